@@ -283,6 +283,19 @@ class TestParameters:
             "merge the values"
         )
 
+    def test_a_contradiction_names_different_values(self, books: MemoryRepo) -> None:
+        for number in range(3):
+            books.send(self.demand(f"vehicle0{number}", format="mcap"))
+        (found,) = books.faults(self.demand("vehicle03", format="bag"))
+        assert '"mcap" for vehicle00 and "bag" for vehicle03; demand' in found
+
+    def test_a_value_that_cannot_be_compared_is_refused(self, books: MemoryRepo) -> None:
+        books.send(self.demand("vehicle00", rate=1))
+        assert books.faults(self.demand("vehicle01", rate=True)) == [
+            "parameters.rate: true for vehicle01 is not a number, but the application definition "
+            "merges the values by max; give a number"
+        ]
+
     @pytest.mark.parametrize(
         ("recorder", "monitor"), [({"rate": 10}, 20), ({"rate": 20}, 10), ({}, 20)]
     )

@@ -307,9 +307,16 @@ def test_a_warning_says_what_an_override_publishes_twice(divides: str, told: boo
             (
                 "overrides/two.yaml",
                 "runs 2 replicas of driver, and each replica publishes every output; run only one, "
-                "or set dividesWork: true in the application definition if the program divides its "
-                "work among replicas",
+                "or set dividesWork: true in 'scaling' of the service's definition if the program "
+                "divides its work among replicas",
             )
         ]
         * told
     )
+
+
+def test_a_replica_that_another_override_takes_away_publishes_nothing_twice() -> None:
+    two, one = (override({"services": ["driver"]}, replicas=n, priority=n % 2) for n in (2, 1))
+    repo = MemoryRepo({**ADDITIONS, "overrides/two.yaml": two, "overrides/one.yaml": one})
+    repo.send(demand())
+    assert list(warnings(override_report(repo.state, NOW))) == []

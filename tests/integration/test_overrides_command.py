@@ -130,13 +130,13 @@ def test_check_says_what_an_override_would_do_and_warns_of_idle_ones(
     found = demandops("check", clone)
     assert found.code == 0
     assert found.err.splitlines() == [
-        "warning: overrides/idle.yaml: matches nothing now; if it should match something, correct "
-        "its field 'select'",
+        "warning: overrides/idle.yaml: has no effect now, because its field 'select' matches "
+        "nothing, or nothing to which its effects apply; if it should have an effect, correct it",
         "warning: overrides/many.yaml: runs 2 replicas of object-detection, and each replica "
-        "publishes every output; run only one, or set dividesWork: true in the application "
-        "definition if the program divides its work among replicas",
-        "warning: overrides/over.yaml: expired at 2020-01-01T00:00:00Z and no longer applies; "
-        "remove the file, or write a later time",
+        "publishes every output; run only one, or set dividesWork: true in 'scaling' of the "
+        "service's definition if the program divides its work among replicas",
+        "warning: overrides/over.yaml: expired at 2020-01-01T00:00:00Z; remove the file, or write "
+        "a later time",
     ]
     told = "  ~ od-edge-vehicle00 (object-detection on edge for vehicle00)"
     assert told in found.out.splitlines()

@@ -2,7 +2,7 @@
 
 Pure: functions take the files as a mapping of paths to texts, and a chart as the path of its
 folder. Like Flux and Argo CD, this module reads a library from the folder that ``repository:
-file://…`` in ``Chart.yaml`` names.
+file://…`` in ``Chart.yaml`` names. The folder must be in ``appdefs/``.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ _EXACT = re.compile(r"\d+\.\d+\.\d+")
 class Dependency:
     """An entry of a chart's ``dependencies``.
 
-    ``index`` is the entry's place in the list. ``folder`` is the library's folder in the state
-    repo, or None if the library is elsewhere. ``imports`` lists those names in the library's
-    ``exports`` whose values the chart imports.
+    ``index`` is the entry's place in the list. ``folder`` is the folder in ``appdefs/`` that
+    ``repository`` names, or None if it names no such folder. The folder may be missing in the state
+    repo. ``imports`` lists those names in the library's ``exports`` whose values the chart imports.
     """
 
     index: int
@@ -45,7 +45,10 @@ def dependencies(folder: str, files: Mapping[str, str]) -> tuple[Dependency, ...
 
 
 def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the folders of a chart and of all libraries that it needs, directly or indirectly."""
+    """Return the folders of a chart and of the libraries that it needs, directly or indirectly.
+
+    Only libraries with a :attr:`Dependency.folder` are included, even if the folder is missing.
+    """
     found = [folder]
     for one in found:
         for dependency in dependencies(one, files):
@@ -57,11 +60,11 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
 def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
     """Return the default values of a chart.
 
-    These are the chart's own values, merged by Helm's rules over the values that it imports from
-    libraries.
+    These are the chart's own values, merged by Helm's rules over the values that it imports by name
+    from libraries in the state repo. A missing ``values.yaml`` has no values.
 
     Raises:
-        InvalidInput: if a ``values.yaml`` cannot be read.
+        InvalidInput: if a ``values.yaml`` is not valid YAML.
     """
     imported: dict[str, Any] = {}
     for dependency in dependencies(folder, files):
@@ -69,7 +72,8 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
             exports = _values(dependency.folder, files).get("exports")
             for name in dependency.imports:
                 values = exports.get(name) if isinstance(exports, dict) else None
-                imported = merged(imported, values if isinstance(values, dict) else {})
+                more = merged({}, values if isinstance(values, dict) else {})
+                imported = merged(more, imported)  # as in Helm, the first import of a value counts
     return merged(imported, _values(folder, files))
 
 
@@ -91,9 +95,10 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 
 def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield a fault for each library that is not in the folder which the chart names for it.
+    """Yield a fault for each library that is not in the folder which ``file://…`` names for it.
 
     Also yield a fault if the chart requires an exact version and the library has another version.
+    Libraries with another kind of ``repository`` are not checked.
     """
     for one in dependencies(folder, files):
         if not one.repository.startswith(_LOCAL):
@@ -101,17 +106,23 @@ def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
         place = f"dependencies[{one.index}]"
         text = files.get(f"{one.folder}/Chart.yaml") if one.folder else None
         if text is None:
-            where = f"'{one.folder}/Chart.yaml'" if one.folder else "that"
+            wrong = (
+                f"'{one.folder}/Chart.yaml' does not exist"
+                if one.folder
+                else "that folder is not in appdefs/"
+            )
             message = (
-                f"{quoted(one.repository)}: {where} does not exist; correct the path, which must "
-                "start at the chart's folder and stay in appdefs/"
+                f"{quoted(one.repository)}: {wrong}; correct the path, which must start at the "
+                "chart's folder and stay in appdefs/"
             )
             yield fault(f"{place}.repository", message).within(f"{folder}/Chart.yaml")
             continue
         version = _mapping(text).get("version")
         if _EXACT.fullmatch(one.version) and one.version != version:
+            has = f"is version {version}" if version else "has no readable version"
             message = (
-                f"is {one.version}, but {one.folder}/Chart.yaml says {version}; make them equal"
+                f"requires {one.version}, but the library in {one.folder} {has}; make the versions "
+                "equal"
             )
             yield fault(f"{place}.version", message).within(f"{folder}/Chart.yaml")
 

@@ -24,7 +24,7 @@ def composed(
     Args:
         title: the schema's title.
         own: name → property, for the chart's properties that the library lacks or defines
-            differently.
+            differently. The schema requires all of them.
         values: the text of the chart's ``values.yaml``, with the descriptions of the values.
         library: the schema of the library.
         shared: the text of the library's ``values.yaml``.

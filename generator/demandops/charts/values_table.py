@@ -40,7 +40,11 @@ def descriptions(text: str) -> dict[str, str]:
 
 
 def table(text: str, root: str = "") -> str:
-    """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``."""
+    """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``.
+
+    The table has each value with a description, and each single value that is in no described
+    mapping. Callers pass a ``root`` that exists, and values that are not null.
+    """
     values: Any = strict_yaml.load(text)
     prefix = f"{root}." if root else ""
     told = {

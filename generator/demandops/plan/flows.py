@@ -1,7 +1,7 @@
 """The flow of topics through an application: which topics services read, and where they come from.
 
-An instance of a service depends on one demanded topic, on the topics of one source, or only on its
-application. So the flows of a demand do not depend on other demands.
+What an application needs of a service depends on one demanded topic, on the topics of one source,
+or only on the application. So the flows of a demand do not depend on other demands.
 """
 
 from __future__ import annotations
@@ -38,9 +38,9 @@ class Flow:
 
     ``name`` is an input role of the application, or ``<service>.<output>``. ``target`` is the
     topic's name at the receiver. ``root`` is the key of the demanded topic because of which the
-    flow is needed. ``delivery`` is the position in ``deliver`` of the delivery that needs the flow,
-    or ``None`` if a service reads the topic. ``type`` is the message type; it is empty unless the
-    demand names the type.
+    flow is needed; it is empty for a delivery, and if no single topic needs the flow. ``delivery``
+    is the position in ``deliver`` of the delivery that needs the flow, or ``None`` if a service
+    reads the topic. ``type`` is the message type; it is empty unless the demand names the type.
     """
 
     name: str
@@ -72,7 +72,10 @@ def node_of(app: Application, service: Service, source: str) -> str:
 
 
 def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys of the instances of a service that an application needs."""
+    """Yield the keys of the instances of a service that an application needs.
+
+    ``node`` of a key is empty if no node is chosen for the service yet.
+    """
     if service.scope == "application":
         yield ServiceKey(service.name, node_of(app, service, ""), application=app.id)
     elif service.root is not None:
@@ -107,7 +110,7 @@ def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicK
 def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[PublishedTopic]:
     """Yield the topics of an application that ``origin`` names.
 
-    ``origin`` is an input role of the application, or ``<service>.<output>``.
+    ``origin`` is an input role of the application, or ``<service>.<output>`` of its definition.
     """
     name, _, output = origin.partition(".")
     if not output:
@@ -132,7 +135,11 @@ def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
-    """Return the flows that an application needs between nodes, sorted by ``name``."""
+    """Return the flows that an application needs between nodes, sorted by ``name``.
+
+    The result is empty if the application definition is missing. A node that is not chosen yet is
+    an empty text.
+    """
     found: dict[tuple[str, str, str, str], Flow] = {}
     for service in config.services.get(app.appdef, {}).values():
         for node, part in _parts(app, service):

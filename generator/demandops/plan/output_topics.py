@@ -4,8 +4,9 @@
 For a service with ``each``, ``{instance}`` stands for the source of the input. A source has one
 usual topic for an input role: the topic in the source's inventory entry or, if there is none, the
 first topic that a demand booked. Any other topic is a further topic of the source. A name that is
-made from a further topic contains the source and this topic. The claims record which topics are
-further topics, so a name stays the same while anybody demands the topic.
+made from a further topic contains the source and this topic. If the inventory names no usual topic,
+the claims record which topics are further topics. So a name stays the same while anybody demands
+the topic and nobody changes the usual topic in the inventory.
 """
 
 from __future__ import annotations
@@ -28,7 +29,8 @@ def outputs(
 ) -> dict[str, str]:
     """Return the topics that a service instance publishes, as a map from output name to topic.
 
-    ``further`` is true if the instance runs for a further topic of a source.
+    ``further`` is true if the instance runs for a further topic of a source. It is ignored if the
+    inventory names the usual topic.
     """
     if service.root is None:
         instance = naming.topic_part(key.application or key.node)
@@ -81,7 +83,10 @@ def usual_topic(config: Config, source: str, role: str) -> str | None:
 
 
 def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
-    """Return the request with ``further`` set in each input that is a further topic."""
+    """Return the request in which ``further`` says for each input whether it is a further topic.
+
+    Only the inputs in roles for whose topics services run are marked.
+    """
     if not request.adds_claims:
         return request
     # the claims of the put's own demand do not count, because the put may release their topics

@@ -2,7 +2,7 @@
 
 A marker is a file of the ledger that records that an override has ended. If an override's end has
 passed when the override is merged, the override never applies. When an override in effect reaches
-its end, the generator publishes a commit that ends the override.
+its end, the generator publishes a commit that ends the override. Until then it stays in effect.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class LedgerUpdate:
     keys: tuple[ClaimKey, ...]
     files: Mapping[str, str | None]
     stays: tuple[tuple[str, str], ...] = ()
-    """(file, reason) of each override that should move a service, but does not."""
+    """(file, reason) for each override and each application whose service it cannot move."""
 
 
 def update_ledger(
@@ -101,6 +101,9 @@ def end_override(world: World, override: Override, now: datetime) -> LedgerUpdat
     """Return the ledger after the end of an override, and the files to write.
 
     One of the files is the marker, which records that the override has ended.
+
+    Raises:
+        ValueError: if the override has no end.
     """
     if override.end is None:
         raise ValueError(f"{override.path} has no end")

@@ -9,8 +9,9 @@ import json
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import TypeGuard
 
-from demandops import naming
+from demandops import naming, strict_yaml
 from demandops.config.appdef import Parameter, Service
 from demandops.config.config import Config
 from demandops.config.override import Override
@@ -40,8 +41,9 @@ def plan(world: World, key: ReleaseKey) -> Release | None:
     Return ``None`` if no claim needs the release, or if an override denies it.
 
     Raises:
-        Refused: if claims contradict each other in a parameter, or if the configuration no longer
-            has what a claim names.
+        Refused: if claims contradict each other in a parameter; if the value of a parameter cannot
+            be used; if application definitions that share a service pin different images of one
+            chart version; or if the configuration no longer has what a claim needs.
     """
     world = without_suspended(world)
     release = _unshaped(world, key)
@@ -65,6 +67,9 @@ def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | 
     """Return the release at ``key`` and the override that denies it.
 
     Return ``None`` if no override denies it, or if no claim needs it.
+
+    Raises:
+        Refused: for the same reasons as :func:`plan`.
     """
     world = without_suspended(world)
     release = _unshaped(world, key)
@@ -140,7 +145,8 @@ def _parts(
 ) -> Iterator[Application]:
     """Yield each application with only those inputs that the instance at ``key`` depends on.
 
-    Several claims on one application give one application with the inputs of all these claims.
+    Several claims on one application give one application with the inputs of all these claims. If
+    the instance reads only the topic that it runs for, only one application is yielded.
     """
     by_id: dict[str, list[Application]] = {}
     for app in apps:
@@ -151,7 +157,7 @@ def _parts(
         if shared:
             yield first.with_inputs(shared)
             if len(service.inputs) == 1:
-                return  # one application is enough, because the instance reads only this input
+                return
             continue
         roles = service.roots or {role for app in same for role in app.inputs}
         united = {role: {one for app in same for one in app.inputs.get(role, ())} for role in roles}
@@ -194,7 +200,7 @@ def demanded_inputs(
     """Yield (role, topic, root) for each topic that a service reads because of an application.
 
     ``role`` is the service's input that reads the topic. ``root`` is the key of the demanded topic
-    from which this topic comes (:class:`demandops.plan.flows.PublishedTopic`).
+    from which this topic comes, or empty (:class:`demandops.plan.flows.PublishedTopic`).
     """
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
@@ -215,7 +221,8 @@ def service_name(config: Config, service: Service, key: ServiceKey) -> str:
 
     If the instance runs for a topic, the name contains the node and the topic's source, as in
     ``od-edge-vehicle00``. The name also contains a slug of the topic, unless ``topics`` in the
-    source's inventory entry lists the topic as the usual one.
+    source's inventory entry lists the topic as the usual one. For a separate instance, the name
+    also contains the version.
     """
     if service.root is None:
         return naming.object_name(service.prefix, key.application or key.node)
@@ -252,23 +259,26 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
         unique = {json.dumps(item, sort_keys=True): item for item in items}
         return [unique[key] for key in sorted(unique)]
     if parameter.merge in ("max", "min"):
-        numbers = [
-            value
-            for value in given
-            if isinstance(value, int | float) and not isinstance(value, bool)
-        ]
+        numbers = [value for value in given if _is_number(value)]
         if len(numbers) != len(given):
-            odd = next(value for value in given if value not in numbers)
+            odd, claim = next(
+                (value, claim)
+                for value, claim in zip(given, claims, strict=True)
+                if not _is_number(value)
+            )
             message = (
-                f"{odd!r} is not a number, but the application definition merges the values "
-                f"by {parameter.merge}; give a number"
+                f"{strict_yaml.short_repr(odd)} for {', '.join(claim.requesters)} is not a number, "
+                f"but the application definition merges the values by {parameter.merge}; give a "
+                "number"
             )
             raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)
     if any(value != given[0] for value in given):
+        first: dict[str, Claim] = {}
+        for claim in claims:
+            first.setdefault(json.dumps(claim.application.parameters[name]), claim)
         shown = " and ".join(
-            f"{json.dumps(claim.application.parameters[name])} for {', '.join(claim.requesters)}"
-            for claim in claims[:3]
+            f"{value} for {', '.join(claim.requesters)}" for value, claim in [*first.items()][:3]
         )
         message = (
             f"demands contradict each other: {shown}; demand the same value, or ask that the "
@@ -276,6 +286,10 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
         )
         raise Refused.at(f"parameters.{name}", message, code="conflict")
     return given[0]
+
+
+def _is_number(value: object) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,7 +327,7 @@ class _ClaimedConnections:
 
 
 def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
-    """Return the routes of all claims on a connection, sorted by source topic."""
+    """Return one route for each source topic that claims on a connection list, sorted by topic."""
     return routes.merged_routes(route for claim in claims for route in claim.connection.topics)
 
 

@@ -25,10 +25,11 @@ class ServiceKey:
     """The identity of one instance of a service.
 
     ``application`` is set if the service runs once for each application. ``source`` and ``topic``
-    are set if the service runs once for each topic; then all applications with this topic share the
-    instance. If none of these is set, all applications on the node share the instance. With
-    ``for_cluster``, all applications in the node's cluster share the instance. ``version`` is set
-    if the service belongs to a separate instance of an application.
+    are set if the service runs once for each topic; then the applications that need the service on
+    this node for this topic share the instance. If none of these is set, the applications that need
+    the service on this node share the instance. With ``for_cluster``, the applications in the
+    node's cluster share it. ``version`` is set if the service runs for each topic and belongs to a
+    separate instance of an application.
     """
 
     service: str
@@ -114,7 +115,10 @@ class ServiceRelease:
         return f" until {format_time(self.keeps.until)}" if self.keeps else ""
 
     def facts(self) -> list[str]:
-        """Return the properties of the release as lines; commit messages show changed lines."""
+        """Return what the release runs with, as lines; commit messages show changed lines.
+
+        Outputs, images that the version does not pin, and patches of Helm values are left out.
+        """
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
             *(f"{name} = {value}" for name, value in self.parameters.items()),
@@ -129,7 +133,11 @@ class ServiceRelease:
         ]
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
-        """Yield (file, entry, what the entry decides) for each entry that shapes the release."""
+        """Yield (file, entry, what the entry decides) for entries that shape the release.
+
+        They are those of the service's definition, version, kept replicas and chart. An empty
+        ``entry`` stands for the whole file.
+        """
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"
         yield self.service.file, entry, "its definition"

@@ -40,7 +40,10 @@ def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator
 def keys_of_claims(
     world: World, claims: Iterable[Claim], *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that ``claims`` need in ``world``, each once."""
+    """Yield the keys of the releases that ``claims`` need in ``world``, each once.
+
+    ``strict`` means the same as for :func:`keys_of`.
+    """
     keys = (
         key
         for claim in claims
@@ -68,7 +71,12 @@ def _service_keys(world: World, claim: Claim, strict: bool) -> Iterator[ServiceK
 
 
 def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
-    """Return the claims that need a service instance, sorted by application and demand."""
+    """Return the claims that need a service instance.
+
+    They are sorted by application and demand. For a service that runs once for each cluster, they
+    are grouped by appdef first. Callers pass a world without suspended claims if these must not
+    count.
+    """
     ledger = world.ledger
     if key.application is not None:
         needed = _service(world, key.application, key) is not None
@@ -90,7 +98,10 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
 
 
 def is_needed(world: World, key: ServiceKey) -> bool:
-    """Return whether a claim needs a service instance."""
+    """Return whether a claim needs a service instance.
+
+    Callers pass a world without suspended claims if these must not count.
+    """
     if key.application is not None:
         return _service(world, key.application, key) is not None
     if key.scope in ("node", "cluster"):

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 
 from demandops.config.appdef import Service
-from demandops.config.config import CHARTS_FILE
+from demandops.config.config import VERSIONS_FILE
 from demandops.config.registry import ApplicationVersion, precedence
 from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
@@ -51,8 +51,10 @@ def version_of_service(
 
     If the applications have several appdefs, the appdef with the newest chart decides.
 
+    At least one of the applications must have a version (:func:`running_version`).
+
     Raises:
-        Refused: if two appdefs have the same chart version, but different images.
+        Refused: if another appdef has the same chart version, but different images.
     """
     newest: dict[str, ApplicationVersion] = {}
     for found in filter(None, (running_version(world, id) for id in applications)):
@@ -64,11 +66,11 @@ def version_of_service(
     for other in versions:
         its, own = contents(other, service), contents(best, service)
         if its[0] == own[0] and its != own:
-            file = world.config.file_of(CHARTS_FILE, service.chart)
+            file = world.config.place_of(VERSIONS_FILE)
             message = (
                 f"application definitions '{best.appdef}' and '{other.appdef}' share "
                 f"{service.chart} {own[0]}, but pin different images; pin the same images, or "
-                f"give one of the definitions another version of the chart in {file}"
+                f"give one of the definitions another version of the chart, in {file}"
             )
             raise Refused.at("version", message, code="conflict")
     return best

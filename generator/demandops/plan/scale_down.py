@@ -1,8 +1,8 @@
 """When a service gets fewer replicas: at once, or after the time in the service's definition.
 
-If demands need fewer replicas than before, the decision records how many replicas the service
-keeps, and until when (:mod:`demandops.ledger.kept_replicas`). When that time is over, the generator
-publishes a commit that removes these replicas from the record.
+If the definition has such a time and demands need fewer replicas than before, the decision records
+how many replicas the service keeps, and until when (:mod:`demandops.ledger.kept_replicas`). When
+that time is over, the generator publishes a commit that removes these replicas from the record.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def with_kept_replicas(
         now: when the demand was received.
 
     Raises:
-        Refused: if a release cannot be planned.
+        Refused: if a release cannot be planned in ``after``.
     """
     kept, changed = after.ledger.kept, list[Instance]()
     for key in keys:

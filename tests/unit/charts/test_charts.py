@@ -139,15 +139,16 @@ METADATA = f"appdefs/{APPDEF.name}/charts/object-detection/Chart.yaml"
             METADATA,
             "file://../../../charts/ros-service",
             "file://../../../../other/ros-service",
-            "dependencies[0].repository: 'file://../../../../other/ros-service': that does not "
-            "exist; correct the path, which must start at the chart's folder and stay in appdefs/",
+            "dependencies[0].repository: 'file://../../../../other/ros-service': that folder is "
+            "not in appdefs/; correct the path, which must start at the chart's folder and stay in "
+            "appdefs/",
         ),
         (
             METADATA,
             "ros-service\n    version: 1.0.0",
             "ros-service\n    version: 0.2.0",
-            "dependencies[0].version: is 0.2.0, but appdefs/charts/ros-service/Chart.yaml says "
-            "1.0.0; make them equal",
+            "dependencies[0].version: requires 0.2.0, but the library in "
+            "appdefs/charts/ros-service is version 1.0.0; make the versions equal",
         ),
     ],
 )
@@ -223,6 +224,16 @@ def test_values_that_people_override_are_accepted(chart: str) -> None:
         "runtimeClassName": "nvidia",
     }
     assert faults(chart, merged(chart_values(chart), change)) == []
+
+
+def test_the_first_of_two_imports_of_a_value_counts() -> None:
+    imports = "[{name: lib, repository: 'file://../lib', import-values: [first, second]}]"
+    files = {
+        "appdefs/a/Chart.yaml": f"name: a\nversion: 1.0.0\ndependencies: {imports}\n",
+        "appdefs/a/values.yaml": "own: 1\n",
+        "appdefs/lib/values.yaml": "exports:\n  first: {x: 1}\n  second: {x: 2, y: 2, own: 2}\n",
+    }
+    assert chart_files.defaults("appdefs/a", files) == {"x": 1, "y": 2, "own": 1}
 
 
 def test_a_topic_of_two_sources_is_read_once() -> None:

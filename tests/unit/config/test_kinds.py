@@ -151,14 +151,37 @@ def test_a_kind_that_the_domain_may_not_have_is_told_with_its_line() -> None:
     )
     assert warned({template: text}) == [
         f"{template}:3: DaemonSet is not among the kinds of access domain 'perception', so the "
-        "cluster refuses such an object if the chart renders one; add DaemonSet to 'kinds' in "
-        f"{DOMAINS}, or remove the object from the chart"
+        "cluster refuses such an object if the chart renders one; list DaemonSet in 'kinds' in "
+        f"{DOMAINS} together with all kinds that the domain's charts have, because a list replaces "
+        "the default kinds (docs/policy.md), or remove the object from the chart"
     ]
     (told,) = warned({template: text})
     assert told.replace(CHART, "appdefs/agent/charts/agent") in PAGE
     used = "ConfigMap, Deployment, HorizontalPodAutoscaler, Role, RoleBinding, Secret"
     kinds = f"[{used}, ServiceAccount, DaemonSet]"
     assert warned({template: text, **domain(kinds=kinds)}) == []
+
+
+@pytest.mark.parametrize(
+    ("fields", "kind", "remedy"),
+    [
+        (
+            {"kinds": "[ConfigMap, Deployment, Secret, Role, RoleBinding, ServiceAccount]"},
+            "DaemonSet",
+            f"add DaemonSet to 'kinds' in {DOMAINS}",
+        ),
+        (
+            {"network": "namespace"},
+            "NetworkPolicy",
+            f"remove 'network: namespace' of the domain in {DOMAINS}",
+        ),
+    ],
+)
+def test_a_remedy_can_be_followed(fields: dict[str, str], kind: str, remedy: str) -> None:
+    """A list that lacks the default kinds would break other charts, and some kinds never fit."""
+    agent = {f"{CHART}/templates/agent.yaml": f"kind: {kind}\n"}
+    found = [told for told in warned({**agent, **domain(**fields)}) if f"{CHART}/templ" in told]
+    assert [f"one; {remedy}" in told for told in found if f": {kind} is" in told] == [True]
 
 
 def test_a_domain_is_told_only_of_applications_that_its_rules_name() -> None:
@@ -193,8 +216,10 @@ def test_what_cannot_be_known_is_said() -> None:
         "kinds of its objects are not known; check yourself that the access domain allows these "
         "kinds",
         f"{CHART}/crds/robot.yaml: CustomResourceDefinition is not among the kinds of access "
-        "domain 'perception', so the cluster refuses such an object if the chart renders one; add "
-        f"CustomResourceDefinition to 'kinds' in {DOMAINS}, or remove the object from the chart",
+        "domain 'perception', so the cluster refuses such an object if the chart renders one; list "
+        f"CustomResourceDefinition, with its group and resource, in 'kinds' in {DOMAINS} together "
+        "with all kinds that the domain's charts have, because a list replaces the default kinds "
+        "(docs/policy.md), or remove the object from the chart",
         f"{CHART}/templates/any.yaml:1: the template computes the kind '{{{{ .Values.kind }}}}'; "
         "check yourself that the access domain allows it",
     ]

@@ -121,6 +121,40 @@ def test_an_application_whose_topics_another_publishes_is_refused() -> None:
     repo.send(goal([application("edge-fusion/1", node="cloud")]))
 
 
+OTHER = """
+apiVersion: demandops/v1
+kind: ApplicationDefinition
+name: other
+inputs: {point_cloud: {}}
+services:
+  other:
+    prefix: ot
+    each: point_cloud
+    outputs: {objects: "/{instance}_local_objectlist"}
+    chart: object-detection
+    values: values/other.yaml.j2
+"""
+
+
+def test_another_definition_with_the_same_output_must_change() -> None:
+    """Neither another id nor another usual topic would give the output another name."""
+    values = "appdefs/other/values/other.yaml.j2"
+    repo = MemoryRepo({"appdefs/other/appdef.yaml": OTHER, values: "replicas: 1\n"})
+    repo.send(put(FRONT))
+    (item,) = put(FRONT)["applications"]
+    again = put() | {"demand": "e", "applications": [item | {"id": "edge/o", "type": "other"}]}
+    (found,) = repo.faults(again)
+    assert found.endswith("on 'edge'; change this output in appdefs/other/appdef.yaml")
+
+
+def test_an_output_that_does_not_name_its_instance_must_change() -> None:
+    path = "appdefs/object-detection-fusion/appdef.yaml"
+    repo = MemoryRepo({path: skeleton()[path].replace("/{instance}_global_objectlist", "/fused")})
+    repo.send(join(CLOUD, id="edge/a"))
+    (found,) = repo.faults(join(CLOUD, id="edge/b"))
+    assert found.endswith(f"on 'edge'; change this output in {path}")
+
+
 def test_a_source_whose_topic_another_publishes_is_refused() -> None:
     repo = with_nodes({"id": "robo-1"}, {"id": "robo/1", "selector": {"a": "b"}})
     repo.send(join(("/a", "robo-1")))

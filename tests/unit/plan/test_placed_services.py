@@ -233,6 +233,9 @@ def test_its_access_domain_must_permit_and_approve_it() -> None:
     refused = repo_with(domains(rules=[rule]), cloud=GPU).take(DEMAND)
     assert isinstance(refused, Refused)
     assert "'cloud' is in access domain 'cloud', which does not permit this demand" in str(refused)
+    assert str(refused).endswith(
+        "or ask for a change of inventory/nodes.yaml or policy/access-domains.yaml"
+    )
     alone = DEMAND | {"applications": [APP | {"connect": "none"}]}
     decision = repo_with(domains(approval="required"), cloud=GPU).send(alone)
     assert decision.approval == ("access domain 'cloud'",)

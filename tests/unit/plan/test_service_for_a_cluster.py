@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from random import Random
@@ -16,7 +17,7 @@ from demandops.plan.release import ServiceKey
 from hypothesis import given
 
 from tests.kit.chance import chances, examples
-from tests.kit.config import edited, skeleton
+from tests.kit.config import edited, override, skeleton
 from tests.kit.memory import MemoryRepo, ledger_in
 
 PAGE = (Path(__file__).parents[3] / "docs" / "appdef.md").read_text()
@@ -134,6 +135,35 @@ def test_its_node_counts_it_and_its_rules_hold() -> None:
     assert "no rule of access domain 'servers' is for 'for-b'" in repo.faults(put("b"))[0]
     moved = put("a", "cloud")
     assert "'cloud' would run 2 services" in repo.faults(moved)[0]
+
+
+PLAIN = """
+apiVersion: demandops/v1
+kind: ApplicationDefinition
+name: plain
+inputs: {ego_data: {}}
+services:
+  plain: {prefix: pl, inputs: {ego_data: ego_data}, chart: object-fusion, values: values/p.yaml.j2}
+"""
+
+
+def test_a_quota_does_not_count_it_if_all_claims_on_it_are_suspended() -> None:
+    domain = {"name": "all", "namespace": "all", "quotas": {"servicesPerNode": 1}}
+    head = {"apiVersion": "demandops/v1", "kind": "AccessDomains", "domains": [domain]}
+    more = {
+        "appdefs/plain/appdef.yaml": PLAIN,
+        "appdefs/plain/values/p.yaml.j2": "replicas: 1\n",
+        "policy/access-domains.yaml": yaml.safe_dump(head),
+    }
+    repo = MemoryRepo(files(**more))
+    repo.send(put("a"))
+    plain = put("b", "cloud")
+    plain["applications"][0]["type"] = "plain"
+    assert "'cloud' would run 2 services" in repo.faults(plain)[0]
+    denied = override({"applications": ["edge/a"]}, deny=True)
+    suspending = MemoryRepo(files(**more, **{"overrides/no.yaml": denied}))
+    suspending.state = replace(suspending.state, ledger=repo.state.ledger)
+    suspending.send(plain)
 
 
 @pytest.mark.parametrize(

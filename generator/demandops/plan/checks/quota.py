@@ -1,4 +1,8 @@
-"""Quotas: the limits of an access domain that a booking must not exceed."""
+"""Quotas: how many claims a requester and how many services a node of an access domain may have.
+
+A booking that does not raise an exceeded count is allowed. The quota ``demandsPerMinute`` is
+checked elsewhere (:mod:`demandops.service.timing.rate_limit`).
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ from demandops.config.policy import AccessDomain
 from demandops.errors import Fault, fault
 from demandops.ledger.claim_changes import Changes
 from demandops.ledger.world import World
+from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import is_needed, keys_of
 from demandops.subject import Subject, SubjectKind
@@ -17,6 +22,7 @@ def faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
     """Yield a fault for each quota that the booking exceeds.
 
     If a quota was exceeded before, there is a fault only if the booking raises the count further.
+    Suspended claims count as claims, but nothing runs for them.
     """
     domain_of = after.config.domain_of
     booked = [change.after for change in changes.claims if change.after]
@@ -66,6 +72,7 @@ def _services(node: str, before: World, after: World) -> Iterator[Fault]:
 
 
 def _running(node: str, world: World) -> int:
+    world = without_suspended(world)
     names = world.ledger.applications_at(node)
     subjects = (Subject(SubjectKind.APPLICATION, name) for name in names)
     keys = {key for subject in subjects for key in keys_of(world, subject)}

@@ -40,7 +40,8 @@ def faults(
 ) -> Iterator[Fault]:
     """Yield a fault for each new service, route or delivery that clashes with another source.
 
-    A service, route or delivery clashes if it would be a topic's second source on a node.
+    A service, route or delivery clashes if it would be a topic's second source on a node. Of a
+    service's outputs, only the first that clashes is reported.
 
     Args:
         request: the demand. If it adds no claims, there are no faults.
@@ -73,7 +74,7 @@ def _of_service(
     clashes = (
         (name, topic, *clash)
         for name, topic in _topics(after, service, key).items()
-        for clash in _clashes(after, key, service, topic)
+        for clash in _clashes(after, key, service, name, topic)
     )
     for name, topic, clash, remedy in islice(clashes, 1):
         yield fault(
@@ -84,19 +85,19 @@ def _of_service(
 
 
 def _clashes(
-    world: World, key: ServiceKey, service: Service, topic: str
+    world: World, key: ServiceKey, service: Service, output: str, topic: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield (clash, remedy), in words, for each source of a topic on the node of ``key``.
+    """Yield (clash, remedy), in words, for each source of an output's topic on the node of ``key``.
 
     The instance at ``key`` itself does not count as a source. The clash names the source, as in
     ``connection 'a' already brings this topic to``.
     """
     for other in _publishers(world, key.node, topic, excluded=key):
         clash = f"{_words(other)} already publishes this topic on"
-        yield clash, _remedy(key, other, service, world.config)
+        yield clash, _remedy(key, other, service, output, world.config)
     for id in world.ledger.connections_bringing(key.node, topic):
         clash = f"connection '{id}' already brings this topic to"
-        yield clash, _remedy(key, None, service, world.config)
+        yield clash, _remedy(key, None, service, output, world.config)
 
 
 def _of_connection(
@@ -224,7 +225,8 @@ def _keys_called(
         return
     for source in config.nodes_by_topic_part.get(instance, ()):
         usual = usual_topic(config, source, role)
-        own = str(excluded.topic) if excluded and source == excluded.source else ""
+        is_own = excluded is not None and (excluded.service, excluded.source) == (name, source)
+        own = str(excluded.topic) if excluded and is_own else ""
         for topic in (usual,) if usual else ledger.usual_topics(role, source, excluded=own):
             yield ServiceKey(name, node, source=source, topic=topic)
     for further, version in ledger.further_topics(role, instance):
@@ -252,12 +254,21 @@ def _words(key: ServiceKey) -> str:
     return f"{key.service} for {key.topic} of '{key.source}'"
 
 
-def _remedy(key: ServiceKey, other: ServiceKey | None, service: Service, config: Config) -> str:
-    if key.application is not None:
+def _remedy(
+    key: ServiceKey, other: ServiceKey | None, service: Service, output: str, config: Config
+) -> str:
+    """Return, in words, how to resolve a clash; ``other`` is ``None`` for one with a connection."""
+    is_named = "{instance}" in service.outputs[output]
+    is_of_same = (
+        other is not None
+        and other.service != key.service
+        and (other.application, other.source) == (key.application, key.source)
+    )
+    if key.application is not None and is_named and not is_of_same:
         return "use another application id"
     if other is None:
         return "let the connection bring the topic under another name"
-    if {"node", "cluster"} & {key.scope, other.scope}:
+    if not is_named or is_of_same or {"node", "cluster"} & {key.scope, other.scope}:
         return f"change this output in {service.file}"
     file = config.file_of(NODES_FILE, str(key.source))
     if key.source == other.source:

@@ -44,7 +44,8 @@ class Difference:
 
     ``what`` describes this application or service. ``demanded`` is the version that the new demand
     asks for. ``others`` is the newest version that the other demands ask for. ``policy`` is the
-    value of ``versions`` in the application definition.
+    value of ``versions`` in the application definition ``appdef``. If two definitions share the
+    service, it is the stricter of their values.
     """
 
     what: str
@@ -71,7 +72,10 @@ class Difference:
         return self.policy in _REFUSING
 
     def approval_reason(self) -> str:
-        """Return why a person must approve the difference; empty if no approval is needed."""
+        """Return why a person must approve the difference; empty if no approval is needed.
+
+        The result has no meaning if :attr:`is_refused`.
+        """
         same = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
         if self.policy == "upgrade" or same:
             return ""
@@ -99,6 +103,9 @@ def differences(
     plans: Mapping[ReleaseKey, Release | None],
 ) -> Iterator[Difference]:
     """Yield the differences between the versions that a demand and other demands ask for.
+
+    A difference that existed before the demand is left out, and so is one that does not concern the
+    demand (:meth:`Difference.matters_to`).
 
     Args:
         request: the demand.

@@ -51,7 +51,10 @@ class Usage:
 
 
 def whole_usage(world: World) -> Usage:
-    """Return what all services request on each node; empty if no node declares a capacity."""
+    """Return what all services request on each node; empty if no node declares a capacity.
+
+    A release that cannot be planned requests nothing.
+    """
     if not world.config.limits_capacity:
         return Usage()
     keys: dict[ReleaseKey, None] = {}
@@ -165,10 +168,14 @@ class Room:
         self._change(claims)
 
     def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:
-        """Return, in words, each resource of which a node has too little for an application.
+        """Return, in words, the resources of which a node has too little for an application.
 
-        ``claims`` are the claims to book for the application. If ``service`` is not empty, only the
-        service of this name is placed on the node.
+        The result is empty if the node has room, or if the application cannot be planned.
+
+        Args:
+            claims: the claims to book for the application, with ``node`` as its node.
+            node: the node.
+            service: if not empty, only the service of this name is placed on the node.
         """
         known = self._world.config.nodes.get(node)
         if known is None or known.capacity is None:
@@ -194,9 +201,10 @@ class Room:
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
         """Return what an application requests at least of its node, as resource → amount.
 
-        Services that the application shares do not count. If ``service`` is not empty, only the
-        service of this name counts. The result is empty if overrides may make the amounts depend
-        on the node. Callers use the amounts to rule out full nodes quickly.
+        Services that the application shares do not count, and neither do services with a node of
+        their own. If ``service`` is not empty, only the service of this name counts. The result is
+        empty if overrides may make the amounts depend on the node. Callers use the amounts to rule
+        out full nodes quickly.
         """
         subject, world = claims[0].subject, self._world
         if any(one.node or one.deny or one.replicas is not None for one in world.overrides):

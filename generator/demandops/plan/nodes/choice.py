@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 from demandops import strict_yaml
 from demandops.config.appdef import Place, Service
-from demandops.config.config import NODES_FILE, Config
+from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.config.inventory import Node, Position
 from demandops.config.node_property import (
     condition_problem,
@@ -33,9 +33,9 @@ from demandops.quoting import quoted
 
 _MOST_SHOWN = 5
 MOST_TRIED = 20
-"""The highest number of nodes on which a booking is tried; each trial takes time."""
+"""After a booking failed on so many nodes, no other node is tried; each trial takes time."""
 NO_ROOM = "no-room"
-"""The code of the fault for an application that fits some nodes, of which none has room."""
+"""The code of the fault if no node fits, but at least one node lacks only room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +125,10 @@ class Choice:
         return not self._closed(known) and self._is_permitted(known)
 
     def candidates(self, positions: Positions) -> Iterator[Chosen]:
-        """Yield the nodes that fit and have room, the best first."""
+        """Yield the nodes that fit, have room and pass :attr:`suits`, the best first.
+
+        The choice ends early if the demand cannot be booked on :data:`MOST_TRIED` nodes.
+        """
         fitting = self._fitting()
         centre = self._centre(positions)
         fitting.sort(key=lambda node: self._rank(node, centre, positions))
@@ -155,7 +158,10 @@ class Choice:
                 yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
 
     def chosen(self, node: str, why: str) -> Chosen | None:
-        """Return ``node`` as the chosen node, or ``None`` if it does not fit or has no room."""
+        """Return ``node`` as the chosen node, or ``None`` if it does not fit or has no room.
+
+        :attr:`suits` is not asked.
+        """
         known = self.config.nodes.get(node)
         if known is None or not self.fits(node) or self._shortage(known):
             return None
@@ -257,19 +263,23 @@ class Choice:
         """Return the fault for an application or a service that gets no node.
 
         The fault lists some nodes and what each of them lacks. The nodes that lack the least come
-        first.
+        first. Callers have found that :meth:`candidates` yields no node.
         """
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
         centre, code = self._centre(positions), "no-node"
         misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
+        places = {self.config.place_of(NODES_FILE): None}
         for node in self.config.nodes_by_role.get(self.requirement.role, ()):
             missing = list(lacks(node, self.requirement))
             reasons = [f"lacks {joined(missing)}"] if missing else []
             reasons += filter(None, [self._closed(node)])
+            if not missing and node.id not in self.config.domain_of:
+                places[self.config.place_of(DOMAINS_FILE)] = None
             if not reasons and not self._is_permitted(node):
                 domain = self.config.domain_of[node.id].name
                 reasons.append(f"is in access domain '{domain}', which does not permit this demand")
+                places[self.config.place_of(DOMAINS_FILE)] = None
             elif not reasons and (shortage := self._shortage(node)):
                 reasons, code = shortage, NO_ROOM
             elif not reasons:
@@ -278,10 +288,11 @@ class Choice:
             count = len(missing) + len(reasons) - bool(missing)
             misses.append((count, self._rank(node, centre, positions), text))
         shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
-        more = [f"{len(misses) - len(shown)} more do not fit"] if len(misses) > len(shown) else []
+        hidden = len(misses) - len(shown)
+        more = [f"{hidden} more {'are' if hidden > 1 else 'is'} not shown"] if hidden else []
         message = f"no node fits: {'; '.join([*shown, *more]) or 'the inventory has no node'}"
         less = f"change 'place' in {self.service.file}" if self.service else "ask for less"
-        message += f"; {less}, or ask for a change of {self.config.place_of(NODES_FILE)}"
+        message += f"; {less}, or ask for a change of {' or '.join(places)}"
         return self._fault(message, code)
 
     def _fault(self, message: str, code: str) -> Fault:

@@ -49,19 +49,22 @@ def with_chosen_nodes(
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a node for each application and service that is to be placed.
 
-    A booked application or service stays on its node if the node has what is required. Any other
-    application or service gets the first node that fits and has room. ``placement`` in the settings
-    decides the order of the nodes. Finally, services move to the nodes that overrides name.
+    A booked application or service stays on its node if the node still fits. If other demands hold
+    it too, the node may be drained or no longer permitted. Any other application or service gets
+    the first node that fits and has room. ``placement`` in the settings decides the order of the
+    nodes. Finally, services move to the nodes that overrides name.
 
     Args:
         request: the request.
         world: the claims and the configuration before the request.
         usage: what services request on each node in ``world``.
         trial: if given, a node is chosen only if ``trial`` returns ``True`` for the request with
-            this node.
+            this node. It is not called for a node on which the application or service is booked
+            already, nor for one on which another application has a service to share.
 
     Returns:
-        The request, and a fault for each application or service that gets no node.
+        The request, and the faults: of each application or service that gets no node, and of each
+        node in the demand that lacks what is required or contradicts an existing claim.
     """
     if not request.adds_claims:
         return request, []
@@ -173,7 +176,8 @@ def _with_named_service_nodes(one: Demanded, world: World) -> Demanded:
 def may_wait(request: DemandRequest, world: World) -> bool:
     """Return whether a demand that lacks room may wait.
 
-    For each application and service to place, there must be a node that would fit if it had room.
+    Callers have found that it lacks only room. For each application and service to place, there
+    must be a node that would fit if it had room.
     The node's access domain must let demands wait, and must ask for no approval. A demand that
     needs approval cannot wait, because a person approves only what can be booked at once.
     """

@@ -1,9 +1,9 @@
 """Relocation: applications and services leave a drained node, and overrides move services.
 
 An application leaves a drained node only if the generator placed it on this node. If a demand names
-the node, the application stays. Claims and definitions contain what is required of a node, so the
-original demands are not needed. The connections of a moved application follow
-(:mod:`demandops.plan.nodes.moved_connections`).
+the node or an override keeps the application, it stays. Claims and definitions contain what is
+required of a node, so the original demands are not needed. The connections of a moved application
+follow (:mod:`demandops.plan.nodes.moved_connections`).
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def following_overrides(
     """Return the ledger after services have moved to the nodes that overrides name.
 
     The connections follow the services. A service also moves back when no override moves it any
-    longer.
+    longer. A service stays if the move would cause a fault.
 
     Args:
         world: the claims and the configuration.
@@ -223,7 +223,10 @@ def following_overrides(
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return the restoration with its claims adapted to the overrides that move services now."""
+    """Return the restoration with its claims adapted to the overrides that move services now.
+
+    A service whose move would cause a fault among these claims is not adapted.
+    """
     moves = any(one.node for one in world.overrides)
     if not moves and not any(
         one.is_on_application and one.application.moved for one in request.claims

@@ -169,8 +169,8 @@ def suspended_by(claim: Claim, world: World) -> Override | None:
 def denied_by(traits: Traits, world: World) -> Override | None:
     """Return the override that denies a claim, demand or release with these traits, or ``None``.
 
-    If several overrides do, return the one with the highest rank. A selector that names services
-    denies the releases of these services, but never a claim or a demand.
+    If several overrides do, return the one with the highest rank. For the release of a service,
+    only selectors that name services count. For a claim or a demand, only the others count.
     """
     for override in reversed(world.overrides):
         if override.deny and any(
@@ -248,7 +248,8 @@ def _kept_claim(
 ) -> Claim | None:
     """Return the claim by which an override keeps a subject, or ``None`` if no override does.
 
-    The claim is one of ``existing``, or a new claim. No demand may hold the subject.
+    The claim is one of ``existing``, or a new claim. A subject whose last claim is suspended gets
+    no new claim. No demand may hold the subject.
 
     Args:
         existing: the kept claims on the subject before the update.

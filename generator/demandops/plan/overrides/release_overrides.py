@@ -1,6 +1,6 @@
-"""The effects of overrides on a planned release: version, node, replicas, images, or denial.
+"""The effects of overrides on a planned release: version, node, replicas, or denial.
 
-Patches of Helm values are applied later, after a template has rendered the values.
+Pins of images and patches of Helm values are applied later, when the release is rendered.
 """
 
 from __future__ import annotations
@@ -20,8 +20,7 @@ from demandops.plan.replicas import overridden
 def apply_overrides(release: Release, world: World) -> Release | None:
     """Return a release with the effects of all overrides, or ``None`` if one of them denies it.
 
-    Raises:
-        Refused: if an override moves the release to a node that the inventory no longer has.
+    An override never moves the release here: its node is the one that the booking recorded.
     """
     if not world.overrides:
         return release
@@ -33,7 +32,7 @@ def apply_overrides(release: Release, world: World) -> Release | None:
     by = []
     for override in world.overrides:
         effects = effects_on(release, override, config) if selects(override, traits, config) else ()
-        if override.node != release.node.id:  # only a booking moves a release to another node
+        if override.node != release.node.id:
             effects = tuple(one for one in effects if one != "node")
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
@@ -54,7 +53,11 @@ def apply_effects(
 ) -> Release:
     """Return a release with the effects of overrides; the last override wins.
 
-    ``by`` has pairs of an override and the names of its effects on the release.
+    ``by`` has pairs of an override and the names of its effects on the release. The effects on
+    images and Helm values are only recorded, in :attr:`ServiceRelease.shaping`.
+
+    Raises:
+        Refused: if an override moves the release to a node that is unknown or in no access domain.
     """
     by = tuple(by)
     if not by:
@@ -76,7 +79,10 @@ def apply_effects(
 
 
 def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
-    """Return the names of the effects that an override has on a release that it selects."""
+    """Return the names of the effects that an override has on a release that it selects.
+
+    ``deny`` and ``keep`` are never among them, because they are not effects on a release.
+    """
     possible = {"hold"}
     if isinstance(release, ServiceRelease):
         known = config.charts[release.service.chart].versions()

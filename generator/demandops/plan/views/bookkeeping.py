@@ -93,7 +93,7 @@ class ResourceEntry:
 
 @dataclass(frozen=True, slots=True)
 class DemandEntry:
-    """One demand that holds claims. ``action`` is the ROS action whose goal made the demand."""
+    """One demand that holds claims. ``action`` is the ROS action that takes such a demand."""
 
     action: Literal["Demand", "DeploymentRequest"]
     request: str
@@ -104,9 +104,10 @@ class DemandEntry:
 class Bookkeeping:
     """The whole view: services by release name, connections and demands by id, all sorted.
 
-    ``suspended`` are the claims that overrides suspend; no service or connection counts them.
-    ``nodes`` are the nodes that declare a capacity, each with its resources. ``waiting`` are the
-    demands that wait for room, in the order in which the generator tries to book them.
+    ``demands`` includes demands whose claims are suspended. ``suspended`` are the claims that
+    overrides suspend; no service or connection counts them. ``nodes`` are the nodes that declare a
+    capacity, each with its resources. ``waiting`` are the demands that wait for room, in the order
+    in which the generator tries to book them.
     """
 
     services: dict[str, ServiceEntry]
@@ -118,7 +119,11 @@ class Bookkeeping:
 
 
 def bookkeeping(world: World) -> Bookkeeping:
-    """Return what runs and who requests it."""
+    """Return what runs and who requests it.
+
+    Raises:
+        Refused: for the same reasons as :func:`demandops.plan.planner.plan`.
+    """
     active = without_suspended(world)
     services = {
         release.name: ServiceEntry(

@@ -1,4 +1,7 @@
-"""The demands that hold something or wait for room, as a list for people."""
+"""The demands that hold something or wait for room, as a list for people.
+
+An override that keeps claims is listed like a demand.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +72,10 @@ def nodes_of(claim: Claim) -> tuple[str, ...]:
 
 
 def demands(world: World) -> list[HeldDemand]:
-    """Return every demand that holds something or waits for room, the oldest first."""
+    """Return every demand that holds something or waits for room, the oldest first.
+
+    The result also has an entry for each override that keeps claims.
+    """
     by_demand: defaultdict[str, list[Claim]] = defaultdict(list)
     for claim in world.ledger:
         by_demand[claim.demand].append(claim)

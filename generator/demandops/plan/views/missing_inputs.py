@@ -1,4 +1,4 @@
-"""Missing inputs: topics that applications need, but that no longer arrive.
+"""Missing inputs: topics that applications read or deliver, but that do not arrive.
 
 A demand that needs a connection gets the connection, or its requester gets a warning. Later an
 override may suspend the connection, demands may release the connection, or people may remove a node
@@ -21,7 +21,10 @@ from demandops.plan.overrides.claim_overrides import without_suspended
 
 @dataclass(frozen=True, slots=True)
 class MissingInput:
-    """A topic that does not arrive: the application, the file of its claim, and the reason."""
+    """A topic that does not arrive, or an output that is no longer delivered.
+
+    It has the application, the file of the claim, and the reason.
+    """
 
     application: str
     file: str
@@ -34,7 +37,10 @@ class MissingInput:
 
 
 def missing_inputs(world: World) -> list[MissingInput]:
-    """Return the topics that do not arrive, sorted; suspended claims need no topics."""
+    """Return the topics that do not arrive, sorted by application.
+
+    Suspended claims need no topics, and suspended connections carry none.
+    """
     active = without_suspended(world)
     found = {
         MissingInput(claim.application.id, claim_file.path_of(claim.key), reason)

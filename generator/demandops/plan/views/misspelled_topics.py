@@ -22,7 +22,7 @@ _SHORT = 4
 
 
 def notes(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each misspelled topic in a request."""
+    """Yield a warning for each misspelled topic in a request that adds claims."""
     if request.adds_claims:
         known = _KnownTopics(world)
         for one in request.demanded:

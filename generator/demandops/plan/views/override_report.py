@@ -16,10 +16,12 @@ from demandops.plan.overrides.claim_overrides import suspended_by
 from demandops.plan.planner import denied_release, plan
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import all_keys, keys_of_claims
+from demandops.plan.replicas import most_replicas
 
 State = Literal["in force", "held back", "expired", "matches nothing", "not rendered yet"]
 """The state of an override.
 
+``matches nothing``: the override selects nothing, or its effects do not apply to what it selects.
 ``held back``: another override with ``hold`` keeps every file that this override would change.
 ``not rendered yet``: a generator has not written the changed files yet
 (:mod:`demandops.render.changes.override_state`).
@@ -37,7 +39,11 @@ class Entry:
 
 
 def override_report(world: World, now: datetime) -> list[Entry]:
-    """Return an entry for every override, sorted by name."""
+    """Return an entry for every override, sorted by name.
+
+    Raises:
+        Refused: for the same reasons as :func:`demandops.plan.planner.plan`.
+    """
     if not world.config.overrides:
         return []
     releases = _releases(world)
@@ -79,13 +85,13 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
         if entry.state == "expired" and override.end:
             yield (
                 override.path,
-                f"expired at {format_time(override.end)} and no longer applies; remove the file, "
-                "or write a later time",
+                f"expired at {format_time(override.end)}; remove the file, or write a later time",
             )
         elif entry.state == "matches nothing":
             yield (
                 override.path,
-                "matches nothing now; if it should match something, correct its field 'select'",
+                "has no effect now, because its field 'select' matches nothing, or nothing to "
+                "which its effects apply; if it should have an effect, correct it",
             )
         elif entry.state == "held back":
             yield (
@@ -97,8 +103,8 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
             yield (
                 override.path,
                 f"runs {override.replicas} replicas of {' and '.join(doubled)}, and each replica "
-                "publishes every output; run only one, or set dividesWork: true in the application "
-                "definition if the program divides its work among replicas",
+                "publishes every output; run only one, or set dividesWork: true in 'scaling' of "
+                "the service's definition if the program divides its work among replicas",
             )
 
 
@@ -116,8 +122,10 @@ def _doubled(entry: Entry) -> Iterator[str]:
     for release in entry.releases if (entry.override.replicas or 0) > 1 else ():
         if isinstance(release, ServiceRelease):
             service = release.service
-            if service.outputs and not service.scaling.divides_work:
-                yield release.key.service
+            is_doubled = service.outputs and not service.scaling.divides_work
+            # an override with a higher rank may set another number
+            if is_doubled and most_replicas(release.replicas) == entry.override.replicas:
+                yield service.name
 
 
 def _releases(world: World) -> dict[str, list[Release]]:

@@ -15,7 +15,7 @@ from itertools import groupby
 
 from demandops.charts import chart_files
 from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.config.policy import AccessDomain, matches
+from demandops.config.policy import KINDS, AccessDomain, matches
 from demandops.connections.connection import Connection
 from demandops.demand.permission import PEERS, needed_access
 from demandops.errors import Fault, fault
@@ -81,8 +81,8 @@ def _unfit_places(config: Config) -> Iterator[Fault]:
 def _above_capacity(world: World) -> Iterator[Fault]:
     for node, excess in overcommitted(world, whole_usage(world)):
         message = (
-            f"{excess}; these services stay on the node, but nothing more is booked on it; raise "
-            "the capacity, or move something to another node"
+            f"{excess}; these services stay on the node, but no demand gets more of this resource "
+            "there; raise the capacity, or move something to another node"
         )
         file = world.config.file_of(NODES_FILE, node.id)
         yield fault("", f"'{node.id}': {message}").within(file)
@@ -110,9 +110,10 @@ def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each access domain whose network is open to other domains.
+    """Yield a warning for each access domain that the network of the hosts opens to other domains.
 
-    The network is open because pods of the domain use the network of the host.
+    One kind of warning says that ``network: namespace`` has no effect. The other kind says which
+    domains share a ROS domain in one cluster.
     """
     nodes = [
         (config.domain_of[node.id].name, node)
@@ -151,7 +152,8 @@ def _listed(ids: list[str]) -> str:
 def _charts(config: Config) -> Iterator[Fault]:
     """Yield a warning for each Kubernetes kind in a chart that an access domain does not allow.
 
-    There is also a warning for each kind that cannot be read from the chart's files.
+    There is also a warning for each kind that cannot be read from the chart's files. Only charts
+    and libraries in the state repo are read.
     """
     for folder, domains in sorted(_domains_of_charts(config).items()):
         yield from _dependencies(folder, config.files)
@@ -205,13 +207,26 @@ def _refused(
 ) -> Iterator[Fault]:
     for domain in domains:
         if kind not in {allowed.kind for allowed in domain.allowed_kinds}:
-            file = config.file_of(DOMAINS_FILE, domain.name)
+            remedy = _how_to_allow(kind, domain, config.file_of(DOMAINS_FILE, domain.name))
             message = (
                 f"{kind} is not among the kinds of access domain '{domain.name}', so the cluster "
-                f"refuses such an object if the chart renders one; add {kind} to 'kinds' in "
-                f"{file}, or remove the object from the chart"
+                f"refuses such an object if the chart renders one; {remedy}, or remove the object "
+                "from the chart"
             )
             yield fault("", message, line=line).within(path)
+
+
+def _how_to_allow(kind: str, domain: AccessDomain, file: str) -> str:
+    """Return, in words, how an access domain comes to allow a kind."""
+    if kind == "NetworkPolicy" and domain.network == "namespace":
+        return f"remove 'network: namespace' of the domain in {file}"
+    added = kind if kind in KINDS else f"{kind}, with its group and resource,"
+    if domain.kinds is not None:
+        return f"add {added} to 'kinds' in {file}"
+    return (
+        f"list {added} in 'kinds' in {file} together with all kinds that the domain's charts have, "
+        "because a list replaces the default kinds (docs/policy.md)"
+    )
 
 
 def _dependencies(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:

@@ -17,7 +17,11 @@ from demandops.subject import Subject
 
 
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
-    """Yield the releases that run; with ``subject``, only those that claims on ``subject`` need."""
+    """Yield the releases that run; with ``subject``, only those that claims on ``subject`` need.
+
+    Raises:
+        Refused: for the same reasons as :func:`demandops.plan.planner.plan`.
+    """
     keys = keys_of(world, subject) if subject else all_keys(world)
     yield from filter(None, (plan(world, key) for key in keys))
 
@@ -74,13 +78,19 @@ def how_to_release(claim: Claim) -> str:
 
 
 def is_released_by_demand_id(claim: Claim) -> bool:
-    """Return whether the operation ``release`` with the claim's demand id ends the claim."""
+    """Return whether people release a claim by its demand id.
+
+    If not, they remove an override, or send the request of the claim again as a shutdown.
+    """
     is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
     return claim.keeping_override is None and not is_of_a_request
 
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
-    """Return (file, entry, what the entry decides) for each file entry that shapes a release."""
+    """Return (file, entry, what the entry decides) for each file entry that shapes a release.
+
+    Overrides are left out: :attr:`demandops.config.override.Shaping.by` has them.
+    """
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
         images = {name: release.version.image(name, image) for name, image in images.items()}

@@ -1,4 +1,7 @@
-"""Warnings about patterns of the policy that match nothing: they are misspelled or outdated."""
+"""Warnings about patterns of the policy that match nothing now.
+
+Such a pattern is misspelled, or what it matches was removed or does not exist yet.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +16,8 @@ from demandops.quoting import quoted
 def warnings(config: Config) -> Iterator[Fault]:
     """Yield a warning for each pattern of an access domain that matches nothing.
 
-    Patterns of requesters are not checked, because the state repo has no list of requesters.
+    The pattern ``*`` and patterns of requesters are not checked: the state repo has no list of
+    requesters.
     """
     for name, domain in sorted(config.domains.items()):
         file = config.file_of(DOMAINS_FILE, name)
