@@ -14,7 +14,10 @@ from datetime import datetime, timedelta, timezone
 LONGEST_S = 366 * 24 * 3600
 
 UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
-"""The end of a lease that has not started, because its claim awaits approval."""
+"""The end of a lease that has not started.
+
+Its claim awaits approval, or a person approved it and the generator has not started the lease yet.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +49,7 @@ class Lease:
 
     @property
     def has_started(self) -> bool:
-        """Whether the lease has started; the lease of a proposed claim has not."""
+        """Whether the lease has started. See :data:`UNSTARTED`."""
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
@@ -70,8 +73,8 @@ class Lease:
     def renewed(self, term: Term, now: datetime) -> Lease:
         """Return the lease after a renewal.
 
-        If the slack covers the renewal, the lease stays the same. The end never moves to an earlier
-        time, because the clock may have been set back.
+        If the term is the same and the slack covers the renewal, the lease stays the same. The
+        recorded end never moves to an earlier time, because the clock may have been set back.
         """
         wanted = term.lease_from(now)
         if (self.seconds, self.slack) == (
