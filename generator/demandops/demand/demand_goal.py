@@ -78,9 +78,10 @@ class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
     ``parameters`` maps names to values, and ``parameters_json`` maps names to values as JSON text.
-    ``version`` is a version or a channel of the registry. ``connect`` is the connection type for
-    inputs from other nodes, unless a connection of the demand carries them. ``services`` maps
-    service names to nodes.
+    ``version`` is a version or a channel of the registry. ``connect`` is the type of the derived
+    connections for the application's flows and deliveries: ``auto`` derives them with any type,
+    ``none`` derives none. What a connection of the demand carries needs no derived connection.
+    ``services`` maps service names to nodes.
     """
 
     id: str = ""
@@ -222,10 +223,14 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
     if lease_s is not None:
         yield fault("lease", "is set by a put; leave it out, or put the demand again")
     if goal.applications or goal.connections:
+        remedy = (
+            "to release a part of the demand, put the demand without that part"
+            if goal.operation == "release"
+            else "leave the field out; to change the demand, put it"
+        )
         yield fault(
             "applications" if goal.applications else "connections",
-            f"a {goal.operation} names only its demand; to release a part of the demand, put the "
-            "demand without that part",
+            f"a {goal.operation} names only its demand; {remedy}",
         )
     if goal.priority:
         yield fault("priority", f"a {goal.operation} does not wait for room; leave priority out")

@@ -39,7 +39,7 @@ class Demanded:
     place: Place
     term: Term | None = None
     connect: str = "none"
-    """How to carry inputs from other nodes: a connection type, ``auto`` (any type) or ``none``."""
+    """The type of derived connections of an application; ``auto``: any type, ``none``: none."""
     note: str = ""
     """How a connection differs from the requested one; the receipt has this text as a warning."""
     placed: tuple[str, ...] = ()

@@ -1,8 +1,8 @@
 """Leases: how long a claim stays booked without a renewal.
 
 The recorded end may lag behind the last renewal by ``slack``, so that only some renewals make a
-commit. A renewal within the slack changes nothing, and a claim is released only after the recorded
-end and the slack have passed. So no generator, not even a restarted one, releases a claim early,
+commit. A renewal within the slack changes nothing, and a lease ends only after the recorded end and
+the slack have passed. So no generator, not even a restarted one, releases a claim early,
 but a release may be late by the slack.
 """
 

@@ -49,7 +49,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 def needed_access(
     held: Application | Connection, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield (access domain, access) for each node on which a service runs or a connection ends.
+    """Yield (access domain, access) for each node where services run or a connection has an end.
 
     The access domain is the node's; a node without one is left out. The access is what a rule of
     this domain must grant.

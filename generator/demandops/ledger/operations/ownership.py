@@ -1,4 +1,4 @@
-"""The owners of a demand that has an id: the requesters that it holds or waits for.
+"""The owners of a demand that has an id: the requesters for whom it holds claims or waits.
 
 A request is refused if it names none of the owners. So if a second requester chooses the same
 demand id by chance, its requests cannot change the demand of the first requester.
