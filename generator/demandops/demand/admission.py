@@ -58,7 +58,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
 
 def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault for each limit of the state repo that the request exceeds."""
+    """Yield a fault for each limit on items and parameters that the request exceeds."""
     items = len(request.demanded) + len(request.own_requesters)
     items += len(request.positions) if isinstance(request, Put) else 0
     for one in request.demanded:
