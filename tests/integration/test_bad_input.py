@@ -138,12 +138,14 @@ ATTACKS: dict[str, tuple[str | bytes, str]] = {
     "a list": (
         "- id: a\n",
         "{file}: request 0 '' refused\n"
-        "  a request is a mapping with id, apps, connections and shutdown\n",
+        "  a request is a mapping with the fields of a Demand (kind, demand, requesters and so on)"
+        ", or with id, apps, connections and shutdown\n",
     ),
     "a text": (
         "hello\n",
         "{file}: request 0 '' refused\n"
-        "  a request is a mapping with id, apps, connections and shutdown\n",
+        "  a request is a mapping with the fields of a Demand (kind, demand, requesters and so on)"
+        ", or with id, apps, connections and shutdown\n",
     ),
     "a key twice": (
         "id: a\napps: []\nid: b\n",

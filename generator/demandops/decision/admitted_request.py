@@ -43,8 +43,8 @@ def admitted(
     If the demand lacks only room on a node and may wait, the result is a request to wait for room.
 
     Raises:
-        Refused: if the demand can neither be booked nor wait. A demand that already holds claims
-            never waits.
+        Refused: if the goal does not pass all checks of :func:`admit` and the demand cannot wait. A
+            demand that already holds claims never waits.
     """
     try:
         return admit(state, goal, throttle, trial)
@@ -82,8 +82,9 @@ def admit(
     this node.
 
     Raises:
-        Refused: with every fault in the form and in the content of the goal. If there is none,
-            with every fault that ``throttle`` yields.
+        Refused: with the limits that the goal exceeds, if it is too large. Otherwise with every
+            fault in the form and in the content of the goal. If there is none, with every fault
+            that ``throttle`` yields.
     """
     config, ledger = state.config, state.ledger
     not_placed: list[Fault] = []
@@ -129,9 +130,10 @@ def admit(
 
 
 def completed(request: DemandRequest, state: State) -> DemandRequest:
-    """Return a request with its leases, implied connections and connection types filled in.
+    """Return a request with its lease terms and connection types filled in.
 
-    The nodes of the request are chosen already.
+    The reference's requests also get their further topics, and other requests their implied
+    connections. The nodes of the request are chosen already.
     """
     config, ledger = state.config, state.ledger
     request = permission.with_lease_terms(request, config)
@@ -143,7 +145,7 @@ def completed(request: DemandRequest, state: State) -> DemandRequest:
 
 
 def leaves_nodes_open(state: State, goal: object) -> bool:
-    """Return whether the generator chooses a node for an application or a service of a goal."""
+    """Return whether the generator chooses or checks nodes for the applications of a goal."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request: DemandRequest | None = demand_goal.parse(goal)[0]
     else:
@@ -158,7 +160,7 @@ def _refuse_large(request: DemandRequest, config: Config) -> None:
 
 
 def form_faults(goal: object) -> list[Fault]:
-    """Return the faults in a goal's form: unknown fields, wrong types."""
+    """Return the faults in a goal's form that need no configuration, such as unknown fields."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         return demand_goal.form_faults(goal)
     return deployment_request_goal.form_faults(goal)

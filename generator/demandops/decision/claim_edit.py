@@ -41,9 +41,9 @@ def changeset_of_edit(
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
     """Yield the faults of claims that a person wrote, each located in the claim's file.
 
-    A claim must pass the same checks as a demand: it must be valid, permitted, within the quotas
-    and capacities, and without a topic clash. An edit that only takes requesters away is always
-    allowed, because it has the effect of a release.
+    A claim must be valid, permitted, within the quotas and capacities, and without a topic clash.
+    The permission and the quotas of a claim that is not valid are not checked. An edit that only
+    takes requesters away is always allowed, because it has the effect of a release.
 
     Args:
         before, after: the world before and after the edit.

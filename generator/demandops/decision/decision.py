@@ -74,8 +74,8 @@ class Decision:
     """The effect of a demand.
 
     ``files`` maps each path to the new text, or to ``None`` if the file is to be removed. If the
-    demand changes nothing, ``files`` is empty. ``approval`` names the access domains, rules and
-    appdefs because of which a person must approve the demand before it is booked.
+    demand changes nothing, ``files`` is empty. ``approval`` has the reasons why a person must
+    approve the demand before it is booked: access domains, rules, appdefs and changes of a version.
     """
 
     request: DemandRequest
@@ -102,8 +102,9 @@ class Decision:
     def lease_s(self) -> int | None:
         """The shortest lease of the demand in seconds, or ``None`` if the demand has no lease.
 
-        For a waiting demand, this is the shortest lease that the demand may get later. So the
-        client renews the demand often enough.
+        For a demand without an id, only the claims that the request changed count. For a waiting
+        demand, this is the shortest lease that the demand may get later. So the client renews the
+        demand often enough.
         """
         waiting = self.state.ledger.waiting.get(self.request.demand)
         if waiting is not None:
@@ -126,18 +127,21 @@ def decide(
     on_stage: Callable[[Stage], None] = lambda stage: None,
     throttle: Throttle = lambda request, config: (),
 ) -> Decision:
-    """Return the decision on a goal of the reference's action or of our own action.
+    """Return the decision on a goal, or on a request that the generator makes itself.
 
     Args:
         state: the configuration and ledger to decide on.
         goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`,
-            :mod:`demandops.demand.demand_goal`), or a request that the generator makes itself.
-            The form and the permissions of the generator's own request are not checked.
+            :mod:`demandops.demand.demand_goal`, :class:`Decommission`), or the generator's own
+            request. Of own requests, only a :class:`Restoration` is checked against the
+            configuration and its policy.
         now: when the demand was received, with time zone.
         read: returns the current text of a file in the state repo, or ``None``.
-        on_stage: called when the demand is admitted and when it is booked.
+        on_stage: called when the demand is admitted and when it is booked, each at most once.
+            Later checks may still refuse an admitted demand.
         throttle: called after all other checks of admission, and only if these find no fault. If
-            ``throttle`` yields faults, the request is refused.
+            ``throttle`` yields faults, the request is refused. It may be called twice for one goal,
+            and is not called for a :class:`Decommission` and for the generator's own requests.
 
     Raises:
         Refused: with every fault, each with its field in the goal.

@@ -27,7 +27,7 @@ from demandops.render.changes.changeset import Changeset
 def notes_on(
     request: DemandRequest, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
-    """Yield notes for the requester of a demand that is booked and rendered."""
+    """Yield notes for the requester of a demand that is booked and rendered, or that waits."""
     yield from separate_instance.notes(request)
     yield from _connection_warnings(request, after)
     yield from misspelled_topics.notes(request, after)
@@ -42,7 +42,7 @@ def notes_on(
 
 
 def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each input that no connection carries, and for each bridged topic.
+    """Yield a warning for each flow that no connection carries, and for each bridged topic.
 
     If a connection differs from the requested one, the note about this difference is a warning too.
     """

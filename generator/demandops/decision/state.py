@@ -27,8 +27,8 @@ from demandops.render.engine import Engine
 class State(World):
     """The world at one commit, with the engine that renders its configuration's templates.
 
-    ``plans`` are the releases that earlier decisions on this configuration planned. A copy made
-    with ``replace`` has no plans, because only :func:`decide` knows which plans are still valid.
+    ``plans`` are releases that earlier decisions on this configuration planned. A copy made with
+    ``replace`` has no plans; only :meth:`followed_by` carries over those that are still valid.
     """
 
     engine: Engine

@@ -1,6 +1,7 @@
 """Admission checks whether what is demanded can run with the configuration.
 
-The check reads appdefs, inventory, brokers and access domains, but not the ledger.
+The check reads appdefs, registry, inventory and access domains, but not the ledger. It does not
+check what the policy allows (:mod:`demandops.demand.permission`).
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from demandops.quoting import quoted
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
-    """Yield every reason why ``request`` cannot be fulfilled, whatever the ledger contains.
+    """Yield a fault for everything in ``request`` that cannot run, whatever the ledger contains.
 
     A shutdown may name nodes that are no longer in the inventory, so that claims on these nodes can
     be released.
@@ -57,7 +58,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
 
 def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault for each limit of the state repo that the request exceeds."""
+    """Yield a fault for each limit on items and parameters that the request exceeds."""
     items = len(request.demanded) + len(request.own_requesters)
     items += len(request.positions) if isinstance(request, Put) else 0
     for one in request.demanded:
@@ -87,7 +88,7 @@ def _too_large(size: str, limit: str, most: int) -> str:
 
 
 def _own_fields(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of the fields that a Demand has and a DeploymentRequest lacks."""
+    """Yield the faults of a Demand's id and lease, and of its requesters if it lists no items."""
     yield from _id("demand", request.demand)
     if request.demand.startswith(OVERRIDE_PREFIX):
         message = (
@@ -307,12 +308,14 @@ def _requesters(requesters: tuple[str, ...]) -> Iterator[Fault]:
 def with_chosen_types(
     request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
 ) -> AnyRequest:
-    """Return ``request`` with the type and the broker that each connection gets.
+    """Return ``request`` with the type that each connection gets.
 
     A type that the request names stays. If the request names none, a claimed connection keeps the
     type of its claim, and a new connection gets the first type that can carry it
     (:func:`connection_types.choose_type`). If no type can carry a connection, its type
-    stays ``None``.
+    stays ``None``. If the type carries a connection in another way than the request says, such as
+    over another broker than it names, the connection is changed and a note says so. A request that
+    adds no claims stays as it is.
 
     Args:
         request: the request.

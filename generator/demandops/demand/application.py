@@ -30,15 +30,15 @@ class InputTopic(NamedTuple):
     def part(self) -> str:
         """The text that stands for this input in topic names.
 
-        The text contains the source. For a further topic, it also contains the topic.
+        The text is made from the source and, for a further topic, from the topic.
         """
         return self.part_in("")
 
     def part_in(self, version: str) -> str:
         """Return the text that stands for this input in the topic names of a separate instance.
 
-        The text contains ``version``, the instance's version. If ``version`` is empty, the text is
-        :attr:`part`.
+        The text is also made from ``version``, the instance's version. If ``version`` is empty, the
+        text is :attr:`part`.
         """
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
@@ -83,7 +83,10 @@ class Requirement:
         return len(self.labels) + len(self.capabilities) + len(self.properties)
 
     def united(self, other: Requirement) -> Requirement:
-        """Return the requirement that a node meets if it meets both this one and ``other``."""
+        """Return the requirement that a node meets if it meets both this one and ``other``.
+
+        If both name a role, they must name the same role. The lists of the result are sorted.
+        """
         return Requirement(
             self.role or other.role,
             tuple(sorted({*self.labels, *other.labels})),
@@ -193,7 +196,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def chosen_node(self, service: str) -> str:
         """Return the node that the demand or the generator chose for a service.
 
-        The service runs elsewhere if an override moves it, or if it runs at its sources.
+        The service may run elsewhere if an override moves it, if it runs at its sources, or if it
+        runs once for each cluster.
         """
         return self.services.get(service, self.node)
 
@@ -217,7 +221,10 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, node=first.node, services=first.services, moved=first.moved)
 
     def booked(self) -> Application:
-        """Return the application in the form of a claim: inputs sorted, without duplicates."""
+        """Return the application in the form of a claim.
+
+        Its inputs, its deliveries and the requirements of ``place`` are sorted, without duplicates.
+        """
         inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items()) if topics}
         place = self.place and self.place.united(self.place)
         deliver = tuple(sorted({*self.deliver}))
@@ -244,7 +251,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def matches_listed(self, listed: object) -> bool:
         """Return whether a shutdown that lists ``listed`` means this application.
 
-        A listed application without a node means an application on any node.
+        Both must have the same id. A listed application without a node means it on any node.
         """
         return (
             isinstance(listed, Application)
@@ -270,7 +277,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         """Yield (text, keys) for each input that a shutdown lists in ``listed``.
 
         ``text`` describes the listed input. ``keys`` are the keys of this application's inputs that
-        match it.
+        match it. A listed input without a source matches that topic of any source.
         """
         assert isinstance(listed, Application)  # noqa: S101 - see matches_listed
         by_name: dict[TopicKey, list[TopicKey]] = {}
@@ -292,7 +299,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def without_node(self, node: str) -> Application | None:
         """Return the application without inputs from a node and deliveries to it.
 
-        Return ``None`` if no input is left, or if a service runs on the node.
+        Return ``None`` if no input is left, or if the application or a service runs on the node.
         """
         if node in self.chosen_nodes or node in self.moved.values():
             return None

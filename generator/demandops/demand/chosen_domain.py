@@ -5,7 +5,9 @@ it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
 
 A demand may name a node without a domain: as the node of an application or of a service, or as an
 end of a connection. If the application or connection is booked already, its domain stays. If it is
-not booked yet, the domain is the only one in which the rules let the requesters use the node.
+not booked yet, the domain is the only one in which the rules let the requesters use the node. If
+there is no such domain, the node's first domain is meant. If there are several, the demand is
+refused.
 """
 
 from __future__ import annotations
@@ -33,7 +35,8 @@ def with_chosen_domains(
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a chosen access domain for each node, and the faults.
 
-    There is a fault for each node for which several access domains are possible.
+    There is a fault for each node for which several access domains are possible. A request that
+    adds no claims has no faults; such a node then stays as it is named.
     """
     if not config.hosts:
         return request, []
@@ -93,9 +96,10 @@ def _field(service: str) -> str:
 def _chosen(
     one: Demanded, booked: Held | None, config: Config, adds: bool, faults: list[Fault]
 ) -> Iterator[tuple[str, str]]:
-    """Yield (field, chosen name of the node) for each field whose node is in several domains.
+    """Yield (field, name of the node in its chosen domain) for each field for which one is chosen.
 
-    Add a fault for a field if the rules allow several of these domains.
+    This concerns only nodes that are in several domains. If the rules allow several of them and the
+    request adds claims, add a fault for the field.
     """
     held, known = one.held, dict(_named(booked)) if booked else {}
     for field, node in _named(held):

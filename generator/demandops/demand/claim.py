@@ -29,8 +29,8 @@ class ClaimKey:
 class Claim:
     """One demand's hold on an application or a connection.
 
-    ``joined`` is true if a goal of the reference's action booked the claim. Only goals of that
-    action can shut such a claim down. If only some of the ``requesters`` hold a topic, ``partial``
+    ``joined`` is true if a goal of the reference's action booked the claim. A shutdown takes holds
+    only from such claims. If only some of the ``requesters`` hold a topic, ``partial``
     maps this topic to the requesters that hold it.
     """
 
@@ -139,8 +139,8 @@ class Claim:
         """Return what is left of the claim without a node; ``None`` if nothing is left.
 
         An application loses its inputs from the node and its deliveries to it. A connection loses
-        the node as its broker. Nothing is left of an application with a service on the node, or of
-        a connection that starts or ends at the node.
+        its broker. Nothing is left of an application that runs on the node, has a service there or
+        has no other inputs, or of a connection from or to the node.
         """
         held = self.held.without_node(node)
         if held is None:

@@ -1,7 +1,7 @@
 """The goal of our own ``Demand`` action as plain data, parsed into a :class:`DemandRequest`.
 
 :func:`parse` takes goals of ``demandops_interfaces/action/Demand`` and YAML of the kind ``Demand``.
-The goal names its demand, may list any type of application, and replaces the demand's claims.
+The goal names its demand. A put may list any type of application, and replaces the demand's claims.
 """
 
 from __future__ import annotations
@@ -78,9 +78,10 @@ class GoalApplication(FrozenModel):
     """One application: its id, type (the name of an appdef), node and inputs by role.
 
     ``parameters`` maps names to values, and ``parameters_json`` maps names to values as JSON text.
-    ``version`` is a version or a channel of the registry. ``connect`` is the connection type for
-    inputs from other nodes, unless a connection of the demand carries them. ``services`` maps
-    service names to nodes.
+    ``version`` is a version or a channel of the registry. ``connect`` is the type of the derived
+    connections for the application's flows and deliveries: ``auto`` derives them with any type,
+    ``none`` derives none. What a connection of the demand carries needs no derived connection.
+    ``services`` maps service names to nodes.
     """
 
     id: str = ""
@@ -152,6 +153,7 @@ _DEEPEST = 50
 
 The value is a part of a claim's file, and the whole file may have 100 levels.
 """
+_TOO_DEEP = f"is nested deeper than {_DEEPEST} levels; make it flatter"
 _LONGEST_KEY = 128
 """How many characters a key in a parameter's value may have.
 
@@ -161,7 +163,10 @@ _LISTS_OF_TEXT = ("requesters", "labels", "capabilities", "properties")
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
-    """Return whether plain data is a goal of our own action."""
+    """Return whether plain data is to be read as a goal of our own action.
+
+    The reference's goals have neither of the fields ``kind`` and ``apiVersion``.
+    """
     return "kind" in data or "apiVersion" in data
 
 
@@ -169,7 +174,8 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     """Parse a goal of our own action.
 
     Returns:
-        The request and the faults of its form. A request with faults must not be booked.
+        The request and the faults of its form. Fields of the wrong form are left out of the
+        request, so that the caller can check the others. A request with faults must not be booked.
     """
     goal, faults = parse_valid_part(data, DemandGoal, _LISTS_OF_TEXT)
     requesters = tuple(goal.requesters)
@@ -213,14 +219,18 @@ def _field(item: str, path: str) -> str:
 
 
 def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
-    """Yield the faults of a release or a renewal: each field that only a put may have."""
+    """Yield a fault for each field of a release or a renewal that only a put may have."""
     if lease_s is not None:
         yield fault("lease", "is set by a put; leave it out, or put the demand again")
     if goal.applications or goal.connections:
+        remedy = (
+            "to release a part of the demand, put the demand without that part"
+            if goal.operation == "release"
+            else "leave the field out; to change the demand, put it"
+        )
         yield fault(
             "applications" if goal.applications else "connections",
-            f"a {goal.operation} names only its demand; to release a part of the demand, put the "
-            "demand without that part",
+            f"a {goal.operation} names only its demand; {remedy}",
         )
     if goal.priority:
         yield fault("priority", f"a {goal.operation} does not wait for room; leave priority out")
@@ -291,9 +301,13 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
             continue
         try:
             parameters[name] = _storable(place, json.loads(text), faults)
-        except (ValueError, RecursionError):
+        except json.JSONDecodeError:
             message = 'is not JSON; text needs its own quotes, as in "\\"fast\\""'
             faults.append(fault(place, message))
+        except RecursionError:
+            faults.append(fault(place, _TOO_DEEP))
+        except ValueError:  # Python refuses to convert it
+            faults.append(fault(place, "has an integer of too many digits; write a shorter one"))
     return Application(
         id=app.id,
         appdef=app.type,
@@ -327,7 +341,7 @@ def _storable(where: str, value: object, faults: list[Fault]) -> object:
 
 def _value_problem(value: object, depth: int) -> str:
     if depth > _DEEPEST:
-        return f"is nested deeper than {_DEEPEST} levels; make it flatter"
+        return _TOO_DEEP
     if isinstance(value, float) and not math.isfinite(value):
         return f"holds {value}, which is not a finite number; give another value, or leave it out"
     if isinstance(value, str) and not is_unicode(value):

@@ -1,7 +1,8 @@
 """Demand requests: one class for each operation on the ledger.
 
 Goals of ROS actions and YAML files are parsed into these values, and
-:mod:`demandops.demand.admission` checks them. :mod:`demandops.ledger.apply` carries them out.
+:mod:`demandops.demand.admission` checks them. :mod:`demandops.ledger.apply` carries them out. The
+stage of the ledger has further classes: ``Wait``, ``Drain`` and ``Restoration``.
 """
 
 from __future__ import annotations
@@ -38,7 +39,7 @@ class Demanded:
     place: Place
     term: Term | None = None
     connect: str = "none"
-    """How to carry inputs from other nodes: a connection type, ``auto`` (any type) or ``none``."""
+    """The type of derived connections of an application; ``auto``: any type, ``none``: none."""
     note: str = ""
     """How a connection differs from the requested one; the receipt has this text as a warning."""
     placed: tuple[str, ...] = ()
@@ -56,8 +57,9 @@ class Demanded:
 class DemandRequest:
     """A request; it is booked or refused as a whole.
 
-    ``demand`` is the demand's id. The reference's requests have no demand id; for each subject of
-    such a request, :func:`demandops.demand.claim.demand_id` makes an id. ``own_requesters`` are the
+    ``demand`` is the demand's id. The reference's requests have no demand id; for each item of such
+    a request, :func:`demandops.demand.claim.demand_id` makes one from the request id and the item's
+    requesters. ``own_requesters`` are the
     requesters of the request as a whole. For example, a request to release a demand lists no
     applications and no connections, but has requesters.
     """
@@ -136,18 +138,19 @@ class Renew(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Expire(DemandRequest):
-    """The generator's request to release a demand whose lease has ended."""
+    """The generator's request to release those claims of a demand whose lease has ended."""
 
     operation = "expire"
 
 
 @dataclass(frozen=True, slots=True)
 class Decommission(DemandRequest):
-    """An operator's request to remove the node or the requester ``id`` for good.
+    """An operator's request to release what needs the node, or names the requester, ``id``.
 
     ``kinds`` are ``node``, ``requester`` or both. ``nodes`` lists the names that the node has in
-    its access domains. ``by`` is the operator as ``name <email>``; ``reason`` may be empty. The
-    journal stores the request; no action and no demand file can express it.
+    its access domains; the admission of the request fills it in. ``by`` is the operator as
+    ``name <email>``; ``reason`` may be empty. The journal stores the request; no action and no
+    demand file can express it.
     """
 
     kinds: frozenset[str] = frozenset()
@@ -163,7 +166,7 @@ class Decommission(DemandRequest):
         return isinstance(data, dict) and data.get("kind") == "Decommission"
 
     def goal(self) -> dict[str, Any]:
-        """Return the request as plain data."""
+        """Return the request as plain data for :meth:`parse`, without ``nodes``."""
         data = {"kind": "Decommission", "name": self.id, "as": sorted(self.kinds), "by": self.by}
         return data | ({"reason": self.reason} if self.reason else {})
 

@@ -167,14 +167,18 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
 
 def form_faults(data: object) -> list[Fault]:
-    """Return the faults in the form of a goal: unknown fields, wrong types."""
+    """Return the faults in a goal's form that need no configuration, such as unknown fields."""
     if not isinstance(data, dict):
         return [_not_a_mapping()]
     return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
 
 
 def _not_a_mapping() -> Fault:
-    return fault("", "a request is a mapping with id, apps, connections and shutdown")
+    message = (
+        "a request is a mapping with the fields of a Demand (kind, demand, requesters and so on), "
+        "or with id, apps, connections and shutdown"
+    )
+    return fault("", message)
 
 
 def _application(

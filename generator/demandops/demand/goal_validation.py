@@ -47,7 +47,10 @@ def _with_keys_of_text(
     location: tuple[int | str, ...],
     faults: list[Fault],
 ) -> Any:  # noqa: ANN401
-    """Return ``data`` without the entries whose key is not Unicode text; add a fault for each."""
+    """Return ``data`` without the entries whose key is not Unicode text; add a fault for each.
+
+    Lists and mappings that are nested too deeply become ``None``, with a fault too.
+    """
     if len(location) > _DEEPEST and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST} levels; make it flatter"
         faults.append(fault(field_path(location[:2]), message))

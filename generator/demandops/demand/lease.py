@@ -1,8 +1,8 @@
 """Leases: how long a claim stays booked without a renewal.
 
 The recorded end may lag behind the last renewal by ``slack``, so that only some renewals make a
-commit. A renewal within the slack changes nothing, and a claim is released only after the recorded
-end and the slack have passed. So no generator, not even a restarted one, releases a claim early,
+commit. A renewal within the slack changes nothing, and a lease ends only after the recorded end and
+the slack have passed. So no generator, not even a restarted one, releases a claim early,
 but a release may be late by the slack.
 """
 
@@ -14,7 +14,10 @@ from datetime import datetime, timedelta, timezone
 LONGEST_S = 366 * 24 * 3600
 
 UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
-"""The end of a lease that has not started, because its claim awaits approval."""
+"""The end of a lease that has not started.
+
+Its claim awaits approval, or a person approved it and the generator has not started the lease yet.
+"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +49,7 @@ class Lease:
 
     @property
     def has_started(self) -> bool:
-        """Whether the lease has started; the lease of a proposed claim has not."""
+        """Whether the lease has started. See :data:`UNSTARTED`."""
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
@@ -70,8 +73,8 @@ class Lease:
     def renewed(self, term: Term, now: datetime) -> Lease:
         """Return the lease after a renewal.
 
-        If the slack covers the renewal, the lease stays the same. The end never moves to an earlier
-        time, because the clock may have been set back.
+        If the term is the same and the slack covers the renewal, the lease stays the same. The
+        recorded end never moves to an earlier time, because the clock may have been set back.
         """
         wanted = term.lease_from(now)
         if (self.seconds, self.slack) == (

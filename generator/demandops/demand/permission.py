@@ -49,9 +49,10 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 def needed_access(
     held: Application | Connection, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield (access domain, access) for each node that an application or connection uses.
+    """Yield (access domain, access) for each node where services run or a connection has an end.
 
-    The access domain is the node's. The access is what a rule of this domain must grant.
+    The access domain is the node's; a node without one is left out. The access is what a rule of
+    this domain must grant.
     """
     more: Access = []
     if isinstance(held, Application):
@@ -154,9 +155,10 @@ def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
 
 
 def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with a lease term for each subject.
+    """Return the request with the lease term of each item.
 
-    The lease policy of the subject's access domain sets the term.
+    The lease policy of the item's access domain sets the term. An item without a lease gets
+    ``None``.
     """
 
     def with_term(one: Demanded) -> Demanded:
@@ -185,7 +187,8 @@ def approval_reasons(
 ) -> tuple[str, ...]:
     """Return the reasons why a request needs approval, such as ``access domain 'edge'``, each once.
 
-    Renewals, releases and the claims of overrides need no approval.
+    The result is empty if the request needs none. Renewals, releases and the claims of overrides
+    need no approval.
 
     Args:
         request: an admitted request.

@@ -38,7 +38,8 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
     Args:
         ledger: the claims before the request.
         request: an admitted request (:mod:`demandops.demand.admission`).
-        now: when the request was received, with time zone. Changed claims record this time.
+        now: when the request was received, with time zone. Claims that a join or a put books or
+            changes record this time.
 
     Returns:
         The new ledger and what changed. If the same request is booked already, at most the leases
@@ -46,7 +47,9 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
 
     Raises:
         Refused: with every contradiction between the request and existing claims, or if the request
-            releases or renews what is not held. A refused request books nothing.
+            contradicts itself, changes a demand of other requesters, releases or renews what is not
+            held, or is a :class:`Restoration` that may not undo newer claims and would do so. A
+            refused request books nothing.
     """
     match request:
         case Join():

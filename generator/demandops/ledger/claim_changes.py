@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.ledger.kept_replicas import Instance
@@ -32,7 +32,8 @@ class ClaimChange:
     @property
     def only_renews(self) -> bool:
         """Whether the claim existed before and at most its lease changed."""
-        return bool(self.before and self.after and self.before.booked == self.after.booked)
+        before, after = self.before, self.after
+        return bool(before and after and replace(after, lease=before.lease) == before)
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +43,8 @@ class Changes:
     ``not_held``: in words, what a shutdown lists, but its requesters do not hold. ``shutdowns``:
     the digests of shutdowns that the ledger now records or forgets. ``repeats``: the earlier
     shutdown that the request repeats, or ``None``. ``kept``: the service instances whose kept
-    replicas changed. ``waiting``: the ids of the demands that begin or cease to wait.
+    replicas changed. ``waiting``: the ids of the demands that begin or cease to wait, or that now
+    wait with another goal.
     """
 
     claims: tuple[ClaimChange, ...] = ()

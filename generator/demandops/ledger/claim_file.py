@@ -356,8 +356,8 @@ def read(text: str, path: str) -> Claim:
     """Return the claim in a file.
 
     Raises:
-        InvalidInput: with every fault. One of these is that the path does not match the ids in the
-            file.
+        InvalidInput: with every fault in the fields; if there is none, if the path does not match
+            the ids in the file.
     """
     data = strict_yaml.load(text, path)
     kind = data.get("kind") if isinstance(data, dict) else None
@@ -402,9 +402,9 @@ def read(text: str, path: str) -> Claim:
 
 
 def kind_of(path: str) -> SubjectKind | None:
-    """Return whether the claim file at a path is for an application or for a connection.
+    """Return the kind of subject to which the claim file at ``path`` belongs.
 
-    Return ``None`` if the path is not that of a claim file.
+    Return ``None`` if the path does not have the form of a claim file's path.
     """
     parts = path.split("/")
     if len(parts) != 5 or parts[0] != LEDGER_ROOT or not path.endswith(".yaml"):

@@ -2,7 +2,8 @@
 
 The repo alone, not the clock, decides whether an override applies, because a replay and ``verify``
 must give the same bytes as the original run. So the generator commits a marker when an override
-ends. If a person then writes a later end into the override, the override is in effect again.
+ends. If a person then writes another end into the override, or removes the end, the override is in
+effect again.
 """
 
 from __future__ import annotations
@@ -48,7 +49,8 @@ def text_of(override: Override) -> str:
 def read(files: Mapping[str, str]) -> dict[str, str]:
     """Return a map from the name of each ended override to the end that the override then had.
 
-    Files that are not valid markers are skipped; :func:`stale_markers` lists them for removal.
+    ``files`` maps paths to texts. Files that are not valid markers are skipped;
+    :func:`stale_markers` lists them for removal.
     """
     ended = {}
     for path, text in files.items():
@@ -62,16 +64,16 @@ def read(files: Mapping[str, str]) -> dict[str, str]:
     return ended
 
 
-def stale_markers(paths: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
-    """Return the paths of the markers that no longer apply, sorted.
+def stale_markers(files: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
+    """Return the paths of those markers in ``files`` that no longer apply, sorted.
 
     These are the markers that are not valid, whose override is gone, or whose override now has
     another end or no end.
     """
-    ended = read(paths)
+    ended = read(files)
     current = {
         path_of(name)
         for name, override in overrides.items()
         if override.end is not None and ended.get(name) == format_time(override.end)
     }
-    return sorted({*paths} - current)
+    return sorted({*files} - current)

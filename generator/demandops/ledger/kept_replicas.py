@@ -62,15 +62,16 @@ Each step has fewer replicas and a later end than the previous step.
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
     """Return the steps of a service whose demands now need more or fewer replicas.
 
-    If the demands need fewer, one step more keeps ``was_needed`` replicas until ``until``. A step
-    that keeps no more than ``needed`` replicas is left out.
+    If the demands need fewer, a new step keeps ``was_needed`` replicas until ``until``. It replaces
+    the steps that keep no more replicas than that. Steps that keep no more than ``needed`` replicas
+    or have ended are left out.
 
     Args:
         steps: the steps so far.
         needed: how many replicas the demands need now.
         was_needed: how many replicas the demands needed before.
         now: the time.
-        until: the end of an additional step.
+        until: the end of the new step.
     """
     if was_needed > needed:
         steps = (*(one for one in steps if one.replicas > was_needed), Kept(was_needed, until))
@@ -88,9 +89,9 @@ def _minute(moment: datetime) -> str:
 
 @dataclass(frozen=True, slots=True)
 class KeptReplicas:
-    """The replicas that all services keep.
+    """The records of all services that keep replicas.
 
-    ``steps`` maps each service instance to its steps: how many replicas it keeps until when.
+    ``steps`` maps each such service instance to its steps: how many replicas it keeps until when.
     ``by_minute`` maps a minute to the instances whose first step ends in this minute.
     """
 
@@ -169,7 +170,7 @@ class _KeptReplicasFile(FrozenModel):
 
 
 def read(text: str, path: str) -> tuple[Instance, Steps] | None:
-    """Return the record in a file, or ``None`` if the file is not valid."""
+    """Return the record in a file; ``None`` if the file is not valid or belongs at another path."""
     try:
         file = parse_file(_KeptReplicasFile, text, path)
     except InvalidInput:

@@ -1,7 +1,8 @@
 """The ledger: which demand holds which subject, as a set of persistent maps.
 
 A :class:`Ledger` never changes, because each request makes a new one. How long that takes depends
-on the size of the request, not on the size of the ledger.
+on the size of the request and on the number of claims on its subjects, not on the number of all
+claims.
 """
 
 from __future__ import annotations
@@ -37,12 +38,12 @@ Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 class Ledger:
     """All claims, and an index of them.
 
-    ``claims`` maps each subject to the claims on it, sorted by demand id, because the planner asks
-    for all claims on a subject. All claims on a subject agree on its type and nodes. If a person
+    ``claims`` maps each subject to the claims on it, sorted by demand id. The generator books only
+    claims that agree with the other claims on the subject about its type and nodes. If a person
     writes a claim that disagrees, the first claim on the subject decides.
-    ``index`` maps each entry of :func:`index_entries` to the claims that have this entry.
-    ``minutes`` has each minute in which a lease ends, so that the next end is found without a scan
-    of all claims.
+    ``index`` maps each entry of :func:`index_entries` to the keys of the claims that have it.
+    ``minutes`` has each minute in which a lease and its slack end, so that the next end is found
+    without a scan of all claims.
     ``ended`` maps the name of each ended override to the end that the override then had.
     ``shutdowns`` are the recent shutdowns.
     ``applications_on`` maps each node to the number of applications for which the node was chosen.
@@ -93,9 +94,9 @@ class Ledger:
         return first.connection if first else None
 
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
-        """Return the ``known`` versions that claims on an application ask for.
+        """Return the ``known`` versions and channels that claims on an application ask for.
 
-        The result also has an empty text if a claim asks for no version, or for an unknown version.
+        The result also has an empty text if a claim asks for no version, or for an unknown one.
         """
         by_version = {word: self.index.get(("version", application, word)) for word in known}
         found = {word: len(keys) for word, keys in by_version.items() if keys}
@@ -172,7 +173,7 @@ class Ledger:
         return self._claims("demand", demand)
 
     def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
-        """Return the claims that overrides keep on ``subject``, or on all subjects."""
+        """Return the claims that overrides keep on ``subject``; without it, on all subjects."""
         return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
 
     def moved_applications(self) -> tuple[str, ...]:
@@ -215,12 +216,15 @@ class Ledger:
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:
-        """Return when the first lease ends, or ``None`` if there is no lease."""
+        """Return when the first lease and its slack end, or ``None`` if there is no lease.
+
+        A lease that has not started counts with the end :data:`UNSTARTED`.
+        """
         found = (claim for key in self.first_to_end() or () if (claim := self.get(key)))
         return min((claim.lease.expires_at for claim in found if claim.lease), default=None)
 
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
-        """Return the keys of the claims whose leases end in the earliest minute.
+        """Return the keys of the claims whose leases, with their slack, end in the earliest minute.
 
         Return ``None`` if there is no lease. Each call returns the same object until a claim enters
         the set, leaves the set or gets another lease. So a caller that compares the objects sees
@@ -235,7 +239,7 @@ class Ledger:
         return tuple(claim for claim in found if claim.lease and not claim.lease.has_started)
 
     def ended_claims(self, now: datetime) -> tuple[Claim, ...]:
-        """Return the claims whose lease ended before ``now``, sorted by the end of the lease."""
+        """Return the claims whose lease and slack ended before ``now``, the earliest end first."""
         over = (minute for minute in self.minutes if minute <= _minute(now))
         ended = [
             (claim.lease.expires_at, claim)
@@ -254,11 +258,11 @@ class Ledger:
         return tuple(claim for claim in found if claim is not None)
 
     def connections_at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
-        """Return the ids of the connections of a type that end at ``node``, sorted."""
+        """Return the ids of the connections of a type from or to ``node``, sorted."""
         return self._ids("link", kind.name, node)
 
     def connections_needing(self, node: str) -> tuple[str, ...]:
-        """Return the ids of the connections that end at a node or use its broker, sorted."""
+        """Return the ids of the connections from or to a node, or that name its broker, sorted."""
         found = {
             id
             for kind in connection_types.CONNECTION_TYPES
@@ -267,7 +271,7 @@ class Ledger:
         return tuple(sorted(found | set(self._ids("broker", node))))
 
     def indexed_names(self, entry: str) -> set[str]:
-        """Return all names in the index entries of one kind, such as ``requester``.
+        """Return the last word of each index entry of one kind, such as ``requester``.
 
         This scans the whole index, so it is slow for a large ledger.
         """

@@ -2,8 +2,8 @@
 
 A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
 record of the first shutdown, the repeat could release another demand of the same requesters. If a
-join adds something for one of the requesters, the record is removed, because the next shutdown may
-mean what the join added.
+join or a restoration books something for one of the requesters, the record is removed, because the
+next shutdown may mean what was booked.
 
 Each record is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
 """
@@ -34,14 +34,14 @@ REMEMBERED = timedelta(minutes=15)
 """How long after a shutdown the same shutdown counts as a repeat, not as a new one."""
 
 _KEPT = timedelta(hours=1)
-"""How long a record is kept.
+"""How old a record must be before :meth:`RecentShutdowns.forget` removes it because of its age.
 
 This is longer than :data:`REMEMBERED`, because a repeat that was received in time may wait in a
 journal before it is decided.
 """
 
 _FORGOTTEN = 10
-"""The highest number of old records that one booking removes."""
+"""The highest number of old records that one request removes."""
 
 _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 
@@ -178,7 +178,7 @@ class _ShutdownFile(FrozenModel):
 
 
 def read(text: str, path: str) -> RecentShutdown | None:
-    """Return the record in a file, or ``None`` if the file is not valid."""
+    """Return the record in a file; ``None`` if the file is not valid or belongs at another path."""
     try:
         file = parse_file(_ShutdownFile, text, path)
     except InvalidInput:

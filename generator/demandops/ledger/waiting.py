@@ -111,7 +111,8 @@ class _WaitingFile(FrozenModel):
 def read(text: str, path: str) -> WaitingDemand | None:
     """Return the waiting demand in a file, or ``None`` if the file is not valid.
 
-    A valid file contains a goal of the action ``Demand``, for the demand that the file names.
+    A valid file contains a put of the action ``Demand`` for the demand that the file names, and is
+    at the path of this demand. The put itself may have faults.
     """
     try:
         file = parse_file(_WaitingFile, text, path)

@@ -11,6 +11,7 @@ from dataclasses import replace
 import pytest
 import yaml
 from demandops import naming
+from demandops.demand import demand_goal
 from demandops.errors import Refused, suggestion
 
 from tests.kit.config import brokers, skeleton
@@ -297,3 +298,18 @@ def test_names_are_made_once_for_each_of_many_topics() -> None:
     assert repo.send(made).outcome == "booked"
     after = naming.topic_part.cache_info()
     assert after.hits + after.misses - before.hits - before.misses < 50 * count
+
+
+@pytest.mark.parametrize(
+    ("written", "told"),
+    [
+        ("[" * 100_000 + "]" * 100_000, "is nested deeper than 50 levels; make it flatter"),
+        ("9" * 5_000, "has an integer of too many digits; write a shorter one"),
+        ("fast", 'is not JSON; text needs its own quotes, as in "\\"fast\\""'),
+    ],
+)
+def test_a_json_text_that_cannot_be_read_is_told_why(written: str, told: str) -> None:
+    made = put("d", "vehicle01")
+    made["applications"][0]["parameters_json"] = {"rate": written}
+    found = [one.message for one in demand_goal.parse(made)[1]]
+    assert found == [told]

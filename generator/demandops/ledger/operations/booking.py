@@ -27,8 +27,9 @@ def book(
         one: what to book.
         request: the id of the request.
         key: the key of the claim.
-        current: the demand's claim on the same subject before the request, or ``None``.
-        now: when the request was received. A claim that is only renewed keeps its booking time.
+        current: the demand's claim on the same subject so far, or ``None``.
+        now: when the request was received. A claim of which at most the lease changes keeps its
+            booking time.
         joined: whether a join books the claim; a join also keeps what ``current`` holds.
     """
     claim = Claim(

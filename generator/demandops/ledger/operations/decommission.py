@@ -1,9 +1,10 @@
 """Decommissioning: a node or a requester leaves for good, so claims are released or reduced.
 
-If a node is decommissioned, the applications on the node, the inputs from the node and the
-connections that end at the node are released for all requesters. If a requester is decommissioned,
-all its claims are released. These include claims that also name other requesters, because the
-others might never release the claims.
+If a node is decommissioned, these are released for all requesters: the applications that run on the
+node, the inputs from it, the deliveries to it, and the connections from or to it. A connection that
+names the node's broker loses the broker. If a requester is decommissioned, all its claims are
+released. These include claims that also name other requesters, because the others might never
+release the claims.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[
     If a requester is decommissioned, waiting demands that have no other requester are removed.
 
     Raises:
-        Refused: if there is no claim and no waiting demand to end.
+        Refused: if there is no claim to release or reduce, and no waiting demand to remove.
     """
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)

@@ -14,7 +14,7 @@ def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
     If the demand waits for room, it stops waiting.
 
     Raises:
-        Refused: if the demand holds nothing or belongs to other requesters.
+        Refused: if the demand neither holds anything nor waits, or belongs to other requesters.
     """
     waited = (request.demand,) * is_waiting(ledger, request)
     held = ledger.claims_of_demand(request.demand) if waited else owned_claims(ledger, request)

@@ -1,4 +1,4 @@
-"""A drain moves placed applications, with their connections, off a node that is drained.
+"""A drain moves placed applications and services, with their connections, off a drained node.
 
 The generator requests the drain. :mod:`demandops.plan.nodes.relocation` determines which claims
 change.
@@ -15,7 +15,7 @@ from demandops.ledger.ledger import Ledger
 
 @dataclass(frozen=True, slots=True)
 class Drain(DemandRequest):
-    """The generator's request to move the applications that it placed on the drained node ``id``.
+    """The generator's request to move what it placed on the drained node ``id``.
 
     ``moves`` are the changes of claims. ``moved`` has a text about each application or service that
     moves. ``stays`` has a text about each application or service that cannot move.

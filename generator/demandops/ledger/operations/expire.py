@@ -10,9 +10,9 @@ from demandops.ledger.ledger import Ledger
 
 
 def expire(ledger: Ledger, request: Expire, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger without the ended claims of a demand, and the changes.
+    """Return the ledger without those claims of a demand whose lease has ended, and the changes.
 
-    A claim has ended if its lease has ended. Other claims of the demand stay.
+    Other claims of the demand stay.
     """
     held = ledger.claims_of_demand(request.demand)
     ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]

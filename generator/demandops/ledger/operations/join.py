@@ -12,19 +12,25 @@ from demandops.ledger.claim_changes import Changes, claim_changes
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.booking import book
 from demandops.ledger.operations.conflicts import conflicts
+from demandops.subject import Subject
 
 
 def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger with the request's items added to what its demand holds, and the changes.
 
     Raises:
-        Refused: with every conflict with an existing claim.
+        Refused: with every conflict with an existing claim, or between items of the request.
     """
     faults: list[Fault] = []
     start = ledger
     keys: list[ClaimKey] = []
+    listed = set[Subject]()
     for one in request.demanded:
-        faults += conflicts(one, ledger)
+        found = [*conflicts(one, start)]
+        known = {each.field for each in found}
+        above = conflicts(one, ledger, above=True) if one.held.subject in listed else ()
+        faults += [*found, *(each for each in above if each.field not in known)]
+        listed.add(one.held.subject)
         key = ClaimKey(one.held.subject, demand_id(request.id, one.requesters))
         ledger = book(ledger, one, request.id, key, ledger.get(key), now, joined=True)
         keys.append(key)

@@ -19,7 +19,7 @@ def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger,
     lease yet.
 
     Raises:
-        Refused: if the demand holds nothing or belongs to other requesters.
+        Refused: if the demand neither holds anything nor waits, or belongs to other requesters.
     """
     if is_waiting(ledger, request) and not ledger.claims_of_demand(request.demand):
         return ledger, Changes()

@@ -1,4 +1,4 @@
-"""The owners of a demand that has an id: the requesters of its claims.
+"""The owners of a demand that has an id: the requesters for whom it holds claims or waits.
 
 A request is refused if it names none of the owners. So if a second requester chooses the same
 demand id by chance, its requests cannot change the demand of the first requester.
@@ -18,7 +18,7 @@ def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
     """Return whether the request's demand waits for room.
 
     Raises:
-        Refused: if the demand belongs to other requesters.
+        Refused: if the demand waits and belongs to other requesters.
     """
     waiting = ledger.waiting.get(request.demand)
     if waiting is not None:
@@ -39,6 +39,7 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
                 claim.demand
                 for requester in request.own_requesters
                 for claim in ledger.claims_of_requester(requester)
+                if claim.keeping_override is None
             }
         )
         never = "the demand has ended, or was never booked; see 'demandops log'"

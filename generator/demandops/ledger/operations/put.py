@@ -18,7 +18,8 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger in which the demand holds only what ``request`` lists, and the changes.
 
     Raises:
-        Refused: if the demand belongs to other requesters or conflicts with other demands.
+        Refused: if the demand belongs to other requesters, conflicts with other demands, or lists
+            an application or a connection twice.
     """
     start, demand = ledger, request.demand
     held = ledger.claims_of_demand(demand)

@@ -48,7 +48,8 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
     """Return the ledger with the claims of the earlier commit, and the changes.
 
     Raises:
-        Refused: if the restoration undoes newer claims and ``drop_newer`` is not set.
+        Refused: if the restoration undoes newer claims and ``drop_newer`` is not set. Claims that
+            overrides keep do not count.
     """
     changes = _changes(ledger, request)
     if not request.drop_newer:
@@ -113,10 +114,14 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
 
 
 def faults(request: Restoration, world: World) -> Iterator[Fault]:
-    """Yield the faults of restored claims that are not valid in the current configuration."""
+    """Yield the faults of claims that the restoration changes or books.
+
+    There is a fault if the current configuration does not allow the claim. Claims that overrides
+    keep are not checked.
+    """
     for change in _changes(world.ledger, request):
         after = change.after
-        if after is None or after.keeping_override is not None:  # kept claims are not checked
+        if after is None or after.keeping_override is not None:
             continue
         booking = request_for(after)
         for found in (

@@ -6,7 +6,9 @@ If several claims hold the topic for the requester, the hold is taken from the f
 2. the oldest other claim with this request id
 3. the oldest claim with another request id
 
-A shutdown never takes holds from the claims of a demand that has an id.
+If the shutdown lists no topic of an application or a connection, it takes all holds that the
+requester has in the first of these claims. A shutdown never takes holds from the claims of a demand
+that has an id.
 """
 
 from __future__ import annotations
@@ -81,7 +83,8 @@ def _holds(
     matching topic, or ``None``. ``keys`` are the keys of the matching topics that the requester
     holds in ``claim``.
 
-    If no topic is listed, ``claim`` is the first of ``claims``, and ``keys`` has all its topics.
+    If no topic is listed or ``claims`` is empty, yield once: ``text`` describes the subject,
+    ``claim`` is the first of ``claims`` or ``None``, and ``keys`` has all its topics.
     """
     subject = one.held.subject
     listed = [words for words, _ in one.held.listed_topics(one.held)]
@@ -100,9 +103,15 @@ def _holds(
             yield f"{subject}: {words} for {requester}", None, []
 
 
+def _origin(claim: Claim) -> str:
+    if claim.joined:
+        return f"request '{claim.request}'"
+    return f"demand '{claim.demand}', which a shutdown cannot end"
+
+
 def _nothing_held(ledger: Ledger, request: Shutdown) -> Fault:
     near = [
-        f"{claim.subject} for {', '.join(claim.requesters)} (request '{claim.request}')"
+        f"{claim.subject} for {', '.join(claim.requesters)} ({_origin(claim)})"
         for subject in request.subjects()
         for claim in ledger.claims_on(subject)
     ] or [
