@@ -177,7 +177,7 @@ def test_an_override_that_a_hold_keeps_back_is_not_said_to_be_in_force(
     assert [Path(path).stem for path in ran.json()["not_rendered"]] == [FUSION]
     status = demandops("status", "--state-repo", fleet.path)
     assert status.code == 1
-    assert "not well: files that a generator has yet to write: 1\n" in status.err
+    assert "not well: files that a generator has yet to write or remove: 1\n" in status.err
     assert demandops("request", EXPERIMENT[2], "--state-repo", fleet.path).code == 0
     ran = demandops("get", "overrides", "calm", "--state-repo", fleet.path, "-o", "json")
     assert (ran.json()["items"][0]["state"], ran.err) == ("in force", "")

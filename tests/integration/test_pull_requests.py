@@ -552,5 +552,5 @@ def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Run
     assert "Releases: 3 to change." in out
     assert out.endswith(
         "\n3 parts of this report are left out because a comment has a limited length; "
-        "`demandops check` shows all.\n"
+        "`demandops check --output json` has more.\n"
     )

@@ -97,3 +97,15 @@ def test_a_command_whose_package_is_missing_says_so(
     assert capsys.readouterr().err == (
         "error: serve needs rclpy, which is not installed; see README.md, 'With ROS 2'\n"
     )
+
+
+def test_a_package_that_no_ros_command_needs_has_another_remedy(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, "demandops.cli.views.diff", raising=False)
+    monkeypatch.delitem(sys.modules, "demandops.render.changes.merge_preview", raising=False)
+    monkeypatch.setitem(sys.modules, "difflib", None)
+    assert main.run(["diff", "a", "b"]) == 1
+    assert capsys.readouterr().err == (
+        "error: diff needs difflib, which is not installed; install demandops again\n"
+    )

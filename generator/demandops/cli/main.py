@@ -56,11 +56,14 @@ COMMANDS = {
     "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
-"""Maps a command's name to the package of the command's module and to the short help."""
+"""Maps a command's name to the package of the command's module, and to the short help.
+
+A package without a dot is below ``demandops.cli``, except ``demandops_ros``.
+"""
 
 
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-"""The commands that run until they are stopped.
+"""The commands that always run until they are stopped.
 
 They log or fill the screen, so they do not show the progress of git operations.
 """
@@ -77,7 +80,11 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import and return a command; raise ClickException if a package that it needs is missing."""
+    """Import and return a command.
+
+    Raises:
+        click.ClickException: a Python package that the command needs, or git, is not installed.
+    """
     room = COMMANDS[name][0]
     ros = room.split(".")[0] == "demandops_ros"
     word = f"{name}_" if iskeyword(name) else name.replace("-", "_")
@@ -88,8 +95,9 @@ def load(name: str) -> click.Command:
         missing = str(error.name).split(".")[0]
         if missing in ("demandops", "demandops_ros"):
             raise
+        remedy = "see README.md, 'With ROS 2'" if ros else "install demandops again"
         raise click.ClickException(
-            f"{name} needs {missing}, which is not installed; see README.md, 'With ROS 2'"
+            f"{name} needs {missing}, which is not installed; {remedy}"
         ) from None
     except ImportError:  # raised by GitPython
         if shutil.which("git"):

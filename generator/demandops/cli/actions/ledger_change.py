@@ -32,7 +32,12 @@ def await_answer(future: Future[Any]) -> None:
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
     """Yield a started :class:`Generator`, and close it at the end of the block.
 
-    Within the block, SIGTERM acts like Ctrl-C.
+    Within the block, SIGTERM acts like Ctrl-C, if this is the main thread.
+
+    Raises:
+        StateRepoError: the state repo cannot be reached, or no generator may write to it.
+        InvalidInput: a file is not valid, and has no last valid version.
+        SigningFailed: the key cannot sign.
     """
     before = signal.getsignal(signal.SIGTERM)
     with suppress(ValueError):  # only the main thread may set a handler
@@ -70,7 +75,7 @@ def print_consequences(decision: Decision) -> None:
 
 
 def print_refusal(title: str, faults: Iterable[dict[str, Any]]) -> None:
-    """Print the title and the faults on stderr. ``faults`` have the form of the JSON output."""
+    """Print the title and the faults on stderr. Each fault has the form of the JSON output."""
     errors.print(title)
     for each in faults:
         errors.print(f"  {Fault(**each)}")

@@ -16,7 +16,9 @@ _COMMON = {
 
 
 def describe(schema: dict[str, Any], root: str) -> None:
-    """Add a description and an example to each property of a schema and its definitions.
+    """Add descriptions and examples to the properties of a schema and its definitions.
+
+    They are in ``templates/schemas/properties.yaml``. A property that the file lacks stays as it is.
 
     Args:
         schema: the JSON Schema of a model; the function changes it.

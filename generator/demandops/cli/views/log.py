@@ -155,7 +155,7 @@ def log(
 
 
 def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
-    """Refuse filters that no commit ever matched: they are probably misspelled."""
+    """Refuse names that no commit is about and, of nodes, the inventory lacks: probably misspelled."""
     known: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
     for entry in repo.log() if known else ():
         for name, values in known.items():
@@ -187,7 +187,8 @@ def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iter
     path = release if "/" in release else repo.release_path(release, tip)
     if path is None:
         raise StateRepoError(
-            f"there never was a release '{release}'; `demandops bookkeeping` lists what runs"
+            f"up to commit {tip[:10]}, there was no release {quoted(release)}; `demandops status` "
+            "lists the current ones"
         )
     return repo.log(commit_range, path)
 

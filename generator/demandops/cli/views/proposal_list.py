@@ -18,8 +18,11 @@ from demandops.staterepo.write.proposal_branch import PendingProposal, pending_p
 def proposals(repo: Reader) -> list[Json]:
     """Return the proposals as JSON data.
 
-    If DEMANDOPS_FORGE_TOKEN_FILE names a file with a token, GitHub or Gitea provides the link to
-    the pull request of each proposal. Otherwise the links are None.
+    If DEMANDOPS_FORGE_TOKEN_FILE names a file with a token, GitHub or Gitea is asked for the link to
+    the pull request of each proposal. A link is None if there is no answer or no pull request.
+
+    Raises:
+        RemoteAway: the state repo cannot be reached.
     """
     pending = list(pending_proposals(repo.repository))
     forge = _forge(repo) if pending else None

@@ -191,9 +191,10 @@ class Status:
         return cls(commit, rows, problems, known, pending, old, left, missing, unreadable)
 
     def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
-        """Return a text that counts problems and unhealthy releases; empty if nothing is wrong.
+        """Return a text that counts everything that is wrong; empty if nothing is wrong.
 
-        Only releases on clusters with a kubeconfig in ``clusters`` count.
+        Of the releases, only those on clusters with a kubeconfig in ``clusters`` count. Missing
+        inputs do not count.
         """
         readable = {name for name, cluster in clusters.items() if cluster.kubeconfig}
         watched = [row for row in self.rows if row["cluster"] in readable]
@@ -201,7 +202,7 @@ class Status:
         healthy = sum(row["health"] == "healthy" for row in watched)
         counts: dict[str, int | str] = {
             "problems in files": len(self.problems),
-            "files that a generator has yet to write": len(self.not_rendered),
+            "files that a generator has yet to write or remove": len(self.not_rendered),
             "clusters with an old bootstrap file": len(self.old_bootstraps),
             "objects that belong to no release": len(self.orphans),
             "releases failing": failing,
@@ -232,7 +233,7 @@ class Status:
         if self.problems:
             count = len(self.problems)
             title = "1 problem" if count == 1 else f"{count} problems"
-            text.insert(0, f"{title}; the last valid version of each file is in effect:")
+            text.insert(0, f"{title}; the last valid version of each file, if any, is in effect:")
         further = map(str, (*self.old_bootstraps, *self.orphans))
         return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
 

@@ -269,12 +269,18 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
-    """Return the commits that started, changed and stopped the object of ``match``."""
+    """Return the commits that started, changed and stopped the object of ``match``.
+
+    There are none of a node or requester, and none of a demand that no commit names.
+    """
     if match.kind in ("node", "requester"):  # `demandops log` lists their commits
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":
         return _history(repo, repo.history(match.path, str(snapshot.commit), most))
-    *newer, first = demand_commits(repo, snapshot, match.name)
+    about = demand_commits(repo, snapshot, match.name)
+    if not about:  # the history was made anew
+        return _history(repo, PathHistory(None, (), 0, None))
+    *newer, first = about
     held = ("demand", match.name) in snapshot.state.ledger.index
     stopped = None if held or not newer else newer.pop(0)
     left = max(len(newer) - most, 0)
