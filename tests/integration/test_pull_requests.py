@@ -13,6 +13,8 @@ import yaml
 from demandops.cli.main import run
 from demandops.cli.repo import pull_request_comment
 from demandops.staterepo.pull_request import merge_check as checking
+from demandops.staterepo.pull_request.merge_check import CheckResult
+from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
 
 from tests.kit.cli import Run
 from tests.kit.goals import APP
@@ -519,6 +521,13 @@ def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Run) -> 
     outside = without_code(out)
     for mark in ("@", "javascript", "http:", "<b>", "]("):
         assert mark not in outside
+
+
+def test_why_a_chart_is_not_rendered_cannot_act_in_a_comment() -> None:
+    charts = RenderedCharts(not_rendered={"cam": "its dependency @everyone is not in charts/"})
+    comment = pull_request_comment.report(CheckResult((), charts=charts))
+    told = "\nchart cam not rendered: `its dependency @everyone is not in charts/`\n"
+    assert told in comment
 
 
 def without_code(text: str) -> str:

@@ -49,7 +49,7 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
 
 
 def print_proposal(proposal: PendingProposal, output: str) -> None:
-    """Print a proposal's branch, summary, requesters and time on stderr, but not with JSON output."""
+    """Print a proposal's branch, summary, requesters and time on stderr, unless output is JSON."""
     if output == "text":
         errors.print(f"{proposal.branch}: {proposal.summary}")
         errors.print(

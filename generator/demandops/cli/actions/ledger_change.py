@@ -35,9 +35,7 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
     Within the block, SIGTERM acts like Ctrl-C, if this is the main thread.
 
     Raises:
-        StateRepoError: the state repo cannot be reached, or no generator may write to it.
-        InvalidInput: a file is not valid, and has no last valid version.
-        SigningFailed: the key cannot sign.
+        StateRepoError, InvalidInput: if the state repo or the key cannot be used.
     """
     before = signal.getsignal(signal.SIGTERM)
     with suppress(ValueError):  # only the main thread may set a handler

@@ -66,7 +66,9 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 @click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
 @click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas.")
 @click.option("--on", "target", metavar="NODE", help="Move services to this node.")
-@click.option("--use-version", "version", metavar="WORD", help="Pin the chart to a version or channel.")
+@click.option(
+    "--use-version", "version", metavar="WORD", help="Pin the chart to a version or channel."
+)
 @click.option(
     "--values",
     "values_file",

@@ -9,7 +9,7 @@ how many parts are omitted.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from demandops.plan.views.bookkeeping import EntryChange
 from demandops.quoting import lines, one_line
@@ -36,10 +36,13 @@ def report(checked: CheckResult, longest: int = LONGEST) -> str:
     return _bounded([*parts, *_consequence(checked)], longest)
 
 
-def chart_lines(charts: RenderedCharts | None) -> Iterator[str]:
+def chart_lines(
+    charts: RenderedCharts | None, shown: Callable[[str], str] = one_line
+) -> Iterator[str]:
     """Yield lines that say which charts helm rendered, and why it did not render the others.
 
-    If helm is missing, yield only a line about that. If ``charts`` is None, yield nothing.
+    If helm is missing, yield only a line about that. If ``charts`` is None, yield nothing. A reason
+    may contain text that people wrote, so ``shown`` makes it safe to print.
     """
     if charts is None:
         return
@@ -52,7 +55,7 @@ def chart_lines(charts: RenderedCharts | None) -> Iterator[str]:
             f"({charts.releases} releases, {charts.examples} examples)"
         )
     for name, reason in charts.not_rendered.items():
-        yield f"chart {name} not rendered: {one_line(reason)}"
+        yield f"chart {name} not rendered: {shown(reason)}"
 
 
 def code(text: str) -> str:
@@ -83,7 +86,7 @@ def _head(checked: CheckResult) -> Iterator[str]:
         yield f"## DemandOps: {'1 error' if found == 1 else f'{found} errors'}\n"
     else:
         yield "## DemandOps: valid, and every release renders\n"
-    yield from (f"\n{line}\n" for line in chart_lines(checked.charts))
+    yield from (f"\n{line}\n" for line in chart_lines(checked.charts, code))
     if checked.base:
         invalid = ", whose invalid files are compared in their last valid versions"
         yield f"\nCompared with {code(checked.base[:10])}{'' if checked.base_valid else invalid}.\n"

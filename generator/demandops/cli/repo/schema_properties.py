@@ -18,7 +18,7 @@ _COMMON = {
 def describe(schema: dict[str, Any], root: str) -> None:
     """Add descriptions and examples to the properties of a schema and its definitions.
 
-    They are in ``templates/schemas/properties.yaml``. A property that the file lacks stays as it is.
+    They come from ``templates/schemas/properties.yaml``. Other properties stay as they are.
 
     Args:
         schema: the JSON Schema of a model; the function changes it.

@@ -27,8 +27,8 @@ from demandops.staterepo.reader import Reader
 def diff(before: str, after: str, state_repo: str, output: str) -> None:
     """Show the differences between two commits.
 
-    The command compares the bookkeeping, the releases and other files below clusters/. A and B are commits, or times like
-    2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
+    The command compares the bookkeeping, the releases and other files below clusters/. A and B are
+    commits, or times like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
 
     \b
     Examples:

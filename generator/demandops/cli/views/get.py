@@ -81,7 +81,12 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
 @state_repo_option
 @_filters
 @at_option
-@click.option("-w", "--watch", is_flag=True, help="Print the list again when a new commit or proposal changes it.")
+@click.option(
+    "-w",
+    "--watch",
+    is_flag=True,
+    help="Print the list again when a new commit or proposal changes it.",
+)
 @output_formats("text", "wide", "name", "json", "yaml")
 def get(
     kind: str,

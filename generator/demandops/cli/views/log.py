@@ -155,7 +155,10 @@ def log(
 
 
 def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
-    """Refuse names that no commit is about and, of nodes, the inventory lacks: probably misspelled."""
+    """Refuse names that are probably misspelled.
+
+    These are names that no commit is about. A node's name is not refused if the inventory has it.
+    """
     known: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
     for entry in repo.log() if known else ():
         for name, values in known.items():

@@ -18,8 +18,9 @@ from demandops.staterepo.write.proposal_branch import PendingProposal, pending_p
 def proposals(repo: Reader) -> list[Json]:
     """Return the proposals as JSON data.
 
-    If DEMANDOPS_FORGE_TOKEN_FILE names a file with a token, GitHub or Gitea is asked for the link to
-    the pull request of each proposal. A link is None if there is no answer or no pull request.
+    The links to the pull requests come from the GitHub or Gitea that demandops.yaml names, with the
+    token in the file that DEMANDOPS_FORGE_TOKEN_FILE names. If one of these is missing, or there is
+    no answer or no pull request, a link is None.
 
     Raises:
         RemoteAway: the state repo cannot be reached.

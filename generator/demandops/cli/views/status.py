@@ -34,6 +34,7 @@ from demandops.plan.views.missing_inputs import MissingInput, missing_inputs
 from demandops.runtime import REAL
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
+from demandops.staterepo.git.repository import RemoteAway
 from demandops.staterepo.load.problem_report import Problem
 from demandops.staterepo.reader import Reader
 
@@ -130,7 +131,8 @@ def _wait_until_healthy(
 ) -> Status:
     """Wait until nothing is wrong or ``timeout`` seconds have passed; return the last status.
 
-    A cluster may take ``patience_s`` seconds to answer.
+    A cluster may take ``patience_s`` seconds to answer. While the state repo cannot be reached, the
+    status is that of the commit fetched last.
     """
     end, told = REAL.monotonic() + timeout, ""
     while (amiss := found.amiss(clusters)) and REAL.monotonic() < end:
@@ -138,7 +140,10 @@ def _wait_until_healthy(
             errors.print(f"waiting: {amiss}")
             told = amiss
         REAL.sleep(_POLL_S)
-        repo.refresh()
+        try:
+            repo.refresh()
+        except RemoteAway as error:  # then the last fetched commit is shown
+            errors.print(f"warning: {error}")
         found = Status.of(repo, clusters, patience_s)
     return found
 
