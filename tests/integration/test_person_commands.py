@@ -256,6 +256,11 @@ def test_a_fleet_is_watched_live(demandops: Run, joined: GitRepo) -> None:
         watching.read_until("Join ")
         joined.commit({"inventory/README.md": "hello\n"}, "A note on the fleet\n")
         watching.read_until("A note on the fleet")
+        valid = joined.files()["inventory/nodes.yaml"]
+        joined.commit({"inventory/nodes.yaml": "nodez: []\n"}, "A slip\n")
+        watching.read_until("not well, last valid state: inventory/nodes.yaml: ")
+        joined.commit({"inventory/nodes.yaml": valid}, "Mended\n")
+        watching.read_until("Mended")
         watching.type(CTRL_C)
         assert watching.end() == 0
     ran = demandops("watch", "--state-repo", joined.path)

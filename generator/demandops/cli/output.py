@@ -115,7 +115,7 @@ at_option = click.option(
     "--at",
     metavar="REV|TIME",
     help="A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h; default: "
-    "the newest commit.",
+    "the newest commit, or in a checkout the one that is checked out.",
 )
 
 

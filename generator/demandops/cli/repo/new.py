@@ -75,7 +75,12 @@ def new() -> None:
     "be repeated. Each further service reads the outputs of the service before it.",
 )
 @click.option("--image", default="", metavar="IMAGE", help="The image, with a tag or digest.")
-@click.option("--node", default="", metavar="ID", help="The node of the example demand.")
+@click.option(
+    "--node",
+    default="",
+    metavar="ID",
+    help="The node of the example demand. Default: an edge server if there is one.",
+)
 @directory_option
 @output_option
 def application(  # noqa: PLR0913 - as many as options

@@ -68,7 +68,7 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
     "--requester",
     metavar="ID",
     shell_complete=names_of("requesters"),
-    help="List only commits that book or release claims of this requester.",
+    help="List only commits about claims or waiting demands of this requester.",
 )
 @click.option(
     "--application",

@@ -49,7 +49,8 @@ _PATIENCE_S = 10
 @click.option(
     "--wait",
     is_flag=True,
-    help="Wait until the exit code would be 0, or until --timeout has passed.",
+    help="Wait until the exit code would be 0, or until --timeout has passed. An invalid file that "
+    "no generator has reported yet ends the wait at once.",
 )
 @click.option(
     "--timeout",

@@ -76,8 +76,9 @@ def why(
     The command shows the requesters, the configuration and overrides that apply, and the commits.
     NAME is the name of a release, application definition or override, or the id of an application,
     connection, demand, node or requester. A part of a release's name or the start of a demand's id
-    is enough if no other release or demand has it. PATH is a file below clusters/ or ledger/. If
-    something no longer runs, the command shows the commit that stopped it.
+    is enough if no other release or demand has it. PATH is a file in a folder of the state repo,
+    such as clusters/ or ledger/. If something no longer runs, the command shows the commit that
+    stopped it.
 
     \b
     Examples:
