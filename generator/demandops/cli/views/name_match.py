@@ -212,8 +212,8 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
         return Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
         raise StateRepoError(
-            f"{quoted(path)} is not in the state repo at commit {str(snapshot.commit)[:10]} and never "
-            "was before; correct the path"
+            f"{quoted(path)} is not in the state repo at commit {str(snapshot.commit)[:10]} and "
+            "never was before; correct the path"
         )
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return Match("file", path, path)
