@@ -99,6 +99,16 @@ def test_a_command_whose_package_is_missing_says_so(
     )
 
 
+def test_a_path_that_cannot_be_written_is_no_fault_of_the_program(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert main.run(["schema", "--write", str(tmp_path / "file" / "folder")]) == 1
+    assert capsys.readouterr().err == (
+        f"error: {tmp_path}/file/folder: Not a directory; check this path, then try again\n"
+    )
+
+
 def test_a_package_that_no_ros_command_needs_has_another_remedy(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

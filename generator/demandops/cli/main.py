@@ -69,6 +69,10 @@ They log or fill the screen, so they do not show the progress of git operations.
 """
 
 
+_OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
+"""Errors that a wrong path or missing permissions cause, such as of a file to write."""
+
+
 class ExitCode(IntEnum):
     """The exit codes of all commands."""
 
@@ -171,6 +175,12 @@ def run(args: list[str] | None = None) -> int:
         sys.stderr.close()
         return ExitCode.DONE
     except Exception as error:
+        if isinstance(error, _OF_A_PATH) and error.filename:
+            errors.print(
+                f"error: {error.filename}: {error.strerror}; check this path, then try again"
+            )
+            logging.getLogger("demandops").info("traceback", exc_info=True)
+            return ExitCode.USER_ERROR
         logging.getLogger("demandops").debug("a fault of the program", exc_info=True)
         errors.print(
             f"error: a fault of demandops itself: {type(error).__name__}: {error}\n"

@@ -137,6 +137,8 @@ def use_context(name: str) -> None:
 def delete_context(name: str) -> None:
     """Delete a context; nothing happens to its state repo.
 
+    If it is the current context, there is no current context afterwards.
+
     \b
     Examples:
       demandops config delete old-fleet
