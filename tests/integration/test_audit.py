@@ -236,9 +236,14 @@ class TestWhy:
             assert demandops("why", name, "--state-repo", played.path) == (1, "", told)
 
     def test_a_name_of_another_kind(self, demandops: Run, played: Any) -> None:
-        ran = demandops("why", FUSION, "--kind", "node", "--state-repo", played.path)
-        told = f"error: no node is called '{FUSION}'; leave out --kind\n"
-        assert (ran.code, ran.err) == (1, told)
+        for name, remedy in (
+            (FUSION, "leave out --kind"),
+            ("fusion", "leave out --kind"),
+            ("cloudd", "did you mean 'cloud'?"),
+        ):
+            ran = demandops("why", name, "--kind", "node", "--state-repo", played.path)
+            told = f"error: no node is called '{name}'; {remedy}\n"
+            assert (ran.code, ran.err) == (1, told)
 
     def test_a_demand_in_a_history_that_was_made_anew(
         self, demandops: Run, request_json: Run, state: Any, tmp_path: Any

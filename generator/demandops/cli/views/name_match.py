@@ -73,8 +73,6 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         )
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
-    if kind is not None:
-        raise StateRepoError(f"no {kind} is called {quoted(name)}; leave out --kind")
     running_names = {release.name for release in release_causes.releases(world)}
     known = {
         *running_names,
@@ -86,6 +84,9 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
     parts = {part for running_name in running_names for part in running_name.split("-")}
     close = closest(name, known | parts)  # a part of a release's name is also accepted
     known = {close} if close else known
+    if kind is not None:
+        remedy = "; leave out --kind" if close in (None, name) else suggestion(name, known)
+        raise StateRepoError(f"no {kind} is called {quoted(name)}{remedy}")
     raise StateRepoError(
         f"nothing called {quoted(name)} runs or ran up to commit {str(snapshot.commit)[:10]}"
         f"{suggestion(name, known)}"
