@@ -231,8 +231,31 @@ class TestWhy:
             (f"{FUSION[:-1]}x", FUSION),
             ("fuson", "fusion"),  # part of a release's name is enough
         ):
-            told = f"error: nothing called '{name}' runs or ever ran; did you mean '{hint}'?\n"
+            at = f"up to commit {played.tip[:10]}"
+            told = f"error: nothing called '{name}' runs or ran {at}; did you mean '{hint}'?\n"
             assert demandops("why", name, "--state-repo", played.path) == (1, "", told)
+
+    def test_a_name_of_another_kind(self, demandops: Run, played: Any) -> None:
+        for name, remedy in (
+            (FUSION, "leave out --kind"),
+            ("fusion", "leave out --kind"),
+            ("cloudd", "did you mean 'cloud'?"),
+        ):
+            ran = demandops("why", name, "--kind", "node", "--state-repo", played.path)
+            told = f"error: no node is called '{name}'; {remedy}\n"
+            assert (ran.code, ran.err) == (1, told)
+
+    def test_a_demand_in_a_history_that_was_made_anew(
+        self, demandops: Run, request_json: Run, state: Any, tmp_path: Any
+    ) -> None:
+        request_json(put("patrol-7"))
+        git(state, "branch", "anew", git(state, "commit-tree", "-m", "All", "main^{tree}"))
+        git(tmp_path, "clone", "--quiet", "--bare", "--single-branch", "--branch", "anew",
+            str(state.path), "anew.git")  # fmt: skip
+        git(tmp_path / "anew.git", "branch", "-m", "anew", "main")
+        ran = demandops("why", "patrol-7", "--state-repo", tmp_path / "anew.git")
+        assert (ran.code, ran.err) == (0, "")
+        assert ran.out.startswith("demand patrol-7 holds claims at ")
 
     def test_rubbish(self, demandops: Run, played: Any) -> None:
         for name in ("", "-", "..", "*", ":(glob)**", "clusters/", "clusters/../x", "ledger//x",

@@ -187,7 +187,11 @@ def test_what_the_merge_target_has_already_is_no_consequence(
     git(clone, "fetch", "--quiet")
     out = demandops("check", clone).out
     assert written not in out
-    assert "the merge target has 2 commits that this checkout lacks: git pull --rebase" in out
+    lacks = "the merge target has 2 commits that this checkout lacks: "
+    assert f"{lacks}git rebase --autostash origin/main\n" in out
+    git(clone, "checkout", "--quiet", "-b", "topic")
+    git(clone, *out.partition(lacks)[2].splitlines()[0].split()[1:])  # the remedy works
+    assert lacks not in demandops("check", clone).out
 
 
 def test_a_folder_that_is_no_state_repo(demandops: Run, tmp_path: Path) -> None:

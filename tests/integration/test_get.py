@@ -14,6 +14,8 @@ import yaml
 from demandops.cli.views.kinds import KINDS
 from demandops.config.override import parse_time
 from demandops.runtime import REAL
+from demandops.staterepo.git.repository import RemoteAway
+from demandops.staterepo.reader import Reader
 
 from tests.kit.cli import Run
 from tests.kit.goals import APP, EXPERIMENT, perception, put
@@ -177,7 +179,7 @@ def test_an_override_that_a_hold_keeps_back_is_not_said_to_be_in_force(
     assert [Path(path).stem for path in ran.json()["not_rendered"]] == [FUSION]
     status = demandops("status", "--state-repo", fleet.path)
     assert status.code == 1
-    assert "not well: files that a generator has yet to write: 1\n" in status.err
+    assert "not well: files that a generator has yet to write or remove: 1\n" in status.err
     assert demandops("request", EXPERIMENT[2], "--state-repo", fleet.path).code == 0
     ran = demandops("get", "overrides", "calm", "--state-repo", fleet.path, "-o", "json")
     assert (ran.json()["items"][0]["state"], ran.err) == ("in force", "")
@@ -365,6 +367,24 @@ class TestStatus:
         assert waiting.endswith("clusters that cannot be read: c-its")
         assert away.startswith("warning: cluster 'c-its' cannot be read: MaxRetryError: ")
         assert told.replace("not well", "waiting") == waiting
+
+    def test_status_wait_goes_on_while_the_state_repo_cannot_be_reached(
+        self, demandops: Run, fleet: GitRepo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        def away(reader: Reader) -> str:
+            raise RemoteAway("the remote is away")
+
+        monkeypatch.setattr(Reader, "refresh", away)
+        file = tmp_path / "clusters.yaml"
+        file.write_text(
+            "apiVersion: demandops/v1\nkind: ClusterAccess\n"
+            f"clusters: {{c-its: {{kubeconfig: {kubeconfig(tmp_path, 'http://127.0.0.1:9')}}}}}\n"
+        )
+        asked = ("status", "--state-repo", fleet.path, "--clusters", file)
+        ran = demandops(*asked, "--wait", "--timeout", "1s")
+        assert ran.code == 1
+        assert "warning: the remote is away\n" in ran.err
+        assert ran.err.splitlines()[-1].startswith("not well: releases not healthy yet: ")
 
     def test_an_input_that_no_longer_arrives(self, demandops: Run, fleet: GitRepo) -> None:
         where = ("--state-repo", fleet.path)

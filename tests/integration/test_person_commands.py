@@ -73,6 +73,17 @@ class TestOverride:
         typo = demandops("override", "end", "idel", *where)
         assert typo.err == "error: there is no override 'idel'\n"
 
+    def test_one_that_was_never_valid_is_not_said_to_be_missing(
+        self, demandops: Run, joined: GitRepo, where: tuple[str, str]
+    ) -> None:
+        joined.commit({"overrides/idle.yaml": "kind: Override\n"})
+        ran = demandops("override", "end", "idle", *where)
+        assert (ran.code, ran.err) == (
+            1,
+            "error: overrides/idle.yaml: is not valid, so nothing is overridden; correct or remove "
+            "the file with git\n",
+        )
+
     def test_a_dry_run_changes_nothing(
         self, demandops: Run, joined: GitRepo, where: tuple[str, str]
     ) -> None:
@@ -245,6 +256,11 @@ def test_a_fleet_is_watched_live(demandops: Run, joined: GitRepo) -> None:
         watching.read_until("Join ")
         joined.commit({"inventory/README.md": "hello\n"}, "A note on the fleet\n")
         watching.read_until("A note on the fleet")
+        valid = joined.files()["inventory/nodes.yaml"]
+        joined.commit({"inventory/nodes.yaml": "nodez: []\n"}, "A slip\n")
+        watching.read_until("not well, last valid state: inventory/nodes.yaml: ")
+        joined.commit({"inventory/nodes.yaml": valid}, "Mended\n")
+        watching.read_until("Mended")
         watching.type(CTRL_C)
         assert watching.end() == 0
     ran = demandops("watch", "--state-repo", joined.path)

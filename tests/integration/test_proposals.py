@@ -13,7 +13,7 @@ import yaml
 
 from tests.kit.cli import Ran, Run
 from tests.kit.generator import wait_until
-from tests.kit.goals import perception
+from tests.kit.goals import perception, put
 from tests.kit.repo import GitRepo, Person, branches, git
 
 
@@ -59,8 +59,20 @@ def test_a_demand_that_needs_approval_is_proposed_and_listed(
     table = demandops("get", "proposals", "--state-repo", strict.path)
     assert branch in table.out
     assert "vehicle00" in table.out
+    mine = demandops("get", "proposals", "--requester", "vehicle00", "--state-repo", strict.path)
+    assert (mine.out, mine.err) == (table.out, "")  # although this requester holds nothing yet
     by_url = demandops("get", "proposals", "--state-repo", strict.path.as_uri(), "--output", "json")
     assert by_url.json()["items"] == [row]
+
+
+def test_a_lease_that_has_not_started_is_explained(
+    demandops: Run, send: Send, strict: GitRepo
+) -> None:
+    send(strict, goal=put("patrol") | {"lease": "1h"})
+    git(strict, "branch", "--force", "main", *branches(strict.path))  # no generator runs
+    ran = demandops("why", "patrol", "--state-repo", strict.path)
+    assert (ran.code, ran.err) == (0, "")
+    assert ", lease of 1h, not started\n" in ran.out
 
 
 def test_the_json_tells_where_it_waits(send: Send, strict: GitRepo) -> None:

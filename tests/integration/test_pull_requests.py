@@ -13,6 +13,8 @@ import yaml
 from demandops.cli.main import run
 from demandops.cli.repo import pull_request_comment
 from demandops.staterepo.pull_request import merge_check as checking
+from demandops.staterepo.pull_request.merge_check import CheckResult
+from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
 
 from tests.kit.cli import Run
 from tests.kit.goals import APP
@@ -521,6 +523,13 @@ def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Run) -> 
         assert mark not in outside
 
 
+def test_why_a_chart_is_not_rendered_cannot_act_in_a_comment() -> None:
+    charts = RenderedCharts(not_rendered={"cam": "its dependency @everyone is not in charts/"})
+    comment = pull_request_comment.report(CheckResult((), charts=charts))
+    told = "\nchart cam not rendered: `its dependency @everyone is not in charts/`\n"
+    assert told in comment
+
+
 def without_code(text: str) -> str:
     """Return a Markdown text without its code spans and fences, by CommonMark's rules."""
     kept, rest = "", text
@@ -552,5 +561,5 @@ def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Run
     assert "Releases: 3 to change." in out
     assert out.endswith(
         "\n3 parts of this report are left out because a comment has a limited length; "
-        "`demandops check` shows all.\n"
+        "`demandops check --output json` has more.\n"
     )

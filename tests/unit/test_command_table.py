@@ -97,3 +97,25 @@ def test_a_command_whose_package_is_missing_says_so(
     assert capsys.readouterr().err == (
         "error: serve needs rclpy, which is not installed; see README.md, 'With ROS 2'\n"
     )
+
+
+def test_a_path_that_cannot_be_written_is_no_fault_of_the_program(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    assert main.run(["schema", "--write", str(tmp_path / "file" / "folder")]) == 1
+    assert capsys.readouterr().err == (
+        f"error: {tmp_path}/file/folder: Not a directory; check this path, then try again\n"
+    )
+
+
+def test_a_package_that_no_ros_command_needs_has_another_remedy(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, "demandops.cli.views.diff", raising=False)
+    monkeypatch.delitem(sys.modules, "demandops.render.changes.merge_preview", raising=False)
+    monkeypatch.setitem(sys.modules, "difflib", None)
+    assert main.run(["diff", "a", "b"]) == 1
+    assert capsys.readouterr().err == (
+        "error: diff needs difflib, which is not installed; install demandops again\n"
+    )

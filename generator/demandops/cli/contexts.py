@@ -22,7 +22,7 @@ Filled = Annotated[str, StringConstraints(min_length=1)]
 
 
 class Context(CamelModel):
-    """The values that a command uses if no option or environment variable gives them."""
+    """The values that a context gives to a command; :mod:`demandops.cli.target` says when."""
 
     state_repo: Filled
     clusters: Filled | None = None
@@ -89,10 +89,15 @@ def write(content: ContextsFile) -> None:
     new.replace(file)
 
 
-def named(name: str) -> Context:
-    """Return the context of this name; raise InvalidInput if there is none."""
+def named(name: str, field: str = "") -> Context:
+    """Return the context of this name.
+
+    Raises:
+        InvalidInput: there is no such context, or the file is not valid. The error names ``field``
+            as the place where the user wrote the name.
+    """
     known = read().contexts
     if name not in known:
         message = f"there is no context '{name}'{suggestion(name, known)}"
-        raise InvalidInput.at("--context", message, file=str(path()))
+        raise InvalidInput.at(field, message, file=str(path()))
     return known[name]

@@ -34,7 +34,7 @@ Command = Callable[..., Any]
 def output_formats(*formats: str) -> Callable[[Command], Command]:
     """Return a decorator that adds the option ``--output`` with these formats to a command.
 
-    With ``--output json``, a command that fails prints its faults as JSON.
+    With ``--output json``, a command that raises DemandOpsError also prints the faults as JSON.
     """
     description = "The output format."
     if "markdown" in formats:
@@ -186,7 +186,7 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
 
 
 def commit_data(entry: LogEntry) -> Json:
-    """Return a commit, its message and its trailers as JSON data."""
+    """Return a commit as JSON data: its author, the parts of its message and most trailers."""
     return {
         "commit": entry.commit,
         "time": time_data(entry.time),

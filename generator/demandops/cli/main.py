@@ -56,14 +56,21 @@ COMMANDS = {
     "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
-"""Maps a command's name to the package of the command's module and to the short help."""
+"""Maps a command's name to the package of the command's module, and to the short help.
+
+A package without a dot is below ``demandops.cli``, except ``demandops_ros``.
+"""
 
 
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-"""The commands that run until they are stopped.
+"""The commands that always run until they are stopped.
 
 They log or fill the screen, so they do not show the progress of git operations.
 """
+
+
+_OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
+"""Errors that a wrong path or missing permissions cause, such as of a file to write."""
 
 
 class ExitCode(IntEnum):
@@ -77,7 +84,11 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import and return a command; raise ClickException if a package that it needs is missing."""
+    """Import and return a command.
+
+    Raises:
+        click.ClickException: a Python package that the command needs, or git, is not installed.
+    """
     room = COMMANDS[name][0]
     ros = room.split(".")[0] == "demandops_ros"
     word = f"{name}_" if iskeyword(name) else name.replace("-", "_")
@@ -88,8 +99,9 @@ def load(name: str) -> click.Command:
         missing = str(error.name).split(".")[0]
         if missing in ("demandops", "demandops_ros"):
             raise
+        remedy = "see README.md, 'With ROS 2'" if ros else "install demandops again"
         raise click.ClickException(
-            f"{name} needs {missing}, which is not installed; see README.md, 'With ROS 2'"
+            f"{name} needs {missing}, which is not installed; {remedy}"
         ) from None
     except ImportError:  # raised by GitPython
         if shutil.which("git"):
@@ -163,6 +175,12 @@ def run(args: list[str] | None = None) -> int:
         sys.stderr.close()
         return ExitCode.DONE
     except Exception as error:
+        if isinstance(error, _OF_A_PATH) and error.filename:
+            errors.print(
+                f"error: {error.filename}: {error.strerror}; check this path, then try again"
+            )
+            logging.getLogger("demandops").info("traceback", exc_info=True)
+            return ExitCode.USER_ERROR
         logging.getLogger("demandops").debug("a fault of the program", exc_info=True)
         errors.print(
             f"error: a fault of demandops itself: {type(error).__name__}: {error}\n"

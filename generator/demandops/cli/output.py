@@ -70,7 +70,11 @@ def painted(text: str, style: str) -> str:
 
 
 def print_lines(found: list[str]) -> None:
-    """Print lines; use the pager ``$PAGER`` if the terminal has too few rows for them."""
+    """Print lines; use a pager if the terminal has too few rows for them.
+
+    The pager is ``$PAGER``, by default ``less``. With ``PAGER=cat`` or an empty ``PAGER``, there is
+    none.
+    """
     text = "".join(f"{line}\n" for line in found)
     high = len(found) >= shutil.get_terminal_size().lines
     pager = os.environ.get("PAGER")
@@ -92,9 +96,9 @@ errors = _Errors()
 
 
 def warn_of(problems: Iterable[object]) -> None:
-    """Warn about invalid files whose last valid version is in effect."""
+    """Warn about invalid files. The last valid version of each is in effect, if there is one."""
     for problem in problems:
-        errors.print(f"warning: {problem}; the file's last valid version is in effect")
+        errors.print(f"warning: {problem}; the file's last valid version, if any, is in effect")
 
 
 def warn_of_not_rendered(paths: Collection[str]) -> None:
@@ -111,7 +115,7 @@ at_option = click.option(
     "--at",
     metavar="REV|TIME",
     help="A commit, tag or branch, or a time like 2026-01-31T14:03, 14:03 (UTC) or 2h; default: "
-    "the newest commit.",
+    "the newest commit, or in a checkout the one that is checked out.",
 )
 
 

@@ -1,8 +1,8 @@
 """The tables that commands print: plain columns that fit the terminal without cutting a word.
 
-On a terminal, text wraps between words. If not all columns fit, the least important ones are left
-out. If the output is no terminal, each row is one line with every column, so that programs like awk
-and grep can read it.
+On a terminal, text wraps between words. If not all columns fit, some are left out, and a last line
+names them. If the output is no terminal, each row is one line with every column, so that programs
+like awk and grep can read it.
 """
 
 from __future__ import annotations
@@ -29,8 +29,9 @@ Cell = str | Sequence[str]
 class Column:
     """A column: its title, and how soon a narrow table leaves it out.
 
-    Columns get room in the order of ``rank``, from low to high. A column of rank 0 is never left
-    out. ``wraps`` is true if the cells contain text that may wrap between words.
+    Columns get room in the order of ``rank``, from low to high. A column that does not fit is left
+    out, even if a narrower one of a higher rank fits. A column of rank 0 is never left out.
+    ``wraps`` is true if the cells contain text that may wrap between words.
     """
 
     title: str

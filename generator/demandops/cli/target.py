@@ -9,7 +9,9 @@ The first of these that is given decides:
 4. the checkout around the current folder. A command that writes uses the checkout's remote.
 5. the current context
 
-The default signing key and clusters come from the same context as the state repo.
+The default signing key and clusters come from the same context as the state repo. In a checkout,
+they come from the first context whose state repo is this checkout or its remote. If
+``--state-repo`` or the environment variable decides, there are no such defaults.
 """
 
 from __future__ import annotations
@@ -43,8 +45,9 @@ _NO_STATE_REPO = (
 def _chosen(around: Path | None) -> Context | None:
     """Return the context that applies, and remember it for :func:`_from_context`.
 
-    This is the context that ``--context`` names. Without that option, it is the context of the
-    checkout ``around`` or, outside a checkout, the current context. Return None if there is none.
+    This is the context that ``--context`` names. Without that option, it is the first context of
+    the checkout ``around`` or, outside a checkout, the current context. Return None if there is
+    none.
     """
     from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
 
@@ -53,7 +56,7 @@ def _chosen(around: Path | None) -> Context | None:
     content = contexts.read()
     found: Context | None
     if name is not None:
-        found = contexts.named(name)
+        found = contexts.named(name, "--context")
     elif around is not None:
         places = {str(around), origin_of(around)}
         same = (one for one in content.contexts.values() if one.state_repo in places)
@@ -71,7 +74,11 @@ def _around() -> Path | None:
 
 
 def readable_repo() -> str | None:
-    """Return the default state repo of a command that only reads; None if there is no default."""
+    """Return the default state repo of a command that only reads; None if there is no default.
+
+    Raises:
+        InvalidInput: the file with the contexts is not valid, or lacks the one of ``--context``.
+    """
     around = _around()
     context = _chosen(around)
     return str(around) if around else context.state_repo if context else None
@@ -94,10 +101,10 @@ def _writable() -> str | None:
 
 
 def hint_to_pull() -> list[str]:
-    """Return a list with a hint to pull if the command pushed to the remote of the checkout.
+    """Return a list with a hint to pull if the command works on the remote of a checkout.
 
-    Otherwise return an empty list. The hint is needed because the pushed commit is not yet in the
-    checkout, and commands that only read use the checkout.
+    Otherwise return an empty list. A command that has pushed a commit to main prints the hint: the
+    commit is not yet in the checkout, and commands that only read use the checkout.
     """
     behind = click.get_current_context().meta.get(_BEHIND)
     return ["to see the new commit in this checkout: git pull"] if behind else []
@@ -119,8 +126,9 @@ def _from_context(field: str) -> Callable[[], str | None]:
 def _required(default: Callable[[], str | None]) -> Callable[..., str]:
     """Return a callback for ``--state-repo`` that returns the address of the state repo.
 
-    This is the given address or, without one, the result of ``default``. The callback raises
-    UsageError if there is neither.
+    This is the given address or, without one, the result of ``default``. An address from the
+    environment is ignored in the cases that the module's docstring names. The callback raises
+    UsageError if there is no address, or where the module's docstring calls one an error.
     """
 
     def check(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
@@ -186,7 +194,10 @@ state_repo_option = _state_repo(readable_repo, "the checkout that you are in")
 """The option ``--state-repo`` of a command that only reads; it may name a checkout."""
 
 writable_repo_option = _state_repo(_writable, "the remote of the checkout that you are in")
-"""The option ``--state-repo`` of a command that writes."""
+"""The option ``--state-repo`` of a command that writes.
+
+Only with ``--dry-run``, its default may be a checkout, namely one without a remote.
+"""
 
 dry_run_option = click.option(
     "--dry-run",

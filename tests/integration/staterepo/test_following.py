@@ -454,7 +454,7 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
     out, err = capsys.readouterr()
     assert err.splitlines()[-1] == "not well: problems in files: 1"
     assert out.splitlines()[:2] == [
-        "1 problem; the last valid version of each file is in effect:",
+        "1 problem; the last valid version of each file, if any, is in effect:",
         f"  {problem}",
     ]
     assert "of-edge-fusion-1" in out
@@ -464,4 +464,4 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
     assert run(["bookkeeping", "--state-repo", str(bare)]) == 0
     shown = capsys.readouterr()
     assert "edge/fusion-1" in shown.out
-    assert shown.err == f"warning: {problem}; the file's last valid version is in effect\n"
+    assert shown.err == f"warning: {problem}; the file's last valid version, if any, is in effect\n"

@@ -33,6 +33,7 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
 
     Raises:
         InvalidInput: if no proposal or several proposals fit.
+        RemoteAway: if the state repo cannot be reached.
     """
     pending = list(pending_proposals(repo.repository))
     exact = [one for one in pending if name == one.branch or name in one.demands]
@@ -48,7 +49,7 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
 
 
 def print_proposal(proposal: PendingProposal, output: str) -> None:
-    """Print a proposal's branch, summary, requesters and time if the output format is text."""
+    """Print a proposal's branch, summary, requesters and time on stderr, unless output is JSON."""
     if output == "text":
         errors.print(f"{proposal.branch}: {proposal.summary}")
         errors.print(

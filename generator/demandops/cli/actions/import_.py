@@ -42,7 +42,8 @@ from demandops.staterepo import reader
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
     help="The file that maps the reference's names to applications and connections. If the file "
-    "does not exist, the command writes a proposed map to it and books nothing.",
+    "does not exist, the command writes a proposed map to it, even with --dry-run, and books "
+    "nothing.",
 )
 @dry_run_option
 @click.option(

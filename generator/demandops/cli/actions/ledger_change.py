@@ -32,7 +32,10 @@ def await_answer(future: Future[Any]) -> None:
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
     """Yield a started :class:`Generator`, and close it at the end of the block.
 
-    Within the block, SIGTERM acts like Ctrl-C.
+    Within the block, SIGTERM acts like Ctrl-C, if this is the main thread.
+
+    Raises:
+        StateRepoError, InvalidInput: if the state repo or the key cannot be used.
     """
     before = signal.getsignal(signal.SIGTERM)
     with suppress(ValueError):  # only the main thread may set a handler
@@ -70,7 +73,7 @@ def print_consequences(decision: Decision) -> None:
 
 
 def print_refusal(title: str, faults: Iterable[dict[str, Any]]) -> None:
-    """Print the title and the faults on stderr. ``faults`` have the form of the JSON output."""
+    """Print the title and the faults on stderr. Each fault has the form of the JSON output."""
     errors.print(title)
     for each in faults:
         errors.print(f"  {Fault(**each)}")

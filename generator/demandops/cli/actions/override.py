@@ -52,7 +52,8 @@ def override() -> None:
 def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
     if not is_override_name(name):
         raise click.BadParameter(
-            f"{quoted(name)} is not a valid override name; use lower-case letters, digits and '-'"
+            f"{quoted(name)} is not a valid override name; use at most 63 lower-case letters, "
+            "digits and '-', with no '-' at the start or end"
         )
     return name
 
@@ -65,9 +66,14 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 @click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
 @click.option("--replicas", type=click.IntRange(0), metavar="N", help="Set the number of replicas.")
 @click.option("--on", "target", metavar="NODE", help="Move services to this node.")
-@click.option("--use-version", "version", metavar="WORD", help="Pin the version of the chart.")
 @click.option(
-    "--values", "values_file", metavar="FILE", help="Patch Helm values with this YAML file."
+    "--use-version", "version", metavar="WORD", help="Pin the chart to a version or channel."
+)
+@click.option(
+    "--values",
+    "values_file",
+    metavar="FILE",
+    help="Patch Helm values with this YAML file; with --connection, the settings of clients.",
 )
 @click.option(
     "--priority",
@@ -156,7 +162,11 @@ def new_override(
         name: the name of the override.
         options: the options of the command, which give the reason.
         selected: the values of the options that select releases and claims.
-        more: the effects and the other fields of the override; None leaves a field out.
+        more: the effects and the other fields of the override; None leaves a field out. Without
+            an owner, the person's name in git is the owner.
+
+    Raises:
+        click.UsageError: there is no reason, or nothing is selected.
     """
     if not options.reason:
         raise click.UsageError("give the reason: -m TEXT")
@@ -174,7 +184,15 @@ def new_override(
 
 
 def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Show the effect of a new override, ask for confirmation, and commit the override."""
+    """Show the effect of a new override, ask for confirmation, and commit the override.
+
+    With ``options.propose``, commit it to a branch. With ``options.dry_run``, only show the effect.
+
+    Raises:
+        InvalidInput: the override exists, or is not valid.
+        click.ClickException: the person did not confirm.
+        StateRepoError: the commit could not be published.
+    """
     if repo.file_reader()(edit.path) is not None:
         message = "exists already; end it first, or choose another name"
         raise InvalidInput.at("", message, file=edit.path)
@@ -184,8 +202,19 @@ def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Show the effect of ending an override, ask for confirmation, and commit the removal."""
+    """Show the effect of ending an override, ask for confirmation, and commit the removal.
+
+    With ``options.propose``, commit it to a branch. With ``options.dry_run``, only show the effect.
+
+    Raises:
+        InvalidInput: there is no such override, or no version of its file was valid.
+        click.ClickException: the person did not confirm.
+        StateRepoError: the commit could not be published.
+    """
     known = repo.last_valid_snapshot(repo.commit()).state.config.overrides
+    if edit.name not in known and repo.file_reader()(edit.path) is not None:
+        message = "is not valid, so nothing is overridden; correct or remove the file with git"
+        raise InvalidInput.at("", message, file=edit.path)
     if edit.name not in known:
         message = f"there is no override '{edit.name}'{suggestion(edit.name, known)}"
         raise InvalidInput.at("", message)
@@ -216,7 +245,7 @@ def _values(file: str | None) -> dict[str, Any] | None:
 def ends_at(text: str | None) -> str | None:
     """Return the end of an override as the file has it, or None if ``text`` is None.
 
-    ``text`` is a time, or a duration from now.
+    ``text`` is a time, or a duration from now; for any other text, raise BadParameter.
     """
     if text is None:
         return None

@@ -57,7 +57,8 @@ yes_option = click.option("-y", "--yes", is_flag=True, help="Do not ask for conf
 propose_option = click.option(
     "--propose",
     is_flag=True,
-    help="Push a branch and open a merge request, instead of committing to main.",
+    help="Push a branch instead of committing to main. If demandops.yaml names a forge, also open "
+    "a merge request.",
 )
 
 
@@ -71,6 +72,7 @@ def confirm(question: str, yes: bool, output: str) -> None:
 
     Raises:
         click.ClickException: the answer was no.
+        click.Abort: the person pressed Ctrl-C or Ctrl-D.
     """
     if is_asked(yes, output) and not click.confirm(question, err=True):
         raise click.ClickException("nothing was changed")
@@ -93,7 +95,11 @@ def writable(
 ) -> Iterator[Reader]:
     """Yield an open state repo for a person's commits, which ``signing_key`` signs.
 
-    With ``dry_run``, the state repo may also be a checkout without a remote.
+    With ``dry_run``, the state repo may also be a checkout.
+
+    Raises:
+        StateRepoError: the state repo cannot be reached or read.
+        SigningFailed: the key cannot sign.
     """
     with reader.opened(state_repo, only_read=dry_run) as repo:
         repo.repository.signer = Signer(signing_key) if signing_key else None
@@ -163,7 +169,7 @@ class Edit:
 def consequence(repo: Reader, edit: Edit) -> Entry:
     """Return the edited override, and the releases and claims that this override affects.
 
-    A new override is treated as if it were already on main.
+    A new override is treated as if it were already on main. An override to remove must exist.
 
     Raises:
         InvalidInput: the new file is not valid.
@@ -182,7 +188,12 @@ def consequence(repo: Reader, edit: Edit) -> Entry:
 def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
     """Publish the edit; return its commit, its branch, and the link of its merge request.
 
-    With ``propose``, the commit goes to a branch with a merge request, otherwise to main.
+    With ``propose``, the commit goes to a branch, otherwise to main. The link is empty if no merge
+    request was opened.
+
+    Raises:
+        InvalidInput: the edit makes the configuration not valid.
+        StateRepoError: the commit could not be published.
     """
     files = {edit.path: edit.text}
     details = CommitDetails(
@@ -216,7 +227,7 @@ def _push_options(repo: Reader, edit: Edit) -> list[str]:
 def _opened(repo: Reader, edit: Edit, branch: str) -> str:
     """Open a pull request at GitHub or Gitea for a pushed branch; return its link.
 
-    Return an empty text if no pull request was opened.
+    Return an empty text if neither forge is configured, or if no pull request could be opened.
     """
     try:
         forge = forge_for(_forge_settings(repo), settings.forge_token_file())
@@ -269,7 +280,7 @@ def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
     """Return one line for each release and claim that the override affects.
 
     If the edit removes the override, each line says that the release or claim is no longer
-    affected.
+    affected. If nothing is affected, one line says so.
     """
     verb = "affects" if edit.text is not None else "no longer affects"
     found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]

@@ -49,7 +49,7 @@ class Document:
 
     @property
     def request_id(self) -> str:
-        """Return the id of the goal's request or demand; empty if the goal has no valid id."""
+        """Return the id of the goal's request or demand; empty if the id is missing or no text."""
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
@@ -116,9 +116,13 @@ def book_or_show(
 ) -> None:
     """Book the requests, and print the outcome of each; with ``dry_run``, book nothing.
 
+    If a request cannot be parsed, all are refused.
+
     Raises:
-        click.Abort: if a request has no answer.
+        click.Abort: if the command was interrupted before each request had an answer.
         click.exceptions.Exit: if a request is refused.
+        StateRepoError: if the state repo cannot be reached or read.
+        Unsound: if it is not known whether a request was booked.
     """
     if any(form_faults(document.goal) for document in documents):
         rows = _unbooked(documents, state_repo)

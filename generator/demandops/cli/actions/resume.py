@@ -24,7 +24,8 @@ from demandops.cli.name_completion import names_of
 def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Run suspended applications and connections again.
 
-    Give the same options as for `demandops suspend`, or NAME, the override's name.
+    Give the same options from --application to --requester as for `demandops suspend`, or NAME, the
+    override's name. The command ends this override.
 
     \b
     Examples:

@@ -126,8 +126,9 @@ def _roll_back(
 ) -> dict[str, Any]:
     """Roll back with a generator; return the outcome as JSON data.
 
-    The caller knows the consequences on top of the commit ``base``. The data has consequences only
-    if the rollback was refused, had no effect, or was decided on another commit than ``base``.
+    The caller knows the consequences on top of the commit ``base``. The data contains consequences
+    only if others are true: none if the rollback was refused or had no effect, and different ones
+    if it was decided on another commit.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:

@@ -45,8 +45,8 @@ def suspend(
     """Stop applications and connections; their claims stay booked.
 
     Nothing runs for these claims, and new demands that match the options are refused. To end the
-    suspension, give `demandops resume` the same options. The command creates an override with
-    `deny` in your own name.
+    suspension, give `demandops resume` the same options from --application to --requester. The
+    command creates an override with `deny` in your own name.
 
     \b
     Examples:

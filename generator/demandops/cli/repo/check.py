@@ -104,7 +104,10 @@ def _charts(charts: RenderedCharts | None) -> dict[str, Any] | None:
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return the diffs that fit into ``most`` lines, by path, and the number of other lines."""
+    """Return the diffs that fit into ``most`` lines, by path, and the number of other lines.
+
+    A diff that does not fit is left out as a whole; a shorter diff after it may fit.
+    """
     shown: dict[str, str] = {}
     left = 0
     for file in files:
@@ -139,7 +142,10 @@ def _lines(checked: CheckResult) -> Iterator[str]:
             yield f"\n(this override also applies to {', '.join(each.other_releases)})"
     if checked.newer:
         commits = "a commit" if checked.newer == 1 else f"{checked.newer} commits"
-        yield f"\nthe merge target has {commits} that this checkout lacks: git pull --rebase"
+        yield (
+            f"\nthe merge target has {commits} that this checkout lacks: git rebase --autostash "
+            f"{checked.target}"
+        )
     consequence = checked.preview
     if consequence is None:
         if checked.suggestions:
@@ -185,4 +191,5 @@ def _file_lines(consequence: MergePreview) -> Iterator[str]:
         yield ""
         yield from text.splitlines()
     if left:
-        yield f"\n{left} more lines of differences are left out; --output json has them"
+        most = f"{_MOST_DIFF_LINES_JSON:,}"
+        yield f"\n{left} more lines of differences are left out; --output json has up to {most}"

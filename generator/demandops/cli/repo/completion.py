@@ -15,10 +15,10 @@ VARIABLE = "_DEMANDOPS_COMPLETE"
 def completion(shell: str) -> None:
     """Print the completion script for a shell.
 
-    The script completes commands, options, and the names of demands, nodes, releases, applications,
-    requesters, proposals and overrides. The names come from the state repo on which the completed
-    command would work. If this state repo is behind a URL, the script fetches nothing, but reads
-    the commit that was fetched last.
+    The script completes commands, options, and names in the state repo, such as those of demands,
+    nodes, releases, requesters, proposals and overrides. The names come from the state repo on
+    which the completed command would work. If this state repo is behind a URL, the script fetches
+    nothing, but reads the commit that was fetched last.
 
     \b
     Examples:

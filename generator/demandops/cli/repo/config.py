@@ -9,7 +9,6 @@ import click
 from demandops.cli import contexts
 from demandops.cli.json_output import output_option, show
 from demandops.cli.table import Column, Table
-from demandops.errors import InvalidInput, suggestion
 
 
 def _names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
@@ -138,14 +137,14 @@ def use_context(name: str) -> None:
 def delete_context(name: str) -> None:
     """Delete a context; nothing happens to its state repo.
 
+    If it is the current context, there is no current context afterwards.
+
     \b
     Examples:
       demandops config delete old-fleet
     """
+    contexts.named(name)
     content = contexts.read()
-    if name not in content.contexts:
-        message = f"there is no context '{name}'{suggestion(name, content.contexts)}"
-        raise InvalidInput.at("", message, file=str(contexts.path()))
     left = {key: one for key, one in content.contexts.items() if key != name}
     current = None if content.current == name else content.current
     contexts.write(content.model_copy(update={"contexts": left, "current": current}))

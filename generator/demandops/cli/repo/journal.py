@@ -22,16 +22,17 @@ from demandops.staterepo.write.slot import FoundJournal, find_journals
 @click.option(
     "--set-aside",
     is_flag=True,
-    help="Rename journals that are damaged, so that the generator starts without them.",
+    help="Rename journals that are damaged, so that the generator starts without them. A journal "
+    "that a running generator uses keeps its name.",
 )
 @output_option
 def journal(state_repo: str, set_aside: bool, output: str) -> None:
     """List the accepted demands that are not published.
 
-    A generator on this machine accepted these demands, and the next generator that starts here for
-    the state repo carries them out. If a journal is damaged, no generator starts, because the
-    journal may lack demands. In this case, use --set-aside, and send again the listed demands that
-    are still needed. --output json prints their goals.
+    A generator on this machine accepted these demands. If it still runs, it carries them out.
+    Otherwise the next generator that starts here for the state repo does. If a journal is damaged,
+    no generator starts, because the journal may lack demands. In this case, use --set-aside, and
+    send again the listed demands that are still needed. --output json prints their goals.
 
     \b
     Examples:

@@ -43,8 +43,9 @@ directory_option = click.option(
 def new() -> None:
     """Write a new application, node, access domain or override.
 
-    The files are valid as they are: `demandops check` passes. The command changes no
-    existing file and commits nothing.
+    The files in the state repo are valid as they are: `demandops check` passes. `new image` writes
+    to the repository of a ROS package instead. The command changes no existing file and commits
+    nothing.
 
     \b
     Examples:
@@ -74,7 +75,12 @@ def new() -> None:
     "be repeated. Each further service reads the outputs of the service before it.",
 )
 @click.option("--image", default="", metavar="IMAGE", help="The image, with a tag or digest.")
-@click.option("--node", default="", metavar="ID", help="The node of the example demand.")
+@click.option(
+    "--node",
+    default="",
+    metavar="ID",
+    help="The node of the example demand. Default: an edge server if there is one.",
+)
 @directory_option
 @output_option
 def application(  # noqa: PLR0913 - as many as options
@@ -387,7 +393,13 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
 
 
 def _example_node(config: Config) -> str:
-    """Return the id of a node for the example demand: an edge server if there is one."""
+    """Return the id of a node for the example demand: an edge server if there is one.
+
+    Only nodes in an access domain are considered.
+
+    Raises:
+        StateRepoError: if there is no such node.
+    """
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not nodes:
         raise StateRepoError(
@@ -406,6 +418,10 @@ def _lay_down(
         directory: the checkout of the state repo.
         made: returns the new files for the current configuration.
         then: further hints to print after the names of the files.
+
+    Raises:
+        InvalidInput: a file is not valid, with or without the new files.
+        StateRepoError: the folder is not a checkout, a file exists, or a name is not a file name.
     """
     with busy("reading the state repo"):
         files, faults = edited_checkout.files_of(directory)

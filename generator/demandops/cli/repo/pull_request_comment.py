@@ -1,15 +1,15 @@
 """The result of ``demandops check`` as a comment on a pull request.
 
-Text that people wrote appears only in code spans and fences, so that this text cannot mention
-users, make links or break the layout. Each span or fence uses more backticks than any run of
-backticks in its text. The length of a comment is limited. So the most important parts come first,
-and the comment states how many parts are omitted.
+Text that people wrote appears only as code, so that this text cannot mention users, make links or
+break the layout. Each code span or fence uses more backticks than any run of backticks in its text.
+The length of a comment is limited. So the most important parts come first, and the comment states
+how many parts are omitted.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from demandops.plan.views.bookkeeping import EntryChange
 from demandops.quoting import lines, one_line
@@ -28,13 +28,22 @@ _ROOM_FOR_NOTE = 200
 
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
-    """Return the result of a check as Markdown, with at most ``longest`` characters."""
+    """Return the result of a check as Markdown, with at most ``longest`` characters.
+
+    ``longest`` must leave room for :data:`MARK` and the note about omitted parts.
+    """
     parts = [f"{MARK}\n", *_head(checked), *_faults(checked), *_suggestions(checked)]
     return _bounded([*parts, *_consequence(checked)], longest)
 
 
-def chart_lines(charts: RenderedCharts | None) -> Iterator[str]:
-    """Yield lines that say which charts helm rendered, and why it did not render the others."""
+def chart_lines(
+    charts: RenderedCharts | None, shown: Callable[[str], str] = one_line
+) -> Iterator[str]:
+    """Yield lines that say which charts helm rendered, and why it did not render the others.
+
+    If helm is missing, yield only a line about that. If ``charts`` is None, yield nothing. A reason
+    may contain text that people wrote, so ``shown`` makes it safe to print.
+    """
     if charts is None:
         return
     if MISSING in charts.not_rendered.values():
@@ -46,11 +55,11 @@ def chart_lines(charts: RenderedCharts | None) -> Iterator[str]:
             f"({charts.releases} releases, {charts.examples} examples)"
         )
     for name, reason in charts.not_rendered.items():
-        yield f"chart {name} not rendered: {one_line(reason)}"
+        yield f"chart {name} not rendered: {shown(reason)}"
 
 
 def code(text: str) -> str:
-    """Return text as a code span of one line."""
+    """Return text as a code span of one line, cut off if it is very long."""
     text = one_line(text, _LONGEST_SPAN)
     if not text.strip():
         return "(empty)"
@@ -77,7 +86,7 @@ def _head(checked: CheckResult) -> Iterator[str]:
         yield f"## DemandOps: {'1 error' if found == 1 else f'{found} errors'}\n"
     else:
         yield "## DemandOps: valid, and every release renders\n"
-    yield from (f"\n{line}\n" for line in chart_lines(checked.charts))
+    yield from (f"\n{line}\n" for line in chart_lines(checked.charts, code))
     if checked.base:
         invalid = ", whose invalid files are compared in their last valid versions"
         yield f"\nCompared with {code(checked.base[:10])}{'' if checked.base_valid else invalid}.\n"
@@ -180,6 +189,6 @@ def _bounded(parts: list[str], longest: int) -> str:
         many = "One part of this report is" if left == 1 else f"{left} parts of this report are"
         taken.append(
             f"\n{many} left out because a comment has a limited length; "
-            "`demandops check` shows all.\n"
+            "`demandops check --output json` has more.\n"
         )
     return "".join(taken)

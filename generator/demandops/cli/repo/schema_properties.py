@@ -16,7 +16,9 @@ _COMMON = {
 
 
 def describe(schema: dict[str, Any], root: str) -> None:
-    """Add a description and an example to each property of a schema and its definitions.
+    """Add descriptions and examples to the properties of a schema and its definitions.
+
+    They come from ``templates/schemas/properties.yaml``. Other properties stay as they are.
 
     Args:
         schema: the JSON Schema of a model; the function changes it.

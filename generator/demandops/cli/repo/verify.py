@@ -29,9 +29,10 @@ from demandops.staterepo.audit.verification import Verdict
 def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
     """Render commits again from their ledger and compare the bytes.
 
-    Once the state repo has policy/allowed-signers, each further commit of the generator must have a
-    good signature. The version of this file in the commit's parent must list the signing key
-    (docs/audit.md). REV, A and B are commits or times.
+    REV names one commit, A..B the commits after A up to B; default: the newest commit. REV, A and B
+    are commits or times. Once the state repo has policy/allowed-signers, each further commit of the
+    generator must have a good signature. The version of this file in the commit's parent must list
+    the signing key (docs/audit.md).
 
     \b
     Examples:

@@ -18,7 +18,8 @@ def version(output: str) -> None:
     """Print the versions of the program and of its formats.
 
     The render version says how the program renders the files in `clusters/`. A generator refuses a
-    state repo of another render version until you run `demandops upgrade`.
+    state repo of another render version. If the repo's version is older, run `demandops upgrade`;
+    if it is newer, update the generator.
 
     \b
     Examples:

@@ -27,8 +27,8 @@ from demandops.staterepo.reader import Reader
 def diff(before: str, after: str, state_repo: str, output: str) -> None:
     """Show the differences between two commits.
 
-    The command compares bookkeeping, releases and other files. A and B are commits, or times like
-    2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
+    The command compares the bookkeeping, the releases and other files below clusters/. A and B are
+    commits, or times like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago).
 
     \b
     Examples:
@@ -63,7 +63,10 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
-    """Return the state at a revision, and warn about files that are not valid there."""
+    """Return the state at a revision, by default the newest; warn about files not valid there.
+
+    An invalid file counts with its last valid version.
+    """
     with progress("reading the ledger") as report:
         snapshot = repo.last_valid_snapshot(repo.commit(revision), report)
     warn_of(repo.problems_of(snapshot))

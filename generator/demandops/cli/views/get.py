@@ -81,7 +81,12 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
 @state_repo_option
 @_filters
 @at_option
-@click.option("-w", "--watch", is_flag=True, help="Print the list again whenever it changes.")
+@click.option(
+    "-w",
+    "--watch",
+    is_flag=True,
+    help="Print the list again when a new commit or proposal changes it.",
+)
 @output_formats("text", "wide", "name", "json", "yaml")
 def get(
     kind: str,
@@ -118,8 +123,9 @@ def get(
         raise click.UsageError(f"{kind} have no --{name}; they can be filtered by {can}")
     with reader.opened(state_repo) as repo:
         source = _read(repo, at)
-        _refuse_unknown(shown, source, names, wanted)
-        items = _matching(shown, shown.items(source), names, wanted)
+        items = shown.items(source)
+        _refuse_unknown(shown, items, source.snapshot.state, names, wanted)
+        items = _matching(shown, items, names, wanted)
         _print(kind, source, items, output, watch)
         while watch:
             REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
@@ -164,15 +170,17 @@ def _matching(
 
 
 def _refuse_unknown(
-    kind: Kind, source: Source, names: tuple[str, ...], wanted: dict[str, str]
+    kind: Kind, items: list[Json], world: World, names: tuple[str, ...], wanted: dict[str, str]
 ) -> None:
-    """Refuse names and filters that match nothing: they are probably misspelled."""
+    """Refuse names and filters that match nothing: they are probably misspelled.
+
+    A filter may match an item's value, or a name that other kinds of items have.
+    """
     faults: list[Fault] = []
-    items = [item["name"] for item in kind.items(source)] if names else []
-    asked = [(name, "", items) for name in names]
-    asked += [
-        (value, f"--{name}", _known(name, source.snapshot.state)) for name, value in wanted.items()
-    ]
+    asked = [(name, "", {item["name"] for item in items}) for name in names]
+    for name, value in wanted.items():
+        listed = (one for item in items for one in kind.filters[name](item))
+        asked.append((value, f"--{name}", {*_known(name, world), *listed}))
     for pattern, option, known in asked:
         if not any(matches(name, (pattern,)) for name in known):
             message = f"nothing is called {quoted(pattern)}{suggestion(pattern, known)}"
@@ -181,14 +189,14 @@ def _refuse_unknown(
         raise InvalidInput(faults)
 
 
-def _known(filter: str, world: World) -> list[str]:
+def _known(filter: str, world: World) -> Iterable[str]:
     if filter == "node":
-        return sorted({*world.config.nodes, *world.ledger.indexed_names("node")})
+        return {*world.config.nodes, *world.ledger.indexed_names("node")}
     if filter == "domain":
-        return sorted(world.config.domains)
+        return world.config.domains
     if filter == "requester":
-        return sorted(world.ledger.indexed_names("requester"))
-    return sorted(world.ledger.subjects(SubjectKind.APPLICATION))
+        return world.ledger.indexed_names("requester")
+    return world.ledger.subjects(SubjectKind.APPLICATION)
 
 
 def _print(kind: str, source: Source, items: list[Json], output: str, watch: bool) -> None:

@@ -68,7 +68,7 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
     "--requester",
     metavar="ID",
     shell_complete=names_of("requesters"),
-    help="List only commits that book or release claims of this requester.",
+    help="List only commits about claims or waiting demands of this requester.",
 )
 @click.option(
     "--application",
@@ -155,7 +155,10 @@ def log(
 
 
 def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
-    """Refuse filters that no commit ever matched: they are probably misspelled."""
+    """Refuse names that are probably misspelled.
+
+    These are names that no commit is about. A node's name is not refused if the inventory has it.
+    """
     known: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
     for entry in repo.log() if known else ():
         for name, values in known.items():
@@ -187,7 +190,8 @@ def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iter
     path = release if "/" in release else repo.release_path(release, tip)
     if path is None:
         raise StateRepoError(
-            f"there never was a release '{release}'; `demandops bookkeeping` lists what runs"
+            f"up to commit {tip[:10]}, there was no release {quoted(release)}; `demandops status` "
+            "lists the current ones"
         )
     return repo.log(commit_range, path)
 

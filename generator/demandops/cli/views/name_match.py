@@ -49,6 +49,8 @@ class Match:
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
     """Return the object that a name or path identifies; ``kind`` limits the search to one kind.
 
+    Only the history up to the commit of ``snapshot`` counts.
+
     Raises:
         StateRepoError: if the name identifies nothing, or several things.
     """
@@ -82,7 +84,13 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
     parts = {part for running_name in running_names for part in running_name.split("-")}
     close = closest(name, known | parts)  # a part of a release's name is also accepted
     known = {close} if close else known
-    raise StateRepoError(f"nothing called {quoted(name)} runs or ever ran{suggestion(name, known)}")
+    if kind is not None:
+        remedy = "; leave out --kind" if close in (None, name) else suggestion(name, known)
+        raise StateRepoError(f"no {kind} is called {quoted(name)}{remedy}")
+    raise StateRepoError(
+        f"nothing called {quoted(name)} runs or ran up to commit {str(snapshot.commit)[:10]}"
+        f"{suggestion(name, known)}"
+    )
 
 
 def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
@@ -104,11 +112,14 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
 def _by_looser_match(
     repo: Reader, snapshot: Snapshot, name: str, kind: str | None
 ) -> Iterator[Match]:
-    """Yield the demand, node or other object of this name.
+    """Yield the first object of this name that :func:`_named` finds.
 
     If there is none, yield the first of these that exists: a current release whose name contains
     ``name``, a held demand whose id begins with ``name``, an ended demand of exactly this id, an
     ended release whose name contains ``name``.
+
+    Raises:
+        StateRepoError: if the name is a part of several names.
     """
     world = snapshot.state
     found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)
@@ -125,7 +136,7 @@ def _by_looser_match(
 
 
 def _named(world: World, name: str) -> Iterator[Match]:
-    """Yield each object of this name that is no release, application or connection."""
+    """Yield each current object of this name that is no release, application or connection."""
     config = world.config
     if ("demand", name) in world.ledger.index:
         yield Match("demand", name)
@@ -185,7 +196,7 @@ def _the_only_name(
 
 
 def demand_commits(repo: Reader, snapshot: Snapshot, id: str) -> list[LogEntry]:
-    """Return the commits about a demand, newest first."""
+    """Return the generator's commits about a demand up to the snapshot's, newest first."""
     entries = repo.log(str(snapshot.commit))
     return [entry for entry in entries if id in entry.trailers.get("Demand-Id", ())]
 
@@ -202,7 +213,8 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
         return Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
         raise StateRepoError(
-            f"{quoted(path)} is not in the state repo and never was; correct the path"
+            f"{quoted(path)} is not in the state repo at commit {str(snapshot.commit)[:10]} and "
+            "never was before; correct the path"
         )
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return Match("file", path, path)

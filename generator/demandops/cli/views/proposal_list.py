@@ -18,8 +18,12 @@ from demandops.staterepo.write.proposal_branch import PendingProposal, pending_p
 def proposals(repo: Reader) -> list[Json]:
     """Return the proposals as JSON data.
 
-    If DEMANDOPS_FORGE_TOKEN_FILE names a file with a token, GitHub or Gitea provides the link to
-    the pull request of each proposal. Otherwise the links are None.
+    The links to the pull requests come from the GitHub or Gitea that demandops.yaml names, with the
+    token in the file that DEMANDOPS_FORGE_TOKEN_FILE names. If one of these is missing, or there is
+    no answer or no pull request, a link is None.
+
+    Raises:
+        RemoteAway: the state repo cannot be reached.
     """
     pending = list(pending_proposals(repo.repository))
     forge = _forge(repo) if pending else None

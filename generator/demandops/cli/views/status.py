@@ -34,6 +34,7 @@ from demandops.plan.views.missing_inputs import MissingInput, missing_inputs
 from demandops.runtime import REAL
 from demandops.service import rollout_targets
 from demandops.staterepo import reader
+from demandops.staterepo.git.repository import RemoteAway
 from demandops.staterepo.load.problem_report import Problem
 from demandops.staterepo.reader import Reader
 
@@ -48,7 +49,8 @@ _PATIENCE_S = 10
 @click.option(
     "--wait",
     is_flag=True,
-    help="Wait until the exit code would be 0, or until --timeout has passed.",
+    help="Wait until the exit code would be 0, or until --timeout has passed. An invalid file that "
+    "no generator has reported yet ends the wait at once.",
 )
 @click.option(
     "--timeout",
@@ -130,7 +132,8 @@ def _wait_until_healthy(
 ) -> Status:
     """Wait until nothing is wrong or ``timeout`` seconds have passed; return the last status.
 
-    A cluster may take ``patience_s`` seconds to answer.
+    A cluster may take ``patience_s`` seconds to answer. While the state repo cannot be reached, the
+    status is that of the commit fetched last.
     """
     end, told = REAL.monotonic() + timeout, ""
     while (amiss := found.amiss(clusters)) and REAL.monotonic() < end:
@@ -138,7 +141,10 @@ def _wait_until_healthy(
             errors.print(f"waiting: {amiss}")
             told = amiss
         REAL.sleep(_POLL_S)
-        repo.refresh()
+        try:
+            repo.refresh()
+        except RemoteAway as error:  # then the last fetched commit is shown
+            errors.print(f"warning: {error}")
         found = Status.of(repo, clusters, patience_s)
     return found
 
@@ -191,9 +197,10 @@ class Status:
         return cls(commit, rows, problems, known, pending, old, left, missing, unreadable)
 
     def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
-        """Return a text that counts problems and unhealthy releases; empty if nothing is wrong.
+        """Return a text that counts everything that is wrong; empty if nothing is wrong.
 
-        Only releases on clusters with a kubeconfig in ``clusters`` count.
+        Of the releases, only those on clusters with a kubeconfig in ``clusters`` count. Missing
+        inputs do not count.
         """
         readable = {name for name, cluster in clusters.items() if cluster.kubeconfig}
         watched = [row for row in self.rows if row["cluster"] in readable]
@@ -201,7 +208,7 @@ class Status:
         healthy = sum(row["health"] == "healthy" for row in watched)
         counts: dict[str, int | str] = {
             "problems in files": len(self.problems),
-            "files that a generator has yet to write": len(self.not_rendered),
+            "files that a generator has yet to write or remove": len(self.not_rendered),
             "clusters with an old bootstrap file": len(self.old_bootstraps),
             "objects that belong to no release": len(self.orphans),
             "releases failing": failing,
@@ -232,7 +239,7 @@ class Status:
         if self.problems:
             count = len(self.problems)
             title = "1 problem" if count == 1 else f"{count} problems"
-            text.insert(0, f"{title}; the last valid version of each file is in effect:")
+            text.insert(0, f"{title}; the last valid version of each file, if any, is in effect:")
         further = map(str, (*self.old_bootstraps, *self.orphans))
         return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
 

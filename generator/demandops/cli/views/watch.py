@@ -18,7 +18,8 @@ from demandops.cli.views.kinds import KINDS, Source
 from demandops.cli.views.log import log_table
 from demandops.cli.views.status import Status, releases_table
 from demandops.cluster import clusters_file
-from demandops.errors import StateRepoError
+from demandops.errors import InvalidInput, StateRepoError
+from demandops.quoting import one_line
 from demandops.runtime import REAL
 from demandops.staterepo import reader
 from demandops.staterepo.reader import Reader
@@ -54,9 +55,14 @@ def watch(state_repo: str, access_file: Path | None) -> None:
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     try:
         with reader.opened(state_repo) as repo, Live(screen=True, auto_refresh=False) as live:
-            away = ""
+            away, shown = "", list[str]()
             while True:
-                shown = _screen(repo, clusters, away)
+                try:
+                    shown = _screen(repo, clusters, away)
+                except InvalidInput as error:  # until a generator has reported the invalid file
+                    if not shown:
+                        raise
+                    shown[1] = painted(f"not well, last valid state: {one_line(str(error))}", "red")
                 live.update(Text.from_ansi("\n".join(shown), no_wrap=True), refresh=True)
                 REAL.sleep(_PAUSE_S)
                 try:

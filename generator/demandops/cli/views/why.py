@@ -76,8 +76,9 @@ def why(
     The command shows the requesters, the configuration and overrides that apply, and the commits.
     NAME is the name of a release, application definition or override, or the id of an application,
     connection, demand, node or requester. A part of a release's name or the start of a demand's id
-    is enough if no other release or demand has it. PATH is a file below clusters/ or ledger/. If
-    something no longer runs, the command shows the commit that stopped it.
+    is enough if no other release or demand has it. PATH is a file in a folder of the state repo,
+    such as clusters/ or ledger/. If something no longer runs, the command shows the commit that
+    stopped it.
 
     \b
     Examples:
@@ -269,12 +270,18 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
-    """Return the commits that started, changed and stopped the object of ``match``."""
+    """Return the commits that started, changed and stopped the object of ``match``.
+
+    There are none of a node or requester, and none of a demand that no commit names.
+    """
     if match.kind in ("node", "requester"):  # `demandops log` lists their commits
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":
         return _history(repo, repo.history(match.path, str(snapshot.commit), most))
-    *newer, first = demand_commits(repo, snapshot, match.name)
+    about = demand_commits(repo, snapshot, match.name)
+    if not about:  # the history was made anew
+        return _history(repo, PathHistory(None, (), 0, None))
+    *newer, first = about
     held = ("demand", match.name) in snapshot.state.ledger.index
     stopped = None if held or not newer else newer.pop(0)
     left = max(len(newer) - most, 0)

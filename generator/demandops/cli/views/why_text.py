@@ -65,7 +65,8 @@ def _claim_lines(claims: list[Json]) -> Iterator[str]:
     for claim in claims:
         lease, subject = claim["lease"], f"{claim['subject']['kind']} '{claim['subject']['id']}'"
         until = f", lease of {duration_text(lease['seconds'])}" if lease else ""
-        until += f" until {time_text(lease['until'])}" if lease else ""
+        if lease:
+            until += f" until {time_text(lease['until'])}" if lease["until"] else ", not started"
         until += (
             ", which has passed; a generator has yet to release the claim"
             if claim["overdue"]

@@ -45,6 +45,8 @@ class Base:
 
     If a file is not valid, ``state`` has its last valid version.
     """
+    target: str = ""
+    """The merge target as git names it, such as ``origin/main``; empty if there is none."""
     newer: int = 0
     """How many commits of the merge target the checkout lacks."""
     merged: Mapping[str, str] = field(default_factory=dict)
@@ -121,12 +123,16 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         tip = trees.commit_of(repo, target)
         _, newer = repo.ahead_behind(repo.head.peel(Commit).id, tip.id)
         merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
-        base = replace(base, newer=newer, merged=merged)
+        base = replace(base, target=_short(target), newer=newer, merged=merged)
     try:
         snapshot = state_in_effect.state_at(repo, commit.id)
     except (InvalidInput, StateRepoError):
         return base
     return replace(base, state=snapshot.state, valid=not snapshot.problems)
+
+
+def _short(reference: str) -> str:
+    return reference.removeprefix("refs/remotes/").removeprefix("refs/heads/")
 
 
 def _started_from(repo: Repository, target: str) -> Commit:

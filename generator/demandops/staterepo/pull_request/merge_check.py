@@ -56,8 +56,9 @@ class CheckResult:
     that commit has files that are not valid, and their last valid versions are compared instead.
     ``preview`` and ``bookkeeping`` show what the merge changes. Both are None if a file of the
     checkout is not valid. ``bookkeeping`` is also None if the bookkeeping of ``base`` is not known.
-    ``newer`` counts the commits that the merge target has and the checkout lacks. ``warnings``
-    point out likely mistakes and what a person has to do after the merge.
+    ``target`` is the name of the merge target, and ``newer`` counts the commits that it has and the
+    checkout lacks. ``warnings`` point out likely mistakes and what a person has to do after the
+    merge.
     """
 
     faults: tuple[Fault, ...]
@@ -66,6 +67,7 @@ class CheckResult:
     bookkeeping: tuple[EntryChange, ...] | None = None
     base: str | None = None
     base_valid: bool = True
+    target: str = ""
     newer: int = 0
     warnings: tuple[Fault, ...] = ()
     charts: RenderedCharts | None = None
@@ -102,6 +104,7 @@ def check(
         (),
         base=start.commit if start else None,
         base_valid=start is None or start.valid,
+        target=start.target if start else "",
         newer=start.newer if start else 0,
     )
     try:
