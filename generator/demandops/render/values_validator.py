@@ -98,7 +98,8 @@ class _Work:
         The value has at most ``depth`` nested levels.
 
         Raises:
-            RecursionError: if a schema applies itself to the same value, or the number is too high.
+            RecursionError: if a schema applies itself to the same value, the number is too high, or
+                too many schemas must be counted.
         """
         if not isinstance(schema, dict) or depth < 0:
             return 1
@@ -138,7 +139,10 @@ class _Work:
             return found
         for step in reference[2:].split("/"):
             name = step.replace("~1", "/").replace("~0", "~")
-            found = found.get(name) if isinstance(found, dict) else None
+            if isinstance(found, list):
+                found = found[int(name)] if name.isdecimal() and int(name) < len(found) else None
+            else:
+                found = found.get(name) if isinstance(found, dict) else None
         return found
 
 

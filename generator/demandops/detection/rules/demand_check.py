@@ -29,7 +29,7 @@ _SAMPLE: Values = {
 def faults_of_demand(
     template: RuleDemand, field: str, subjects: tuple[str, ...], momentary: frozenset[str]
 ) -> list[Fault]:
-    """Return the faults of a rule's demand.
+    """Return the faults of a rule's demand: of its names, else of its form, else of its ids.
 
     Args:
         template: the template of the demand.
@@ -53,7 +53,9 @@ def faults_of_demand(
     written = dict(rule_template.texts(template.data, field))
     for one in formed:
         path = f"{field}.{one.field}" if one.field else field
-        found.append(fault(path, _message_for_number(written.get(path, "")) or one.message))
+        is_text = one.message.startswith("must be text")
+        number = _message_for_number(written.get(path, "")) if is_text else ""
+        found.append(fault(path, number or one.message))
     return found or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
 
 

@@ -92,7 +92,7 @@ class RuleDemand:
         """Return the goal that starts the demand, if ``values`` has all names of the template.
 
         If ``values`` lacks a name, the goal has only the demand's id and its requesters, which
-        suffice to end the demand.
+        suffice to end the demand. Only the template of a ``Demand`` may use such names.
         """
         if self.names() <= set(values):
             return self.goal(values)
@@ -117,7 +117,8 @@ class RuleDemand:
             rule: the name of the rule.
 
         Returns:
-            The entity for each name in ``subjects``; ``None`` if the rule has not made this demand.
+            The entity for each name in ``subjects``; ``None`` if the rule makes
+            no demand with this id and these requesters.
         """
         if self.action == "demand":
             pairs = [(str(self.data["demand"]), held.demand)]
