@@ -267,8 +267,8 @@ def doubling(times: int) -> dict[str, object]:
 
 
 def doubling_in_list(times: int) -> dict[str, object]:
-    """Return such a schema whose definitions are the items of a list."""
-    steps = [{"anyOf": [{"$ref": f"#/allOf/{i + 1}"}] * 2} for i in range(times)]
+    """Return such a schema whose definitions are the items of a list; ``%4f`` stands for ``O``."""
+    steps = [{"anyOf": [{"$ref": f"#/all%4ff/{i + 1}"}] * 2} for i in range(times)]
     return {"allOf": [*steps, {"type": "object"}]}
 
 

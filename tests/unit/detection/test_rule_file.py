@@ -101,8 +101,8 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near=NEAR, demand=demand(demand="{entity}/{x}")),
-            "rules.yaml:18: rules[0].demand.demand: '{x}' changes, but an id must stay "
-            "the same; leave that name out",
+            "rules.yaml:18: rules[0].demand.demand: '{x}' changes, but the demand's id "
+            "must stay the same; leave that name out",
         ),
         (
             rule("a", near=NEAR, demand=demand(operation="release")),
@@ -139,7 +139,7 @@ def test_mistakes_of_sources_are_told_together() -> None:
         "rules.yaml:4: sources.a: must say at exactly one place where the name of the entity is: "
         "either write {entity} as a part of 'topic', or set 'entity' to the field of the message "
         "that has the name",
-        "rules.yaml:8: sources.b.topic: 'b/entity' is not a topic name that ROS 2 allows; use "
+        "rules.yaml:8: sources.b.topic: 'b/{entity}' is not a topic name that ROS 2 allows; use "
         "letters, digits and '_', with a single '/' between parts; no part may start with a digit",
         "rules.yaml:9: sources.b.type: 'PoseStamped' is not a message type; write it like "
         "std_msgs/msg/String",

@@ -46,7 +46,7 @@ class _InArea(CamelModel):
     @model_validator(mode="after")
     def _has_one_shape(self) -> _InArea:
         if (self.point is None) == (self.polygon is None):
-            raise ValueError("needs either point or polygon")
+            raise ValueError("needs exactly one of point and polygon")
         return self
 
     @property

@@ -80,11 +80,12 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
         yield from _missing(data, field, "demand", "requesters")
         why = "otherwise two events would share one demand"
         listed = [("demand", [data.get("demand", "")], why)]
-        stable = [("demand", data.get("demand", "")), ("requesters", data.get("requesters", ()))]
-        for name, value in stable:
-            for path, text in rule_template.texts(value, f"{field}.{name}"):
+        for name, what in (("demand", "id"), ("requesters", "requesters")):
+            for path, text in rule_template.texts(data.get(name, ()), f"{field}.{name}"):
                 if changing := sorted(names(text) - {"rule", "entity", "other"}):
-                    message = f"'{{{changing[0]}}}' changes, but an id must stay the same; "
+                    message = (
+                        f"'{{{changing[0]}}}' changes, but the demand's {what} must stay the same; "
+                    )
                     yield fault(path, f"{message}leave that name out")
     else:
         yield from _missing(data, field, "id")

@@ -105,7 +105,7 @@ class Rule(CamelModel):
             listed = f"; it has {', '.join(given)}" if given else ""
             raise ValueError(f"needs exactly one of {', '.join(CONDITIONS)}{listed}")
         if (self.demand is None) == (self.deployment_request is None):
-            raise ValueError("needs either demand or deploymentRequest")
+            raise ValueError("needs exactly one of demand and deploymentRequest")
         if self.renew and self.demand is not None:
             raise ValueError(
                 "renew is for a deploymentRequest; leave it out, because the detector renews each "
