@@ -58,8 +58,9 @@ def check_values(
         template: the path of the file that the values come from: a template or an override.
 
     Raises:
-        InvalidInput: if values do not match the schema, or if the schema is not valid. The error
-            names ``template`` and each of these values, or the file of the schema.
+        InvalidInput: if values do not match the schema; the error names ``template`` and each of
+            these values. Also if the schema or the chart's ``values.yaml`` is not valid; the error
+            names that file.
     """
     schema = config.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
     if schema is None:

@@ -117,15 +117,18 @@ class RuleDemand:
             rule: the name of the rule.
 
         Returns:
-            The entity for each name in ``subjects``; ``None`` if the rule makes
-            no demand with this id and these requesters.
+            The entity for each name in ``subjects``. ``None`` if the rule makes no demand with this
+            id and these requesters, or if neither tells the entities, such as an id
+            ``{entity}-{other}`` of entities with dashes.
         """
+        named = {*requesters_in(self.action, self.data)}
+        if len(held.requesters) > len(named):
+            return None
         if self.action == "demand":
             pairs = [(str(self.data["demand"]), held.demand)]
         else:
-            named = {*requesters_in(self.action, self.data)}
             pairs = [(str(self.data.get("id", "")), held.request)]
-            pairs += product(sorted(named), held.requesters)
+        pairs += product(sorted(named), held.requesters)
         found: dict[str, set[str]] = {name: set() for name in subjects}
         for template, text in pairs:
             for name, entity in candidates(template, text).items():
