@@ -36,7 +36,7 @@ from jinja2.visitor import NodeTransformer
 MAX_STEPS = 1_000_000
 """How many steps a rendering may take: a few seconds of work.
 
-A template with 100 topics takes several thousand steps.
+A template that lists 100 topics takes a few hundred steps.
 """
 MAX_LENGTH = 1_000_000
 """How many characters a text may have. Kubernetes accepts objects of at most 1.5 MB."""
