@@ -162,8 +162,8 @@ def test_a_broker_and_a_topic_that_only_the_cluster_knows_are_told(migration: Mi
     told = [line for line in migration.run().err.splitlines() if "vehicle02" in line]
     assert told == [
         "warning: mqtt-connection-vehicle02-edge: its broker service-mqtt-broker-edge:1993 is not "
-        "in inventory/brokers.yaml; add the broker there, or leave the field empty, so that the "
-        "generator chooses one",
+        "in inventory/brokers.yaml; add the broker there and its node to the map, or leave the "
+        "field empty, so that the generator chooses one",
         "warning: mqtt-connection-vehicle02-edge: earlier requests also listed "
         "/vehicles/vehicle02/ego_data; the connection's clients may still carry these topics, so "
         "add the needed ones to the map",
@@ -182,8 +182,8 @@ UNKNOWN = (
     [
         (
             "",
-            "is empty, because an operator was stopped while it wrote the file; leave the file "
-            "out, or list in it who holds each resource, such as "
+            "is empty, perhaps because an operator was stopped while it wrote the file; leave the "
+            "file out, or list in it who holds each resource, such as "
             "'mqtt-connection-vehicle00-edge: [vehicle00]'",
         ),
         ("[]", UNKNOWN),
@@ -203,8 +203,8 @@ UNKNOWN = (
         ("of-a: {topicsEgoData: {}}", "of-a: topicsObjectlist: is missing; add it"),
         (
             "of-edge-object-detection-fusion: [a]",
-            "of-edge-object-detection-fusion: is in two files, which may be from different times; "
-            "give only one of them",
+            "of-edge-object-detection-fusion: appears twice, perhaps from different times; give "
+            "it only once",
         ),
     ],
 )

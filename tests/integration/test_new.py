@@ -118,7 +118,8 @@ def test_an_access_domain_beside_one_that_has_every_node_is_refused(
     assert (ran.code, ran.err) == (
         1,
         "error: policy/access-domains.yaml: nodes: access domain 'fleet' has every node by its "
-        "pattern '*', so no other access domain can have a node; narrow this pattern first\n",
+        "pattern '*', so no pattern of another access domain may match a node; narrow this "
+        "pattern first\n",
     )
 
 

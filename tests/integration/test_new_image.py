@@ -110,6 +110,13 @@ def test_an_invalid_tag_or_digest_is_refused(
         ),
         (
             "x",
+            "ghcr.io/X/y",
+            "https://h/x",
+            "error: --repository: 'ghcr.io/X/y' is no valid repository; write HOST/PATH in lower "
+            "case, without a tag",
+        ),
+        (
+            "x",
             "ghcr.io/x/y",
             "https://h/$(x)",
             "error: --state-repo: 'https://h/$(x)' is no valid URL",

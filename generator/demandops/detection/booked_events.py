@@ -1,4 +1,4 @@
-"""Finds, from the booked demands, the events that had started before a restart."""
+"""Finds, from the bookkeeping, the events that had started before a restart."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from demandops.detection.rules.rule_file import RuleFile
 
 
 def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, Goal]:
-    """Return each event whose demand is booked, with a goal that can end this demand.
+    """Return each event whose demand is booked or waits for room, with a goal that can end it.
 
     Args:
         file: the rules.

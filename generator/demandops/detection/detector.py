@@ -19,7 +19,11 @@ from demandops.detection.rules.rule_template import Values
 
 @dataclass(frozen=True, slots=True)
 class Want:
-    """The goal that an event wants from now on; ``None`` ends the event's demand."""
+    """The goal that an event wants from now on; ``None`` ends the event's demand.
+
+    ``retry_s`` is how many seconds to wait before a refused goal is sent again. ``renew_s`` is how
+    often to send a ``DeploymentRequest`` again, 0 for never.
+    """
 
     key: Key
     goal: Goal | None
@@ -49,6 +53,8 @@ class Detector:
 
     def resume(self, booked: Mapping[Key, Goal], now: float, settle_s: float) -> list[Want]:
         """Continue the events whose demands were booked before the detector started.
+
+        Call this before the first step, because it forgets what steps have found.
 
         Args:
             booked: each event, with its demand as a goal. The goal may lack everything except the
@@ -95,7 +101,8 @@ class Detector:
 
         An event ends if its rule is gone or is no longer for its entities. If the rule has changed,
         the event wants the goal of the changed rule. If the template of the changed rule needs a
-        value that is not known, the event keeps its goal. ``settle_s`` is as in :meth:`resume`.
+        value that is not known, the event keeps its goal. Dwell times begin anew. The entities of
+        the other events are awaited as after a restart; ``settle_s`` is as in :meth:`resume`.
         """
         before, old = self._state.lasting, self._rules
         self.file, self._engine = file, EventEngine(file)

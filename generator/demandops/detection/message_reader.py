@@ -22,7 +22,7 @@ Getter = Callable[[Any], Any]
 
 
 class Unreadable(Exception):
-    """Raised for a message with a missing or unusable field; the error's text is one line."""
+    """Raised for a message that cannot be used; the error's text is one line."""
 
 
 class MessageReader:
@@ -50,7 +50,8 @@ class MessageReader:
             at: the time at which the message arrived.
 
         Raises:
-            Unreadable: if a field is missing or has the wrong kind of value.
+            Unreadable: if a field is missing, a number is missing or not finite, a position is too
+                far from the origin, or the entity's name has characters that are not allowed.
         """
         if self._entity:
             entity = str(self._entity(message)).strip("/")

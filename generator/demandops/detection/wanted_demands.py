@@ -23,7 +23,7 @@ from demandops.detection.rules.rule_demand import Goal
 Purpose = Literal["start", "renew", "end"]
 
 _RENEW_AFTER = 1 / 3
-"""The fraction of a lease after which to renew it; two more attempts fit before the lease ends."""
+"""The fraction of a lease after which to renew it, so that time is left for more attempts."""
 _RETRY_S = 5.0
 _OTHER_S = 0.2
 """How many seconds until the next try while another event holds a demand with the same id."""
@@ -162,8 +162,9 @@ class WantedDemands:
         """Record the outcome of a goal.
 
         Returns:
-            The reason of a failure, for the log. The text is empty if the goal succeeded, or if the
-            previous attempt failed for the same reason.
+            The reason of a failure, for the log. The text is empty if the goal succeeded, if the
+            previous attempt failed for the same reason, or if the demand to end or renew is not
+            held any longer.
         """
         entry = self._entries[sending.key]
         entry.is_under_way = False

@@ -13,7 +13,7 @@ from demandops.migration.reference_files import (
     ObjectDetection,
     ReferenceFiles,
 )
-from demandops.migration.reference_map import ReferenceMap
+from demandops.migration.reference_map import ReferenceMap, is_object_list
 from demandops.migration.remaining_joins import Join, remaining, replayed
 
 _MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # the numbers of these types in ROS messages
@@ -22,11 +22,12 @@ _MQTT, _OBJECT_DETECTION_FUSION = 1, 1  # the numbers of these types in ROS mess
 def remaining_joins(files: ReferenceFiles) -> tuple[dict[str, list[Join]], list[str]]:
     """Return a map from resource to the joins that no shutdown has undone yet, and warnings.
 
-    Detections are left out, because a goal for a fusion brings the detections that the fusion
-    needs.
+    Resources that nobody holds are left out. Detections are left out too, because a goal for a
+    fusion brings the detections that the fusion needs. If the files have only the spec of a
+    resource, the joins are those of its last request, and a warning says so.
 
     Raises:
-        InvalidInput: if the files do not say who holds a resource.
+        InvalidInput: if a connection has several requests, but no bookkeeping.
     """
     joins, warnings, faults = dict[str, list[Join]](), list[str](), list[Fault]()
     for name in files.names():
@@ -55,8 +56,9 @@ def _rewritten(name: str) -> Fault:
     message = (
         "has requests, but no bookkeeping. The requests alone do not tell who holds the "
         "connection, because the reference's operator adds each later requester to the first "
-        "request. Give mqtt_bookkeeping.yml too. If this file is lost, write one that lists each "
-        f"requester as often as it joined, such as '{name}: [vehicle00]'"
+        "request. Give an mqtt_bookkeeping.yml that has the connection. If this file is lost, "
+        "write one that lists each requester as often as it holds the connection, such as "
+        f"'{name}: [vehicle00]'"
     )
     return fault(name, message)
 
@@ -87,7 +89,7 @@ def goals(joins: dict[str, list[Join]], mapped: ReferenceMap, file: str) -> list
     """Return goals, oldest first: one for each set of requesters that hold something together.
 
     If requesters hold a resource twice, they get a second goal with another id, because the ledger
-    counts a repeated goal once.
+    counts a repeated goal once. ``file`` is the map's file, which errors name.
 
     Raises:
         InvalidInput: if the map in ``file`` has no entry for a resource or a topic.
@@ -128,8 +130,13 @@ def _application(name: str, join: Join, mapped: ReferenceMap) -> dict[str, Any]:
         one for one in join.topics if one not in app.ego_data and one not in app.point_clouds
     ]
     if missing:
-        where = f"applications.{name}.egoData"
-        raise InvalidInput([fault(f"{where}.{topic}", _MISSING) for topic in missing])
+        where = f"applications.{name}"
+        raise InvalidInput(
+            fault(
+                f"{where}.{'pointClouds' if is_object_list(topic) else 'egoData'}.{topic}", _MISSING
+            )
+            for topic in missing
+        )
     clouds = [app.point_clouds[topic] for topic in join.topics if topic in app.point_clouds]
     ego_data = {topic: app.ego_data[topic] for topic in join.topics if topic in app.ego_data}
     return {

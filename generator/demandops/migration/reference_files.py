@@ -119,7 +119,10 @@ class MqttConnection(_Part):
     )
 
     def topics(self) -> list[tuple[str, str]]:
-        """Return the topics of the last request, each with its name at both ends."""
+        """Return the topics of the last request, each with its name at both ends.
+
+        The result is empty if the fields of one end are empty.
+        """
         targets = self.mqtt2ros.__pydantic_extra__
         names = [targets[one].ros_topic for one in self.mqtt2ros.mqtt_topics if one in targets]
         return list(zip(self.ros2mqtt.ros_topics, names, strict=False))
@@ -200,10 +203,11 @@ class ReferenceFiles:
 
 
 def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
-    """Return the content of all documents. Each document is paired with the name of its file.
+    """Return the content of all documents. ``documents`` are pairs of a file's name and a document.
 
     Raises:
-        InvalidInput: with the faults of all files.
+        InvalidInput: with the faults of all documents; of each document, only those of its first
+            invalid entry.
     """
     found, faults = ReferenceFiles(), list[Fault]()
     for file, document in documents:
@@ -219,8 +223,8 @@ def read(documents: Iterable[tuple[str, object]]) -> ReferenceFiles:
 def _read(found: ReferenceFiles, file: str, document: object) -> None:
     if document is None:
         message = (
-            "is empty, because an operator was stopped while it wrote the file; leave the file "
-            "out, or list in it who holds each resource, such as "
+            "is empty, perhaps because an operator was stopped while it wrote the file; leave the "
+            "file out, or list in it who holds each resource, such as "
             "'mqtt-connection-vehicle00-edge: [vehicle00]'"
         )
         raise InvalidInput.at("", message, file=file)
@@ -288,6 +292,6 @@ Value = TypeVar("Value")
 
 def _add(known: dict[str, Value], name: str, value: Value, file: str) -> None:
     if name in known:
-        message = "is in two files, which may be from different times; give only one of them"
+        message = "appears twice, perhaps from different times; give it only once"
         raise InvalidInput([fault(name, message).within(file)])
     known[name] = value

@@ -85,6 +85,11 @@ def slug(id: str) -> str:
     return id.replace("_", "-").replace("/", "-")
 
 
+def is_object_list(topic: str) -> bool:
+    """Return whether a topic has an object list, by its name in the reference."""
+    return topic.endswith(_OBJECT_LIST)
+
+
 def is_host(broker: Broker, host: str, port: object) -> bool:
     """Return whether a broker is at the address ``host`` and ``port``.
 
@@ -136,7 +141,7 @@ class _Inventory:
         node = spec.node if spec else max(named, key=len, default="")
         rest = id.removeprefix(f"{slug(node)}-")
         topics = dict.fromkeys(topic for join in joins for topic in join.topics)
-        clouds = [topic for topic in topics if topic.endswith(_OBJECT_LIST)]
+        clouds = [topic for topic in topics if is_object_list(topic)]
         return {
             "id": f"{node}/{rest.replace('-', '_')}" if node and rest != id else "",
             "node": node,
@@ -198,6 +203,7 @@ class _Inventory:
                 return broker.node
         self.warnings.append(
             f"{name}: its broker {spec.host}:{spec.port} is not in {self._broker_files}; add the "
-            "broker there, or leave the field empty, so that the generator chooses one"
+            "broker there and its node to the map, or leave the field empty, so that the generator "
+            "chooses one"
         )
         return ""

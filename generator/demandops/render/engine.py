@@ -69,7 +69,7 @@ class _FilesLoader(BaseLoader):
 
 
 class _CompiledTemplates(BytecodeCache):
-    """Keeps compiled templates, so that a process compiles each text only once."""
+    """Keeps compiled templates, so that a process seldom compiles a text twice."""
 
     _LIMIT = 256
 
@@ -178,8 +178,8 @@ class Engine:
             context: the variables of the template.
 
         Raises:
-            InvalidInput: if the template or the check fails. The error names the template and, if
-                known, the line.
+            InvalidInput: if the template or the check fails. If the template fails, the error names
+                the template. Each fault has the template's line, if that line is known.
         """
         text = ""
         try:

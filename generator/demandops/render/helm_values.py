@@ -24,9 +24,9 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
     """Return the Helm values of a service, with the patches of overrides merged in.
 
     Raises:
-        InvalidInput: if the template fails, the values do not match the chart's schema, or an
-            override sets the replicas of an autoscaled service to 0. The error names the template
-            or the override.
+        InvalidInput: if the template fails, the values do not match the chart's schema, the schema
+            is not valid, or an override sets the replicas of an autoscaled service to 0. The error
+            names the template, the schema or the override.
     """
     template = config.values_template(release.service)
     if release.autoscaler and release.autoscaler.max == 0:
@@ -49,7 +49,7 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
 def _name_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
     """Yield the faults of ``error``.
 
-    Each message also names the overrides that change the template's variables.
+    If overrides change the template's variables, each message also names these overrides.
     """
     changing = {"version", "images", "replicas", "node"}
     files = [override.path for override, effects in release.shaping.by if changing & {*effects}]

@@ -1,7 +1,8 @@
 """The last check of rendered files before a commit.
 
 Helm values must match the chart's ``values.schema.json``. Objects of Kubernetes' built-in kinds
-must match the schemas of Kubernetes. Every path must be in a folder that the generator owns.
+must match the schemas of Kubernetes. Every path must be in a folder that the generator owns. No two
+objects of a cluster may have the same kind, namespace and name.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ _API = re.compile(r"^apiVersion: (\S+)$", re.MULTILINE)
 def check_values(
     values: Mapping[str, Any], chart: ChartSource, config: Config, template: str
 ) -> None:
-    """Check Helm values against the chart's schema, if the chart is in the state repo.
+    """Check Helm values against the chart's schema, if the state repo has this schema.
 
     Like Helm, the function first merges the values into the chart's defaults, because a schema may
     require a value that has a default.
@@ -57,8 +58,9 @@ def check_values(
         template: the path of the file that the values come from: a template or an override.
 
     Raises:
-        InvalidInput: if values do not match the schema. The error names ``template`` and each of
-            these values.
+        InvalidInput: if values do not match the schema; the error names ``template`` and each of
+            these values. Also if the schema or the chart's ``values.yaml`` is not valid; the error
+            names that file.
     """
     schema = config.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
     if schema is None:
@@ -82,8 +84,9 @@ def check_files(files: Mapping[str, str | None]) -> None:
     """Check files that are about to be committed. A file with the text ``None`` is removed.
 
     Raises:
-        InvalidInput: if a file is not valid. The error lists all faults. Their cause is a mistake
-            in DemandOps or in a template, not in a demand.
+        InvalidInput: if a file is not valid, or if an object of a cluster appears twice. The error
+            lists all faults. Their cause is a mistake in DemandOps or in a template, not in a
+            demand.
     """
     faults: list[Fault] = []
     seen: dict[tuple[str, str, str, str], str] = {}

@@ -68,7 +68,7 @@ def override_comment(override: Override, effects: tuple[str, ...]) -> str:
 
 
 def split_comments(text: str) -> tuple[list[str], str]:
-    """Return the comment lines above a file's body, and the body."""
+    """Return the comments on overrides at the start of a file, and the file's body below them."""
     lines = text.splitlines(keepends=True)
     count = 0
     while count < len(lines) and lines[count].startswith(_START):

@@ -3,7 +3,8 @@
 Each loop, call, filter and comparison takes steps from a budget. The number of steps depends on the
 size of the values, and no value can become large. So a template that exceeds the budget fails at
 the same place on every machine. Templates can use only the filters and methods that this module
-lists, because the others give random results, expose memory addresses, or make HTML.
+lists, and the engine's own filters. Many of the others give random results, expose memory
+addresses, or make HTML.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from jinja2.visitor import NodeTransformer
 MAX_STEPS = 1_000_000
 """How many steps a rendering may take: a few seconds of work.
 
-A template with 100 topics takes several thousand steps.
+A template that lists 100 topics takes a few hundred steps.
 """
 MAX_LENGTH = 1_000_000
 """How many characters a text may have. Kubernetes accepts objects of at most 1.5 MB."""
@@ -105,8 +106,9 @@ def budget() -> Iterator[None]:
 def _size(value: object, *, data: bool = True) -> int:
     """Return the size of a value with all its parts. A part that occurs twice counts twice.
 
-    With ``data``, raise SecurityError for an object that is no text, number, list or mapping. Its
-    text could contain a memory address, which differs between machines.
+    Raise SecurityError if the value has too many parts. With ``data``, also raise it for an object
+    that is no text, number, true, false, null, list or mapping. Its text could contain a memory
+    address, which differs between machines.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
@@ -129,7 +131,8 @@ def _size(value: object, *, data: bool = True) -> int:
                 size += len(part)
             elif data and not isinstance(part, _PLAIN):
                 raise SecurityError(
-                    f"a template may write text, numbers, lists and mappings, not {type(part)}"
+                    "a template may write only text, numbers, true, false, null, lists and "
+                    "mappings; if this is a method or a macro, add its parentheses, as in name()"
                 )
         if size + (text >> 4) > MAX_SIZE:
             raise SecurityError(f"a value is too large: it has more than {MAX_SIZE} parts")
@@ -139,7 +142,7 @@ def _size(value: object, *, data: bool = True) -> int:
 def _counted_value(value: Any, *, data: bool = False) -> Any:  # noqa: ANN401
     """Take a step from the budget for each part of a value, and return the value.
 
-    An iterator becomes a list.
+    An iterator or a view of a mapping becomes a list.
     """
     if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
         value = list(islice(value, MAX_SIZE + 1))
@@ -155,9 +158,14 @@ def _refuse_large(name: str, size: int, most: int = MAX_LENGTH) -> None:
 
 
 def _refuse_wide(name: str, form: str, values: Iterable[object]) -> None:
-    """Raise SecurityError if formatting ``values`` with ``form`` may give too large a text."""
+    """Raise SecurityError if formatting ``values`` with ``form`` may give too large a text.
+
+    Also raise it if ``form`` takes a width from a value, because the size is not known then.
+    """
     if _WIDTH_AS_ARGUMENT.search(form):
-        _refuse_large(name, MAX_LENGTH + 1)
+        raise SecurityError(
+            f"the format of '{name}' has '*' or a brace inside braces; write each width as a number"
+        )
     fields = form.count("%") + form.count("{")
     widths = sum(map(int, _DIGITS.findall(form)))
     _refuse_large(name, len(form) + widths + fields * sum(16 * _size(value) for value in values))
@@ -389,7 +397,8 @@ class Sandbox(ImmutableSandboxedEnvironment):
         """Return the result of a macro, function or method.
 
         Raises:
-            SecurityError: if ``_METHODS`` does not list the method of a built-in type.
+            SecurityError: if ``_METHODS`` does not list the method of a built-in type, the result
+                would be too large, or too few steps are left.
         """
         steps = _budget.get()
         for value in (*args, *kwargs.values()):
@@ -399,15 +408,15 @@ class Sandbox(ImmutableSandboxedEnvironment):
             if isinstance(owner, kind):
                 steps.take(1 if kind is dict else _size(owner))
                 if __obj.__name__ not in _METHODS.get(kind, ()):
-                    raise SecurityError(f"the method '{__obj.__name__}' is unsafe here")
+                    raise SecurityError(f"a template may not call the method '{__obj.__name__}'")
                 _refuse_growth(__obj.__name__, (owner, *args, *kwargs.values()))
         steps.take(1)
         return _counted_value(super().call(__context, __obj, *args, **kwargs))
 
     def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
-        """Return a function that replaces ``str.format`` and refuses too large a result.
+        """Return a function that replaces a format method and refuses too large a result.
 
-        Return None if ``value`` is not a format method.
+        Return None if ``value`` is neither ``str.format`` nor ``str.format_map``.
         """
         wrapped = super().wrap_str_format(value)
         if wrapped is None:

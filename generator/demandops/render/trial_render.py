@@ -26,10 +26,10 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return a map from each appdef to the releases that a trial demand for the appdef gives.
+    """Return a map from each appdef to the services' releases that a trial demand for it gives.
 
     Overrides do not apply. Each trial demand names the first suitable node (:func:`_trial_node`).
-    If no node is in an access domain, there are no trial demands.
+    If no node is in an access domain, there are no trial demands, and the map is empty.
 
     Raises:
         Refused: if a service cannot be planned.
@@ -105,11 +105,13 @@ def render_trial_demands(world: World, engine: Engine) -> None:
 
     So each appdef is checked before its first demand. A service is rendered for each version that
     ``registry/versions.yaml`` lists, and with each override that is in effect. If at least one of
-    the appdefs that an override affects can be rendered, the override counts as valid.
+    the appdefs that an override affects can be rendered, the override counts as valid. Overrides
+    are checked only if everything can be rendered without them. If no node is in an access domain,
+    nothing is checked.
 
     Raises:
         Refused, InvalidInput: if a service cannot be planned or rendered. The error names the
-            template, the values or the override at fault.
+            template, the schema or the override at fault.
     """
     config = world.config
     invented = trial_releases(config)

@@ -9,6 +9,7 @@ import json
 from collections.abc import Iterator
 from functools import lru_cache
 from typing import Any
+from urllib.parse import unquote
 
 import jsonschema_rs
 
@@ -98,7 +99,8 @@ class _Work:
         The value has at most ``depth`` nested levels.
 
         Raises:
-            RecursionError: if a schema applies itself to the same value, or the number is too high.
+            RecursionError: if a schema applies itself to the same value, the number is too high, or
+                too many schemas must be counted.
         """
         if not isinstance(schema, dict) or depth < 0:
             return 1
@@ -137,8 +139,11 @@ class _Work:
         if not isinstance(reference, str) or not reference.startswith("#/"):
             return found
         for step in reference[2:].split("/"):
-            name = step.replace("~1", "/").replace("~0", "~")
-            found = found.get(name) if isinstance(found, dict) else None
+            name = unquote(step).replace("~1", "/").replace("~0", "~")
+            if isinstance(found, list):
+                found = found[int(name)] if name.isdecimal() and int(name) < len(found) else None
+            else:
+                found = found.get(name) if isinstance(found, dict) else None
         return found
 
 

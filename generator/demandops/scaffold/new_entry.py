@@ -15,6 +15,9 @@ def node(id: str, type: str, cluster: str, config: Config) -> dict[str, str]:
     """Return a map from path to text, with a file for a new node.
 
     If the node's cluster is new too, the map also has a file for the cluster.
+
+    Raises:
+        InvalidInput: if a node of this id exists.
     """
     if id in config.nodes:
         raise InvalidInput.at("ID", f"'{id}' is a node already; choose another id")
@@ -36,8 +39,8 @@ def access_domain(
 ) -> dict[str, str]:
     """Return a map from path to text: a file for a new access domain.
 
-    Only ``requesters`` may demand something in the domain. If there are none, everybody may demand
-    everything.
+    Only requesters that match one of the patterns in ``requesters`` may demand something in the
+    domain. Without patterns, everybody may demand everything.
 
     Raises:
         InvalidInput: if a domain of this name exists, or another domain has all nodes (``*``).
@@ -48,8 +51,8 @@ def access_domain(
         if "*" in other.nodes:
             file = config.file_of(DOMAINS_FILE, other.name)
             message = (
-                f"access domain '{other.name}' has every node by its pattern '*', so no other "
-                "access domain can have a node; narrow this pattern first"
+                f"access domain '{other.name}' has every node by its pattern '*', so no pattern of "
+                "another access domain may match a node; narrow this pattern first"
             )
             raise InvalidInput.at("nodes", message, file=file)
     path = f"policy/access-domains/{name}.yaml"
@@ -68,7 +71,11 @@ def override(
     effect: Mapping[str, Any],
     config: Config,
 ) -> dict[str, str]:
-    """Return a map from path to text: a file for a new override with one effect."""
+    """Return a map from path to text: a file for a new override with one effect.
+
+    Raises:
+        InvalidInput: if an override of this name exists.
+    """
     if name in config.overrides:
         raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
     path = f"overrides/{name}.yaml"

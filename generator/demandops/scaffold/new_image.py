@@ -1,4 +1,4 @@
-"""Writes a container file and pipelines for the repository of a ROS package.
+"""A new container file and new pipelines for the repository of a ROS package.
 
 The pipelines test the package, build its image, and propose the image to the state repo, pinned by
 its digest. Pure.
@@ -39,9 +39,16 @@ def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str])
     """
     url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
     if not _NAME.fullmatch(name):
-        raise InvalidInput.at("NAME", f"{quoted(name)} is no valid name; use a-z, 0-9 and -")
+        message = (
+            f"{quoted(name)} is no valid name; use at most 63 of a-z, 0-9 and -, and no - at its "
+            "ends"
+        )
+        raise InvalidInput.at("NAME", message)
     if image is None:
-        message = f"{quoted(repository)} is no valid repository; write HOST/PATH without a tag"
+        message = (
+            f"{quoted(repository)} is no valid repository; write HOST/PATH in lower case, without "
+            "a tag"
+        )
         raise InvalidInput.at("--repository", message)
     if not _URL.fullmatch(url):
         message = f"{quoted(state_repo)} is no valid URL; write https://HOST/PATH or git@HOST:PATH"

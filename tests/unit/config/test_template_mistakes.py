@@ -71,14 +71,27 @@ APPENDED: dict[str, tuple[str, str]] = {
     "a division by nothing": ("x: {{ 1 / 0 }}\n", "zero"),
     "a value that YAML has no word for": (
         "x: {{ ''.join }}\n",
-        "a template may write text, numbers, lists and mappings, not <class 'builtin_function",
+        "a template may write only text, numbers, true, false, null, lists and mappings; if this "
+        "is a method or a macro, add its parentheses, as in name()",
+    ),
+    "a method that is not listed": (
+        "x: {{ ''.swapcase() }}\n",
+        "a template may not call the method 'swapcase'",
+    ),
+    "a width from a value": (
+        "x: {{ '%*d' % (1000000000, 1) }}\n",
+        "the format of '%' has '*' or a brace inside braces; write each width as a number",
+    ),
+    "a width from a named value": (
+        "x: {{ '{:>{w}}'.format(1, w=1000000000) }}\n",
+        "the format of 'format' has '*' or a brace inside braces; write each width as a number",
     ),
 }
 """Lines of a template with a mistake, each with a word of Jinja's message."""
 TOO_LARGE = [
     *("'a' * 1000000000", "[1] * 1000000000", "10 ** 1000", "'%1000000000d' % 1"),
-    *("'%*d' % (1000000000, 1)", "'%1000000000d' | format(1)", "'{:>1000000000}'.format(1)"),
-    *("'{:>{w}}'.format(1, w=1000000000)", "'{x:>1000000000}'.format_map({'x': 1})"),
+    *("'%1000000000d' | format(1)", "'{:>1000000000}'.format(1)"),
+    "'{x:>1000000000}'.format_map({'x': 1})",
     *("'a'.ljust(1000000000)", "'a'.center(1000000000)", "'1'.zfill(1000000000)"),
     *("'a' | center(1000000000)", "'a' | indent(1000000000, true)"),
     *("[1] | batch(1000000000, 'x') | list", "[1] | slice(1000000000) | list"),
@@ -253,6 +266,12 @@ def doubling(times: int) -> dict[str, object]:
     return {"$ref": "#/$defs/d0", "$defs": {**steps, f"d{times}": {"type": "object"}}}
 
 
+def doubling_in_list(times: int) -> dict[str, object]:
+    """Return such a schema whose definitions are the items of a list; ``%4f`` stands for ``O``."""
+    steps = [{"anyOf": [{"$ref": f"#/all%4ff/{i + 1}"}] * 2} for i in range(times)]
+    return {"allOf": [*steps, {"type": "object"}]}
+
+
 class TestSchema:
     """Validation by a chart's schema reads no other file, and always ends."""
 
@@ -280,11 +299,19 @@ class TestSchema:
         [
             doubling(60),
             '{"not":' * 100_000 + "{}" + "}" * 100_000,
+            doubling_in_list(60),
             {"allOf": [{"$ref": "#"}]},
             {"additionalProperties": {"allOf": [{"$ref": "#"}] * 2}},
             {"patternProperties": {"a": {"$ref": "#"}, "e": {"$ref": "#"}}},
         ],
-        ids=["doubling", "deep", "itself", "doubling by depth", "doubling by patterns"],
+        ids=[
+            "doubling",
+            "doubling in a list",
+            "deep",
+            "itself",
+            "doubling by depth",
+            "doubling by patterns",
+        ],
     )
     def test_a_schema_that_would_not_end_is_a_fault(self, schema: object) -> None:
         (found,) = self.faults(schema)

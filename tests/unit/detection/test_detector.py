@@ -36,6 +36,16 @@ def entry(*requesters: str, request: str = "", joined: bool = False) -> dict[str
     return {"action": action, "request": request, "requesters": sorted(requesters)}
 
 
+def test_requesters_tell_the_entities_that_an_id_does_not() -> None:
+    together = {"source": "cars", "start": 5, "stop": 8}
+    for requesters in (["{entity}", "{other}"], ["{other}", "r", "{entity}"]):
+        goal = demand(demand="{entity}-{other}", requesters=requesters)
+        held = {one.strip("{}") for one in requesters} - {"entity", "other"} | {"car-1", "car-2"}
+        books = {"demands": {"car-1-car-2": entry(*held)}}
+        booked = booked_events(file_of(rule("pair", together=together, demand=goal)), books)
+        assert {*booked} == {("pair", ("car-1", "car-2"))}
+
+
 def test_the_booked_demands_of_rules_are_told_from_all_others() -> None:
     books = {
         "demands": {

@@ -152,6 +152,13 @@ def test_a_clock_that_is_set_ends_nothing() -> None:
         assert run.told(10_003 + seconds) == [("near", "a", "stop", 10_003 + seconds)]
 
 
+def test_a_schedule_follows_a_clock_that_is_set() -> None:
+    run = Run(rule("hours", schedule={"start": "07:00", "stop": "20:00"}))
+    assert run.told(6.0 * 3600) == []
+    run.state = run.state.shifted(3 * 3600)
+    assert run.told(9.0 * 3600 + 1) == [("hours", "", "start", 9.0 * 3600)]
+
+
 def test_a_step_leaves_the_state_before_as_it_was() -> None:
     run = Run(
         rule("near", near=NEAR), rule("pair", together={"source": "cars", "start": 5, "stop": 8})

@@ -58,22 +58,28 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a"),
-            "rules.yaml:16: rules[0]: needs one of near, together, count, threshold, schedule",
+            "rules.yaml:16: rules[0]: needs exactly one of near, together, count, threshold, "
+            "schedule",
         ),
         (
             rule("a", near=NEAR, demand=demand(demand="{entiti}")),
-            "rules.yaml:18: rules[0].demand.demand: '{entiti}' has no value in this rule; did you "
-            "mean 'entity'?",
+            "rules.yaml:18: rules[0].demand.demand: '{entiti}' has no value here; did you mean "
+            "'entity'?",
         ),
         (
             rule("a", near=NEAR, demand=demand(demand="{}")),
-            "rules.yaml:18: rules[0].demand.demand: '{}' has no value in this rule; known: "
-            "distance, entity, rule, x, y",
+            "rules.yaml:18: rules[0].demand.demand: '{}' has no value here; known: distance, "
+            "entity, rule, x, y",
         ),
         (
             rule("a", near=NEAR, demand=demand(request="{distance}")),
             "rules.yaml:21: rules[0].demand.request: '{distance}' becomes a number, but this field "
             "needs text; write a word before {distance}, such as 'near-{distance}'",
+        ),
+        (
+            rule("a", near=NEAR, demand=demand(lease="{x}")),
+            "rules.yaml:21: rules[0].demand.lease: must be a duration like 10m, or whole seconds, "
+            "not 0.0",
         ),
         (
             rule("a", near={"source": "cars", "polygon": [{"x": 0, "y": 0}, {"x": 1, "y": 1}]}),
@@ -95,8 +101,8 @@ def faults(text: str) -> list[str]:
         ),
         (
             rule("a", near=NEAR, demand=demand(demand="{entity}/{x}")),
-            "rules.yaml:18: rules[0].demand.demand: '{x}' changes, but an id must stay "
-            "the same; leave that name out",
+            "rules.yaml:18: rules[0].demand.demand: '{x}' changes, but the demand's id "
+            "must stay the same; leave that name out",
         ),
         (
             rule("a", near=NEAR, demand=demand(operation="release")),
@@ -130,9 +136,10 @@ def test_mistakes_of_sources_are_told_together() -> None:
         "d": {"topic": "/d/{entity}", "type": "p/msg/M", "timeout": "0s"},
     }
     assert faults(text_of(rule("r", near={**NEAR, "source": "a"}), sources=sources)) == [
-        "rules.yaml:4: sources.a: must say where the name of the entity is: either write {entity} "
-        "as a part of 'topic', or set 'entity' to the field of the message that has the name",
-        "rules.yaml:8: sources.b.topic: 'b/entity' is not a topic name that ROS 2 allows; use "
+        "rules.yaml:4: sources.a: must say at exactly one place where the name of the entity is: "
+        "either write {entity} as a part of 'topic', or set 'entity' to the field of the message "
+        "that has the name",
+        "rules.yaml:8: sources.b.topic: 'b/{entity}' is not a topic name that ROS 2 allows; use "
         "letters, digits and '_', with a single '/' between parts; no part may start with a digit",
         "rules.yaml:9: sources.b.type: 'PoseStamped' is not a message type; write it like "
         "std_msgs/msg/String",

@@ -11,7 +11,9 @@ import pytest
 from demandops.errors import InvalidInput
 from demandops.migration import imported_goals, reference_files
 from demandops.migration.reference_files import Hold, ReferenceFiles
+from demandops.migration.reference_map import MappedApplication, ReferenceMap
 from demandops.migration.remaining_joins import Join
+from demandops.settings import API_VERSION
 from hypothesis import given
 
 from tests.kit import plain_yaml
@@ -137,9 +139,23 @@ def test_the_versioning_of_a_connection_does_not_show_its_holders() -> None:
     assert str(refused.value) == (
         f"{CONNECTION}: has requests, but no bookkeeping. The requests alone do not tell who holds "
         "the connection, because the reference's operator adds each later requester to the first "
-        "request. Give mqtt_bookkeeping.yml too. If this file is lost, write one that lists each "
-        f"requester as often as it joined, such as '{CONNECTION}: [vehicle00]'"
+        "request. Give an mqtt_bookkeeping.yml that has the connection. If this file is lost, "
+        "write one that lists each requester as often as it holds the connection, such as "
+        f"'{CONNECTION}: [vehicle00]'"
     )
+
+
+def test_a_topic_that_the_map_lacks_is_named_where_it_belongs() -> None:
+    joins = {FUSION: [Join(1, ("vehicle00",), ("/ego_data", "/station00_local_objectlist"))]}
+    app = MappedApplication(id="edge/fusion", node="edge")
+    head: Any = {"apiVersion": API_VERSION, "kind": "ReferenceMap"}
+    mapped = ReferenceMap(**head, request="imported", applications={FUSION: app})
+    with pytest.raises(InvalidInput) as refused:
+        imported_goals.goals(joins, mapped, "map.yaml")
+    assert [one.field for one in refused.value.faults] == [
+        f"applications.{FUSION}.egoData./ego_data",
+        f"applications.{FUSION}.pointClouds./station00_local_objectlist",
+    ]
 
 
 def test_a_deleted_application_is_not_imported_although_its_versions_remain() -> None:

@@ -86,9 +86,12 @@ class State:
     engaged: Mapping[Who, frozenset[Key]] = field(default_factory=dict)
     """For each entity, the keys of the phases in which the entity takes part."""
     counted: Mapping[Who, frozenset[str]] = field(default_factory=dict)
-    """For each entity, the rules that count it."""
+    """For each entity, the names of the rules that count it now.
+
+    These rules have a condition on a count, and the entity is within its radius.
+    """
     counts: Mapping[str, int] = field(default_factory=dict)
-    """For each rule, how many entities the rule counts."""
+    """How many entities a rule counts, by the name of the rule."""
     cells: Mapping[Cell, frozenset[str]] = field(default_factory=dict)
     """The entities in each square, for rules on pairs."""
 
@@ -98,12 +101,16 @@ class State:
         return frozenset(key for key, phase in self.phases.items() if phase.lasts)
 
     def shifted(self, seconds: float) -> State:
-        """Return the state with all its times moved by ``seconds``."""
+        """Return the state after the clock was set forward by ``seconds``.
+
+        All times move with the clock, so dwell times and timeouts go on. Only schedules follow the
+        new time: the next step looks at them.
+        """
         return replace(
             self,
             now=self.now + seconds,
             settled=self.settled + seconds,
-            due=self.due + seconds,
+            due=min(self.due, self.now) + seconds,
             hours_due=self.now + seconds,
             seen={who: one._replace(at=one.at + seconds) for who, one in self.seen.items()},
             awaited={who: until + seconds for who, until in self.awaited.items()},

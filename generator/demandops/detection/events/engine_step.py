@@ -54,7 +54,7 @@ class EngineStep:
         """Continue an event that started before a restart, and wait for its entities.
 
         The wait is ``settle_s`` seconds, or the timeout of an entity's source if that is longer.
-        An event for which there is no rule is ignored.
+        An event that no rule is for is ignored.
         """
         rule = self._engine.rules.get(key[0])
         if rule is None or len(rule.subjects) != len(key[1]):
@@ -71,8 +71,8 @@ class EngineStep:
     def pass_time(self, until: float) -> None:
         """Advance the time to ``until``, and apply all changes that are due by then.
 
-        Such a change is due when a dwell time ends, when an entity has been silent for too long, or
-        when a schedule begins or ends.
+        Such a change is due when a dwell time ends, when an entity has been silent for too long,
+        when a resumed event has waited long enough, or when a schedule begins or ends.
         """
         while until >= self._due:
             self._due = inf
@@ -85,7 +85,7 @@ class EngineStep:
         self._now = max(self._now, until)
 
     def _all_due(self) -> Iterator[tuple[float, Callable[[], None]]]:
-        """Yield (when, action) for each change that passing time alone will cause."""
+        """Yield (when, action) for each change that passing time alone may cause."""
         for key, phase in self._phases.items():
             if not phase.lasts:
                 at = phase.since + self._engine.rules[key[0]].dwell

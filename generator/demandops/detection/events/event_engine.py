@@ -56,7 +56,8 @@ class EventEngine:
 
         Args:
             now: the time.
-            held: the events whose demands are already booked. Events without a rule are left out.
+            held: the events whose demands are already booked. Events that no rule is for are
+                left out.
             settle_s: how many seconds the entities of these events may stay unseen until they count
                 as gone. If their source's timeout is longer, the timeout counts instead.
         """
@@ -80,7 +81,8 @@ class EventEngine:
 
         Args:
             state: the state before the step; it is not changed.
-            observations: in the order in which they were made. An observation earlier than
+            observations: in the order in which they were made. An observation of a source that
+                the file lacks is left out. An observation earlier than
                 ``state.now`` counts as made at ``state.now``. An observation later than ``now``
                 counts as made at ``now``.
             now: the time.

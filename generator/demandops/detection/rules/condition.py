@@ -1,7 +1,8 @@
 """The conditions of rules: distances, counts, limits and hours.
 
-Each condition on a number starts at one value and stops at another, so that a value that varies
-around the limit does not start and stop the condition again and again.
+A condition on a number has a value at which it starts and a value at which it stops. If both
+differ, a number that varies around one of them does not start and stop the condition again and
+again. Only a threshold may have the same value for both.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ class _InArea(CamelModel):
     @model_validator(mode="after")
     def _has_one_shape(self) -> _InArea:
         if (self.point is None) == (self.polygon is None):
-            raise ValueError("needs either point or polygon")
+            raise ValueError("needs exactly one of point and polygon")
         return self
 
     @property
@@ -115,7 +116,9 @@ class Count(_InArea):
                 f"'stop' is {self.stop}, but must be less than 'start', which is {self.start}"
             )
         if self.point is not None and not self.radius:
-            raise ValueError("radius is missing; add it, because no entity is exactly at a point")
+            raise ValueError(
+                "needs a radius of more than 0, because no entity is exactly at a point"
+            )
         return self
 
 

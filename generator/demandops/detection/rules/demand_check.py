@@ -29,7 +29,7 @@ _SAMPLE: Values = {
 def faults_of_demand(
     template: RuleDemand, field: str, subjects: tuple[str, ...], momentary: frozenset[str]
 ) -> list[Fault]:
-    """Return the faults of a rule's demand.
+    """Return the faults of a rule's demand: of its names, else of its form, else of its ids.
 
     Args:
         template: the template of the demand.
@@ -53,7 +53,9 @@ def faults_of_demand(
     written = dict(rule_template.texts(template.data, field))
     for one in formed:
         path = f"{field}.{one.field}" if one.field else field
-        found.append(fault(path, _message_for_number(written.get(path, "")) or one.message))
+        is_text = one.message.startswith("must be text")
+        number = _message_for_number(written.get(path, "")) if is_text else ""
+        found.append(fault(path, number or one.message))
     return found or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
 
 
@@ -78,11 +80,12 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
         yield from _missing(data, field, "demand", "requesters")
         why = "otherwise two events would share one demand"
         listed = [("demand", [data.get("demand", "")], why)]
-        stable = [("demand", data.get("demand", "")), ("requesters", data.get("requesters", ()))]
-        for name, value in stable:
-            for path, text in rule_template.texts(value, f"{field}.{name}"):
+        for name, what in (("demand", "id"), ("requesters", "requesters")):
+            for path, text in rule_template.texts(data.get(name, ()), f"{field}.{name}"):
                 if changing := sorted(names(text) - {"rule", "entity", "other"}):
-                    message = f"'{{{changing[0]}}}' changes, but an id must stay the same; "
+                    message = (
+                        f"'{{{changing[0]}}}' changes, but the demand's {what} must stay the same; "
+                    )
                     yield fault(path, f"{message}leave that name out")
     else:
         yield from _missing(data, field, "id")

@@ -92,7 +92,7 @@ class RuleDemand:
         """Return the goal that starts the demand, if ``values`` has all names of the template.
 
         If ``values`` lacks a name, the goal has only the demand's id and its requesters, which
-        suffice to end the demand.
+        suffice to end the demand. Only the template of a ``Demand`` may use such names.
         """
         if self.names() <= set(values):
             return self.goal(values)
@@ -117,14 +117,18 @@ class RuleDemand:
             rule: the name of the rule.
 
         Returns:
-            The entity for each name in ``subjects``; ``None`` if the rule has not made this demand.
+            The entity for each name in ``subjects``. ``None`` if the rule makes no demand with this
+            id and these requesters, or if neither tells the entities, such as an id
+            ``{entity}-{other}`` of entities with dashes.
         """
+        named = {*requesters_in(self.action, self.data)}
+        if len(held.requesters) > len(named):
+            return None
         if self.action == "demand":
             pairs = [(str(self.data["demand"]), held.demand)]
         else:
-            named = {*requesters_in(self.action, self.data)}
             pairs = [(str(self.data.get("id", "")), held.request)]
-            pairs += product(sorted(named), held.requesters)
+        pairs += product(sorted(named), held.requesters)
         found: dict[str, set[str]] = {name: set() for name in subjects}
         for template, text in pairs:
             for name, entity in candidates(template, text).items():

@@ -1,6 +1,7 @@
 """The file of rules for the event detector, and the checks across its parts.
 
-:func:`read` reports all faults of a file together, each with its line and field.
+:func:`read` reports many faults of a file together, each with its line and field. But the parts are
+compared only if the fields are valid, and a demand's form is checked only if its names are known.
 """
 
 from __future__ import annotations
@@ -56,8 +57,9 @@ class Source(CamelModel):
     def _names_entities(self) -> Source:
         if ("{entity}" in self.topic) == bool(self.entity):
             raise ValueError(
-                "must say where the name of the entity is: either write {entity} as a part of "
-                "'topic', or set 'entity' to the field of the message that has the name"
+                "must say at exactly one place where the name of the entity is: either write "
+                "{entity} as a part of 'topic', or set 'entity' to the field of the message that "
+                "has the name"
             )
         if bool(self.x) != bool(self.y):
             raise ValueError("names x or y alone; give both, or neither")
@@ -101,9 +103,9 @@ class Rule(CamelModel):
         given = [name for name in CONDITIONS if getattr(self, name) is not None]
         if len(given) != 1:
             listed = f"; it has {', '.join(given)}" if given else ""
-            raise ValueError(f"needs one of {', '.join(CONDITIONS)}{listed}")
+            raise ValueError(f"needs exactly one of {', '.join(CONDITIONS)}{listed}")
         if (self.demand is None) == (self.deployment_request is None):
-            raise ValueError("needs either demand or deploymentRequest")
+            raise ValueError("needs exactly one of demand and deploymentRequest")
         if self.renew and self.demand is not None:
             raise ValueError(
                 "renew is for a deploymentRequest; leave it out, because the detector renews each "
@@ -169,7 +171,8 @@ def read(text: str, file: str) -> RuleFile:
     """Return the rules in the text of a file.
 
     Raises:
-        InvalidInput: with every fault, each with its line.
+        InvalidInput: if the rules are not valid. The error has the faults that were found
+            together, each with its line. When they are mended, further ones may appear.
     """
     with located_in(text):
         rules = parse_file(RuleFile, text, file)
@@ -218,6 +221,9 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
 
 
 def _may_meet(one: Rule, other: Rule) -> bool:
-    """Return whether two rules may be for the same entities, as far as their patterns tell."""
+    """Return whether two rules have a pattern in common, or one of them has the pattern ``*``.
+
+    Different patterns that match the same entity, such as ``car*`` and ``*1``, are not recognized.
+    """
     patterns = {*one.entities}, {*other.entities}
     return "*" in patterns[0] | patterns[1] or not patterns[0].isdisjoint(patterns[1])

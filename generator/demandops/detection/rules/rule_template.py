@@ -83,15 +83,17 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
                 message = f"has a single '{token[0]}'; write '{token[0] * 2}' for one brace"
                 found.append(fault(path, message))
             elif token[1] is not None and token[1] not in known:
-                message = f"'{{{token[1]}}}' has no value in this rule"
+                message = f"'{{{token[1]}}}' has no value here"
                 found.append(fault(path, message + suggestion(token[1], known)))
     return found
 
 
 def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return the entities whose names turn the template into ``text``.
+    """Return entities whose names turn the template into ``text``.
 
-    The result maps each name in braces to an entity. It is empty if no entities give this text.
+    The result maps each name in braces to an entity. If several combinations of entities give this
+    text, the result is one of them. The result is empty if none does, or if the template has no
+    names in braces.
     """
     seen: set[str] = set()
     pattern, end = "", 0

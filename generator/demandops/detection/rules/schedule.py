@@ -12,7 +12,8 @@ DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 class Schedule:
     """A span of hours on certain days of the week.
 
-    If ``end`` is before ``start``, the span lasts past midnight. ``days`` are numbers; Monday is 0.
+    If ``end`` is before ``start``, the span lasts past midnight. ``days`` are the days on which a
+    span starts, as numbers; Monday is 0.
     """
 
     days: frozenset[int]
@@ -32,10 +33,11 @@ class Schedule:
         )
 
     def next_check(self, now: float) -> float:
-        """Return a time after ``now`` until which the result of :meth:`is_on` does not change.
+        """Return the time after ``now`` at which to call :meth:`is_on` again.
 
-        The returned time is at most an hour after ``now``, because a change to or from summer time
-        moves the hours.
+        Until then the result of :meth:`is_on` stays the same. Only if summer time begins or ends in
+        between, the result may change earlier. So the returned time is at most an hour after
+        ``now``.
         """
         local = datetime.fromtimestamp(now, self.zone)
         ahead = [now + 3600.0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from demandops.identifiers import topic_problem
+from demandops.quoting import quoted
 
 ENTITY = "{entity}"
 _PART = r"(?P<entity>[A-Za-z0-9_]+)"
@@ -14,7 +15,8 @@ def topic_pattern_problem(pattern: str) -> str:
     """Return why a text is not a pattern of topics, or an empty string."""
     if pattern.count(ENTITY) > 1:
         return "has {entity} twice; name the entity once"
-    return topic_problem(pattern.replace(ENTITY, "entity"))
+    example = pattern.replace(ENTITY, "entity")
+    return topic_problem(example).replace(quoted(example), quoted(pattern), 1)
 
 
 def entity_in(pattern: str, topic: str) -> str | None:

@@ -36,7 +36,10 @@ FileReader = Callable[[str], str | None]
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
+    """A release that starts, changes or stops.
+
+    ``details`` has a line for each changed fact of a release that changes; otherwise it is empty.
+    """
 
     name: str
     what: str
@@ -57,13 +60,16 @@ class Changeset:
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
     overrides: tuple[str, ...] = ()
-    """The paths of the overrides that change the content of the written files."""
+    """The paths of the overrides that have an effect on the written files, ``hold`` included."""
     blocked: tuple[str, ...] = ()
     """A warning for each release that a ``hold`` override keeps from changing."""
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """Each release that the change may affect, as it is after the change."""
+    """Each release that the change may affect, as it is after the change; None if it is gone."""
     former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """Each release of ``plans``, as it was before the change."""
+    """Each release of ``plans``, as it was before the change.
+
+    None if there was no such release, or if it could not be planned.
+    """
 
 
 def build_changeset(
@@ -87,7 +93,8 @@ def build_changeset(
         plans: releases of ``before`` that the caller has planned already.
 
     Raises:
-        Refused, InvalidInput: if a release cannot be planned or rendered.
+        Refused, InvalidInput: if a release cannot be planned or rendered, or if a file would not be
+            valid (:func:`demandops.render.output_check.check_files`) or would be too large.
     """
     files: dict[str, str | None] = {
         claim_file.path_of(change.key): claim_file.text_of(change.after) if change.after else None
@@ -151,7 +158,7 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
 def render_all(
     world: World, engine: Engine, keys: Iterable[ReleaseKey], current: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return all generated files, by path.
+    """Return all generated files except those of the ledger, by path.
 
     Args:
         world: the configuration and the ledger.
@@ -180,7 +187,11 @@ def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
 
 
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
-    """Return how a release changes; ``existed`` is true if the release had a file before."""
+    """Return how a release changes; ``existed`` is true if the release had a file before.
+
+    ``old`` or ``new`` is None if the release does not exist before or after the change, but not
+    both.
+    """
     release = new or old
     assert release is not None  # noqa: S101 - a change has at least one side
     kind: Change = "stop" if not new else "change" if existed else "start"

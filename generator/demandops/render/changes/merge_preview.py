@@ -71,7 +71,11 @@ class MergePreview:
 
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
-    """Return all releases that can be planned, by key."""
+    """Return all releases that can be planned, by key.
+
+    Raises:
+        Refused: if the definition of a claimed application is missing.
+    """
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
         try:
@@ -88,6 +92,9 @@ def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) ->
 
     A fault's file is the first of these that exists: a file in ``edited`` with a claim that needs
     the release; the file that the fault names; the file of the first claim that needs the release.
+
+    Raises:
+        Refused: if the definition of a claimed application is missing.
     """
     faults: list[Fault] = []
     files: dict[ReleaseKey, list[str]] = {}
@@ -184,7 +191,8 @@ def _facts(before: str, after: str) -> Iterator[str]:
 def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
     """Yield (path, old, new) for each smallest part that differs between two values.
 
-    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`.
+    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`. Two lists of
+    different lengths are one part.
     """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):

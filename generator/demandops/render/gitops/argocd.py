@@ -54,7 +54,7 @@ def render(
 
 
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
-    """Return the bootstrap files and a placeholder for each access domain, by path."""
+    """Return the bootstrap files and a placeholder for each access domain of a cluster, by path."""
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
         for cluster, domains in domains_by_cluster(config).items()

@@ -1,8 +1,8 @@
 """Manifests for Flux: a HelmRelease for each service, and the chart sources of each domain.
 
 The fields are those of helm.toolkit.fluxcd.io/v2 and source.toolkit.fluxcd.io/v1 in Flux 2.9.
-The manifests do not contain requesters, so another requester of a running service changes only
-the ledger.
+The manifests do not contain requesters, so a new requester of a running service changes only the
+ledger, unless the topics, parameters or replicas of the service change with it.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ def chart_object(name: str, chart: ChartSource) -> str:
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """Return the files that do not depend on demands, by path.
 
-    These are the bootstrap files and, for each access domain, its chart sources and a file that
-    keeps its folder.
+    These are the bootstrap files, if ``flux.url`` is set in ``demandops.yaml``. For each access
+    domain of a cluster, they are also its chart sources and a file that keeps its folder.
     """
     flux = config.repo_settings.flux
     files = {

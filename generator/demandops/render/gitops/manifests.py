@@ -18,8 +18,9 @@ def render(release: Release, config: Config, engine: Engine) -> str:
 
     Raises:
         Refused: if the registry has no image for a communication client.
-        InvalidInput: if an appdef's values template fails or its values do not match the chart's
-            schema.
+        InvalidInput: if the values of a service are not valid
+            (:func:`demandops.render.helm_values.values_of`), or if the configuration of a client is
+            not valid (:func:`demandops.render.connection_client.render`).
     """
     if not isinstance(release, ServiceRelease):
         return connection_client.render(release, config, engine)
@@ -32,9 +33,11 @@ def render(release: Release, config: Config, engine: Engine) -> str:
 def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """Return the files that exist even without demands, by path.
 
-    Each cluster has a bootstrap file, which makes the cluster's controller follow the repo. Each
-    access domain of a cluster has a placeholder file, which keeps the domain's folder in Git.
-    Without the folder, Flux and Argo CD would fail instead of removing what is no longer demanded.
+    Each cluster has a bootstrap file, which makes the cluster's controller follow the repo. For
+    Flux, there are no bootstrap files without ``flux.url``. Each access domain of a cluster has a
+    placeholder file, which keeps the domain's folder in Git. Without the folder, Flux and Argo CD
+    would fail instead of removing what is no longer demanded. For Flux, each access domain of a
+    cluster also has the sources of all charts.
     """
     if config.repo_settings.gitops == "argocd":
         return argocd.base_files(config, engine)

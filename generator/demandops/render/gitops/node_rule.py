@@ -19,7 +19,10 @@ _SELECTOR = "variables.selector"
 
 
 def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
-    """Return the expression that is true if a pod's selector names a node of the domain."""
+    """Return the expression that is true if a pod's selector names a node of the domain.
+
+    A node with an empty selector makes the expression true for every pod.
+    """
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
     for node in config.nodes.values():
@@ -48,7 +51,7 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
 
 
 def expression_of(pattern: str) -> str:
-    """Return a pattern of the policy as a regular expression of RE2.
+    """Return a pattern of the policy as a regular expression of RE2, without ``^`` and ``$``.
 
     The pattern may contain ``*`` and ``?``.
     """
