@@ -32,6 +32,8 @@ from jinja2.runtime import Context, Undefined
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 from jinja2.visitor import NodeTransformer
 
+from demandops.strict_yaml import not_writable
+
 MAX_STEPS = 1_000_000
 """How many steps a rendering may take: a few seconds of work.
 
@@ -105,8 +107,8 @@ def budget() -> Iterator[None]:
 def _size(value: object, *, data: bool = True) -> int:
     """Return the size of a value with all its parts. A part that occurs twice counts twice.
 
-    With ``data``, raise SecurityError for an object that is no text, number, list or mapping. Its
-    text could contain a memory address, which differs between machines.
+    With ``data``, raise SecurityError for an object that is no data, such as a method. Its text
+    could contain a memory address, which differs between machines.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
@@ -128,9 +130,7 @@ def _size(value: object, *, data: bool = True) -> int:
             elif isinstance(part, range):
                 size += len(part)
             elif data and not isinstance(part, _PLAIN):
-                raise SecurityError(
-                    f"a template may write text, numbers, lists and mappings, not {type(part)}"
-                )
+                raise SecurityError(not_writable(part))
         if size + (text >> 4) > MAX_SIZE:
             raise SecurityError(f"a value is too large: it has more than {MAX_SIZE} parts")
     return size + (text >> 4)

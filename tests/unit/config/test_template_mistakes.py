@@ -71,7 +71,7 @@ APPENDED: dict[str, tuple[str, str]] = {
     "a division by nothing": ("x: {{ 1 / 0 }}\n", "zero"),
     "a value that YAML has no word for": (
         "x: {{ ''.join }}\n",
-        "a template may write text, numbers, lists and mappings, not <class 'builtin_function",
+        "lists and mappings, but not a builtin_function_or_method; add '()' to call it",
     ),
 }
 """Lines of a template with a mistake, each with a word of Jinja's message."""
