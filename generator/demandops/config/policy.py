@@ -56,6 +56,7 @@ class Rule(CamelModel):
 class Quotas(CamelModel):
     """The upper limits of an access domain. A field that is not given sets no limit.
 
+    What exceeds a limit already, because the limit was lowered, may stay, but not grow.
     ``demands_per_minute`` limits the demands that one generator receives from a requester.
     """
 
