@@ -73,7 +73,8 @@ def nearest(field: str, known: Mapping[str, int]) -> int | None:
 def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) -> list[Fault]:
     """Return the faults, each with the line that :meth:`FieldLines.of` finds for its field.
 
-    A fault that has a line keeps it. ``text_of`` returns the text of a file, or None if there is no such file.
+    A fault that has a line keeps it. ``text_of`` returns the text of a file, or None if there is no
+    such file.
     """
     known = FieldLines(text_of)
     return [replace(one, line=one.line or known.of(one.file, one.field)) for one in faults]

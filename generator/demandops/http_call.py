@@ -30,7 +30,7 @@ _CAUSES = {
     "LocalProtocolError": _INVALID,
     "UnsupportedProtocol": _INVALID,
     "RemoteProtocolError": "the answer is not HTTP, or not complete; check the URL and the server",
-    "ProxyError": "the proxy refuses the connection; check HTTPS_PROXY and the other proxy variables",
+    "ProxyError": "the proxy refuses the connection; check HTTPS_PROXY and ALL_PROXY",
 }
 """For types of httpx's errors, a text without the error's own, which may echo the request."""
 

@@ -105,7 +105,9 @@ PATTERN_WORDS = {
     r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$": "the name of a resource, such as cpu or nvidia.com/gpu",
     r"^[A-Za-z_][A-Za-z0-9_]*$": f"{_ANY} and '_', with no digit first, for example ROS_DOMAIN_ID",
     r"^[A-Za-z0-9_.-]+$": f"{_ANY}, '_', '.' and '-', such as start.launch.py",
-    r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$": f"{_ANY}, '_', '.' and '-', but no '.' or '-' first, such as ca.crt",
+    r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$": (
+        f"{_ANY}, '_', '.' and '-', but no '.' or '-' first, such as ca.crt"
+    ),
     r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$": "the tag of an image, such as v1.2.0",
     r"^[A-Z][A-Za-z0-9]*$": "a kind of Kubernetes object, such as ConfigMap",
     r"^([a-z0-9]([a-z0-9.-]*[a-z0-9])?)?$": "the group of an API, such as batch, or nothing",
@@ -119,12 +121,15 @@ PATTERN_WORDS = {
     ),
     r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
     r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder of the state repo, such as appdefs/mine/charts/one",
-    r"^[a-z0-9][a-z0-9._/:-]*$": "the name of an image or a registry in lower case, without a tag, such as registry.example/one",
+    r"^[a-z0-9][a-z0-9._/:-]*$": (
+        "the name of an image or a registry in lower case, without a tag, such as "
+        "registry.example/detection"
+    ),
     r"^sha256:[0-9a-f]{64}$": "a digest, which is 'sha256:' and 64 digits (0 to 9, a to f)",
     r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$": "a quantity, such as 500m, 2 or 1Gi",
     r"^(tcp|udp|ws)/[^\s/#?]+:\d{1,5}$": "an endpoint of Zenoh, such as tcp/router.example:7447",
     r"^(\d+h)?(\d+m)?(\d+s)?$": "a duration, such as 30s, 1m or 1h30m",
-    r"^[^\s,][^\n\r,]*$": "a label on one line, without a comma, and without white space at its start",
+    r"^[^\s,][^\n\r,]*$": "a label on one line, with no comma, and no white space at its start",
     r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$": (
         "the key of a label, such as node_id or example.org/host"
     ),
@@ -133,8 +138,8 @@ PATTERN_WORDS = {
         "ends, or nothing"
     ),
     r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$": (
-        f"a topic such as /{{instance}}_objects: each part is '/' and {_ANY} and '_', with no digit "
-        "first, and may have {instance} once"
+        f"a topic such as /{{instance}}_objects: each part is '/' and then {_ANY} and '_', with no "
+        "digit first, and may have {instance} once"
     ),
 }
 """For each regular expression of a field: the texts that match it, in words for messages."""

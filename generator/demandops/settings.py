@@ -93,7 +93,8 @@ def data_home(state_repo: str) -> Path:
     """Return the folder of the generator's journal and clone for one state repo.
 
     It is inside ``DEMANDOPS_DATA_HOME`` or, if that is not set, ``$XDG_STATE_HOME/demandops``
-    (``~/.local/state/demandops``). Its name is a digest of the state repo's address, because the address may contain a password.
+    (``~/.local/state/demandops``). Its name is a digest of the state repo's address, because the
+    address may contain a password.
     """
     if Path(state_repo).exists():  # all spellings of a path give the same folder
         state_repo = str(Path(state_repo).resolve())

@@ -201,14 +201,13 @@ def parse(model: type[Model], data: object, file: str = "") -> Model:
 def parse_file(model: type[Model], text: str, file: str) -> Model:
     """Parse the text of a YAML file, and return its content as an instance of ``model``.
 
-    ``model`` must have a field ``apiVersion``.
-
     Raises:
-        InvalidInput: if the text is not strict YAML, or as :func:`parse` does.
+        InvalidInput: if the text is not strict YAML or not a mapping, or as :func:`parse` does.
     """
     data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
-        *_, version = get_args(model.model_fields["apiVersion"].annotation)
-        message = f"must be a mapping that starts with apiVersion: {version}"
+        message, version = "must be a mapping", model.model_fields.get("apiVersion")
+        if version is not None:
+            message += f" that starts with apiVersion: {get_args(version.annotation)[-1]}"
         raise InvalidInput.at("", message, file=file)
     return parse(model, data, file)

@@ -44,7 +44,8 @@ def duration_text(seconds: float) -> str:
 def span(seconds: float) -> str:
     """Return a duration, rounded down, in one or two units, like ``12d`` or ``3h20m``.
 
-    The sign is left out. The second unit is given only if the number of the first unit has one digit.
+    The sign is left out. The second unit is given only if the number of the first unit has one
+    digit.
     """
     left = int(abs(seconds))
     for place, (size, unit) in enumerate(_UNITS):

@@ -58,8 +58,8 @@ class Zenoh(CamelModel):
     """The Zenoh bridge that a node runs when a connection needs it.
 
     Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
-    the endpoint's port at every IPv4 address. It always connects to the routers in ``connect``. If none
-    of these fields is given, the bridge only connects to bridges that have an endpoint.
+    the endpoint's port at every IPv4 address. It always connects to the routers in ``connect``. If
+    none of these fields is given, the bridge only connects to bridges that have an endpoint.
     """
 
     endpoint: Endpoint | None = None

@@ -125,9 +125,9 @@ class Limits(CamelModel):
     """The sizes above which a demand is refused.
 
     ``demand_items`` limits how many things (applications, connections, topics, requesters and so
-    on) the demand lists in total. ``parameter_bytes`` limits the parameters of an application, written as JSON.
-    ``file_bytes`` limits each file that the generator writes for the demand, because Kubernetes
-    stores no object above 1.5 MB.
+    on) the demand lists in total. ``parameter_bytes`` limits the parameters of an application,
+    written as JSON. ``file_bytes`` limits each file that the generator writes for the demand,
+    because Kubernetes stores no object above 1.5 MB.
     """
 
     demand_items: Positive = 20_000
