@@ -2,7 +2,7 @@
 
 A :class:`Fault` says where the problem is, what it is and how to fix it. An error carries all
 faults that were found together, so that a person can fix a file or a request in one go.
-``cli.main`` maps errors to exit codes, ``demandops_ros.node`` maps them to action results.
+``cli.main`` maps errors to exit codes, ``demandops_ros.actions`` maps them to action results.
 """
 
 from __future__ import annotations

@@ -36,10 +36,16 @@ QUEUE_LIMIT = 10_000
 """How many demands may be queued; a further demand is rejected."""
 
 REQUESTER_QUEUE_LIMIT = 1_000
-"""How many demands of one requester may be queued; a further demand is rejected."""
+"""How many demands of one requester may have no answer yet; a further demand is rejected.
+
+Demands that await approval do not count.
+"""
 
 PROPOSAL_LIMIT = 100
-"""How many demands of one requester may await approval; a further demand is refused."""
+"""How many proposals of one requester may await approval.
+
+A demand that needs a further proposal is refused.
+"""
 
 GENERATED_ROOTS = ("bootstrap", "clusters")
 """The top-level folders whose files are all rendered from ledger and configuration."""

@@ -287,8 +287,8 @@ class Node(CamelModel):
         if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
             raise ValueError(
                 "the id is not a valid label value, so no node of the cluster can have it in the "
-                "label node_id; choose an id of up to 63 letters, digits, '-', '_' and '.', or "
-                "add a selector"
+                "label node_id; choose an id of up to 63 letters, digits, '-', '_' and '.' with a "
+                "letter or digit at both ends, or add a selector"
             )
         return self
 

@@ -72,7 +72,8 @@ class LeasePolicy(CamelModel):
     neither is set, the demand's claims last forever.
 
     If ``deployment_requests`` is true, goals of the reference's ``DeploymentRequest`` get the
-    default lease. Their client must send a goal again before its lease ends.
+    default lease. Their client must send a goal again before its lease ends. Otherwise their claims
+    last forever.
 
     The recorded end of a lease may lag behind the last renewal by ``slack``, so the generator may
     release a claim late by that much.
