@@ -120,7 +120,7 @@ PATTERN_WORDS = {
         f"one or more parts with '/' between them (fleet/one), each of {_ANY}, '_' and '-'"
     ),
     r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
-    r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder of the state repo, such as appdefs/mine/charts/one",
+    r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder in appdefs/, such as appdefs/mine/charts/one",
     r"^[a-z0-9][a-z0-9._/:-]*$": (
         "the name of an image or a registry in lower case, without a tag, such as "
         "registry.example/detection"
