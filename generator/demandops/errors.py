@@ -2,7 +2,7 @@
 
 A :class:`Fault` says where the problem is, what it is and how to fix it. An error carries all
 faults that were found together, so that a person can fix a file or a request in one go.
-``cli.main`` maps errors to exit codes, ``demandops_ros.node`` maps them to action results.
+``cli.main`` maps errors to exit codes, ``demandops_ros.actions`` maps them to action results.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from demandops.quoting import clipped, one_line
 MOST_FAULTS = 100
 """How many faults of one file, or of a request, are listed; further ones are only counted."""
 _LONGEST_FIELD = 2_000
+_MORE = "more"
 _COMPARED = 12
 
 
@@ -37,7 +38,7 @@ class Fault:
     line: int | None = None
 
     def __post_init__(self) -> None:
-        """Escape ``message``, but not ``file`` and ``field``, which :meth:`__str__` escapes."""
+        """Escape and cut ``message``; ``file`` and ``field`` are escaped by :meth:`__str__`."""
         object.__setattr__(self, "message", one_line(self.message))
 
     def __str__(self) -> str:
@@ -97,16 +98,19 @@ class InvalidInput(DemandOpsError):
 def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
     """Yield the first faults of each file, and one fault that says how many more the file has.
 
-    Long field names are shortened.
+    Long field names are shortened. A fault that already counts further faults is kept.
     """
     counts: dict[str, int] = {}
     for fault in faults:
+        if fault.code == _MORE:
+            yield fault
+            continue
         count = counts[fault.file] = counts.get(fault.file, 0) + 1
         if count <= MOST_FAULTS:
             yield replace(fault, field=clipped(fault.field, _LONGEST_FIELD))
     for file, count in counts.items():
         if count > MOST_FAULTS:
-            yield Fault("more", "", f"has {count - MOST_FAULTS} more faults", file)
+            yield Fault(_MORE, "", f"has {count - MOST_FAULTS} more faults", file)
 
 
 class Refused(InvalidInput):
@@ -118,7 +122,7 @@ class StateRepoError(DemandOpsError):
 
 
 class Withdrawn(DemandOpsError):
-    """Raised when the requester canceled its demand before the commit."""
+    """Raised when a demand is canceled, released or replaced before its commit."""
 
 
 class TurnedDown(DemandOpsError):
@@ -137,7 +141,11 @@ class NotReached(DemandOpsError):
 
 
 class ShuttingDown(DemandOpsError):
-    """Raised when a demand arrives while the generator stops."""
+    """Raised when a demand gets no answer because the generator stops.
+
+    A demand that arrived before the stop stays in the journal, and the next start resumes it. A
+    demand that arrives during the stop is not accepted. The message says which of both it is.
+    """
 
 
 class Unsound(DemandOpsError):
@@ -149,7 +157,7 @@ class Unsound(DemandOpsError):
 
 
 class QueueFull(DemandOpsError):
-    """Raised when the demand queue is full."""
+    """Raised when the queue is full, or when too many demands of the requester have no answer."""
 
 
 def fault(field: str, message: str, *, code: str = "invalid", line: int | None = None) -> Fault:
@@ -163,7 +171,10 @@ def internal(error: Exception) -> StateRepoError:
 
 
 def closest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is most similar to ``word``, or None if none is similar."""
+    """Return a known word that is similar to ``word``, or None if none is found.
+
+    If many words are known, only some of them are compared, so a similar word may be missed.
+    """
     close = get_close_matches(word, _neighbors(word, sorted(known)), n=1)
     return close[0] if close else None
 

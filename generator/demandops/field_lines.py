@@ -16,8 +16,8 @@ from demandops.strict_yaml import LOADER, load_all
 def lines(text: str, document: int = 0) -> dict[str, int]:
     """Return the line of each field of a document; a field is a path like ``nodes[3].cluster``.
 
-    ``document`` is the index of the document in the text. The result is empty if :func:`load_all`
-    refuses the text, because the error of :func:`load_all` already names the line.
+    ``document`` is the index of the document in the text. The result is empty if the text has no
+    such document, or if :func:`load_all` refuses the text; its errors name lines themselves.
     """
     found: dict[str, int] = {}
     with suppress(InvalidInput, yaml.YAMLError):
@@ -71,9 +71,10 @@ def nearest(field: str, known: Mapping[str, int]) -> int | None:
 
 
 def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) -> list[Fault]:
-    """Return the faults, each with the line of its field if that line is known.
+    """Return the faults, each with the line that :meth:`FieldLines.of` finds for its field.
 
-    ``text_of`` returns the text of a file, or None if there is no such file.
+    A fault that has a line keeps it. ``text_of`` returns the text of a file, or None if there is no
+    such file.
     """
     known = FieldLines(text_of)
     return [replace(one, line=one.line or known.of(one.file, one.field)) for one in faults]

@@ -29,9 +29,11 @@ PullRequestState = Literal["open", "merged", "closed"]
 
 
 class ForgeError(DemandOpsError):
-    """Raised when a forge fails or refuses; ``status`` is the HTTP status, if it answered.
+    """Raised when a forge fails or refuses; ``status`` is the HTTP status of a refusal.
 
-    ``asks_to_wait`` says whether the forge got too many calls. No message contains the token.
+    ``status`` is None if the forge gives no answer, or none that can be read. ``asks_to_wait`` says
+    whether the forge asks to call again later, mostly because it got too many calls. No message
+    contains the token.
     """
 
     def __init__(
@@ -77,9 +79,10 @@ class Forge(ABC):
         """
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the branch's pull request, and create it if the branch never had one.
+        """Return the branch's pull request to ``target``; create it if there never was one.
 
-        A branch gets only one pull request, so a closed one is returned as it is.
+        A branch gets only one pull request, so a closed one is returned as it is. An existing one
+        keeps its title and body.
         """
         existing = self.find(branch, target)
         if existing is not None:
@@ -148,7 +151,7 @@ class GitHub(Forge):
     EXISTS = 422
 
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the newest pull request for a branch."""
+        """Return the newest pull request for a branch; ``None`` if there is none."""
         query = {
             "head": f"{self._owner}:{branch}",
             "base": target,
@@ -172,7 +175,11 @@ class Gitea(Forge):
     EXISTS = 409
 
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the pull request for a branch."""
+        """Return the pull request for a branch; ``None`` if there is none.
+
+        The result is ``None`` too if the token may not see the project, because Gitea answers both
+        with status 404.
+        """
         try:  # the branch ends the path, so its slash stays unquoted
             path = f"{self._pulls}/{quote(target, safe='')}/{quote(branch, safe='/')}"
             return self._read(self._call("GET", path))
@@ -192,7 +199,7 @@ def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
     while the generator runs.
 
     Raises:
-        ForgeError: if the token cannot be read.
+        ForgeError: if no file for the token is set, or the token cannot be read.
     """
     if proposals.forge not in ("github", "gitea") or proposals.url is None:
         return None

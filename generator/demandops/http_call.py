@@ -1,9 +1,10 @@
 """HTTP calls to other services: the only module that imports httpx.
 
-A call trusts the certificates in ``SSL_CERT_FILE``, or the system's if the variable is not set. It
-uses the proxy that the usual environment variables name. It follows no redirect, because
-credentials must not reach another host. The answer's length and duration are limited. No error
-contains the URL or a header, because they may hold secrets.
+A call trusts the certificates that OpenSSL trusts by default: those of the system. The variable
+``SSL_CERT_FILE`` replaces the system's file, and ``SSL_CERT_DIR`` the system's folder. A call uses
+the HTTP proxy that the usual environment variables name. It follows no redirect, because
+credentials must not reach another host. The answer's length and duration are limited. An error
+contains nothing of the request but the host's name, because a URL or a header may hold secrets.
 """
 
 from __future__ import annotations
@@ -24,6 +25,14 @@ if TYPE_CHECKING:
 
 _MOST_BYTES = 4_000_000
 _TOO_MANY_REQUESTS = 429
+_INVALID = "the URL, a header or the proxy's address is not valid; check them"
+_CAUSES = {
+    "LocalProtocolError": _INVALID,
+    "UnsupportedProtocol": _INVALID,
+    "RemoteProtocolError": "the answer is not HTTP, or not complete; check the URL and the server",
+    "ProxyError": "the proxy refuses the connection; check HTTPS_PROXY and ALL_PROXY",
+}
+"""For types of httpx's errors, a text without the error's own, which may echo the request."""
 
 for _name in ("httpx", "httpcore"):  # they log URLs and headers
     logging.getLogger(_name).setLevel(logging.WARNING)
@@ -37,8 +46,9 @@ class NoAnswer(DemandOpsError):
 class HttpAnswer:
     """An answer: its status, the status in words, and the body.
 
-    ``asks_to_wait`` says whether the service got too many calls. Some services then answer with
-    status 429, others (GitHub) with 403 and headers that say so.
+    ``asks_to_wait`` says whether the service asks to call again later, mostly because it got too
+    many calls. Some services then answer with status 429, others (GitHub) with another error and
+    with headers that say so.
     """
 
     status: int
@@ -65,10 +75,11 @@ def call(
     Args:
         method, url, headers, body: the request.
         timeout: how many seconds it may take to connect, to send, and to receive each part of the
-            answer. The answer must be complete within twice this time.
+            answer. An answer that is not complete within twice this time is refused.
 
     Raises:
-        NoAnswer: if there is no answer, or if the answer is too long or too slow.
+        NoAnswer: if the request cannot be sent, if there is no answer, or if the answer is not
+            HTTP, too long or too slow.
     """
     import httpx  # noqa: PLC0415 - slow (a tenth of a second), so only on use
 
@@ -86,6 +97,8 @@ def call(
                     raise NoAnswer(f"the answer is longer than {_MOST_BYTES} bytes; check the URL")
                 if REAL.monotonic() > end:
                     raise NoAnswer(_too_slow(timeout))
+            if REAL.monotonic() > end:  # the end of the answer may come late, too
+                raise NoAnswer(_too_slow(timeout))
             return HttpAnswer(
                 answer.status_code,
                 answer.reason_phrase,
@@ -99,7 +112,9 @@ def call(
     except httpx.TransportError as error:
         raise NoAnswer(_cause(error)) from None
     except (httpx.InvalidURL, ValueError):
-        raise NoAnswer("the URL or a header is not valid; check them") from None
+        raise NoAnswer(_INVALID) from None
+    except ImportError:  # httpx needs a further package for SOCKS
+        raise NoAnswer("a SOCKS proxy is set, but only HTTP proxies can be used") from None
 
 
 def _trust(url: str) -> ssl.SSLContext:
@@ -114,10 +129,15 @@ def _too_slow(timeout: float) -> str:
 
 
 def _cause(error: httpx.TransportError) -> str:
-    """Return the reason why there is no answer; it contains no part of the request."""
-    if type(error).__name__ in ("LocalProtocolError", "UnsupportedProtocol"):
-        return "the URL or a header is not valid; check them"
+    """Return the reason why there is no answer; it contains no part of the request but the host."""
+    known = _CAUSES.get(type(error).__name__)
+    if known:
+        return known
     text = one_line(str(error) or type(error).__name__)
     if "CERTIFICATE_VERIFY_FAILED" in text:
+        if "mismatch" in text:
+            return f"{text}; use a host that the certificate names"
+        if "expired" in text:
+            return f"{text}; renew the certificate"
         return f"{text}; if you trust the certificate, set SSL_CERT_FILE to its file"
     return f"{text}; check that the server runs and can be reached"

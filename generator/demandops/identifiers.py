@@ -23,7 +23,10 @@ _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
 def absolute_topic(topic: str) -> str:
-    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``."""
+    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``.
+
+    An empty name and a private name (``~…``) stay unchanged, so :func:`topic_problem` refuses them.
+    """
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
 
@@ -43,8 +46,8 @@ def control_character(text: str) -> str:
 def id_problem(value: str) -> str:
     """Return what is wrong with an id, or an empty string.
 
-    An id may be nearly any text. It must not contain invisible characters or ``..``, and must not
-    start or end with white space.
+    An id may be nearly any text of up to :data:`MAX_ID` characters. It must not contain invisible
+    characters or ``..``, and must not start or end with white space.
     """
     if not value:
         return "is empty; give an id"
@@ -71,11 +74,11 @@ def topic_problem(name: str) -> str:
         return f"{quoted(name)} is private to a node; give the full name, starting with '/'"
     if not _TOPIC.fullmatch(name):
         return (
-            f"{quoted(name)} is not a topic name that ROS 2 allows; use letters, digits and '_', "
-            "with a single '/' between parts; no part may start with a digit"
+            f"{quoted(name)} is not a topic name that ROS 2 allows; begin each part with a single "
+            "'/', and write letters, digits and '_' after it, with no digit first"
         )
     if len(name) > MAX_TOPIC:
-        return f"has {len(name)} characters; ROS 2 takes at most {MAX_TOPIC}"
+        return f"has {len(name)} characters; ROS 2 takes at most {MAX_TOPIC}; shorten it"
     return ""
 
 
@@ -102,7 +105,9 @@ PATTERN_WORDS = {
     r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$": "the name of a resource, such as cpu or nvidia.com/gpu",
     r"^[A-Za-z_][A-Za-z0-9_]*$": f"{_ANY} and '_', with no digit first, for example ROS_DOMAIN_ID",
     r"^[A-Za-z0-9_.-]+$": f"{_ANY}, '_', '.' and '-', such as start.launch.py",
-    r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$": f"{_ANY}, '_', '.' and '-', such as ca.crt",
+    r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$": (
+        f"{_ANY}, '_', '.' and '-', but no '.' or '-' first, such as ca.crt"
+    ),
     r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$": "the tag of an image, such as v1.2.0",
     r"^[A-Z][A-Za-z0-9]*$": "a kind of Kubernetes object, such as ConfigMap",
     r"^([a-z0-9]([a-z0-9.-]*[a-z0-9])?)?$": "the group of an API, such as batch, or nothing",
@@ -115,21 +120,26 @@ PATTERN_WORDS = {
         f"one or more parts with '/' between them (fleet/one), each of {_ANY}, '_' and '-'"
     ),
     r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$": "a version of three numbers, such as 1.2.0",
-    r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder of the state repo, such as appdefs/mine/charts/one",
-    r"^[a-z0-9][a-z0-9._/:-]*$": "an image without its tag, such as registry.example/detection",
+    r"^[A-Za-z0-9][A-Za-z0-9_./-]*$": "a folder in appdefs/, such as appdefs/mine/charts/one",
+    r"^[a-z0-9][a-z0-9._/:-]*$": (
+        "the name of an image or a registry in lower case, without a tag, such as "
+        "registry.example/detection"
+    ),
     r"^sha256:[0-9a-f]{64}$": "a digest, which is 'sha256:' and 64 digits (0 to 9, a to f)",
     r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$": "a quantity, such as 500m, 2 or 1Gi",
     r"^(tcp|udp|ws)/[^\s/#?]+:\d{1,5}$": "an endpoint of Zenoh, such as tcp/router.example:7447",
     r"^(\d+h)?(\d+m)?(\d+s)?$": "a duration, such as 30s, 1m or 1h30m",
-    r"^[^\s,][^\n\r,]*$": "a label without a comma",
+    r"^[^\s,][^\n\r,]*$": "a label on one line, with no comma, and no white space at its start",
     r"^([a-z0-9.-]+/)?[A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?$": (
         "the key of a label, such as node_id or example.org/host"
     ),
     r"^([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?$": (
-        f"the value of a label: up to 63 {_ANY}, '_', '.' and '-'"
+        f"the value of a label: up to 63 {_ANY}, '_', '.' and '-', with a letter or digit at both "
+        "ends, or nothing"
     ),
     r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$": (
-        "a topic that begins with '/', such as /{instance}_objects"
+        f"a topic such as /{{instance}}_objects: each part is '/' and then {_ANY} and '_', with no "
+        "digit first, and may have {instance} once"
     ),
 }
 """For each regular expression of a field: the texts that match it, in words for messages."""

@@ -26,11 +26,11 @@ def read_input(file: str | Path) -> tuple[str, str]:
 
 
 def read_secret(path: Path, *, private: bool = False) -> bytes:
-    """Return the secret in a file, without the line end.
+    """Return the secret in a file, without the line ends at its end.
 
     Args:
         path: the file.
-        private: whether to refuse a file that other users may read.
+        private: whether to refuse a file on which everybody has a right; its group may have rights.
 
     Raises:
         InvalidInput: if the file holds no secret, cannot be read, or is not private enough.
@@ -38,13 +38,13 @@ def read_secret(path: Path, *, private: bool = False) -> bytes:
     secret = b""
     try:
         if private and path.stat().st_mode & 0o007:
-            problem = "may be read by everybody on this machine; run chmod o= on it"
+            problem = "is open to everybody on this machine; run chmod o= on it"
         else:
             secret = path.read_bytes().rstrip(b"\r\n")
             problem = "is empty; write the secret into this file"
     except (OSError, ValueError) as error:  # a ValueError if the path has the character NUL
         why = getattr(error, "strerror", None) or error
-        problem = f"cannot be read: {why}; write the secret into this file"
+        problem = f"cannot be read: {why}; write the secret into this file, and make it readable"
     if not secret.strip():
         raise InvalidInput.at("", problem, file=str(path))
     return secret

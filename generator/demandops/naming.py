@@ -52,10 +52,10 @@ def object_name(prefix: str, *ids: str) -> str:
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name: ``edge/lane-view`` gives ``edge_lane_view``.
 
-    If an id gives no valid name in this way, a hash is appended. ``extra`` distinguishes names that
-    are made from the same id, for example for two point clouds of one source. With ``extra``, the
-    name also contains a slug of ``extra`` and a hash. Results are cached, because each release asks
-    for the names of all its inputs.
+    If an id gives no valid name in this way, or is long, a hash is appended. ``extra``
+    distinguishes names that are made from the same id, for example for two point clouds of one
+    source. With ``extra``, the name also contains a slug of ``extra`` and a hash. Results are
+    cached, because each release asks for the names of all its inputs.
     """
     plain = re.sub("[-/]", "_", id)
     if not extra and len(id) <= _MAX_TOKEN and _TOPIC_TOKEN.fullmatch(plain):

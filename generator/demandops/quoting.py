@@ -55,7 +55,7 @@ def lines(text: str) -> str:
 
 
 def quoted(value: str, most: int = 80) -> str:
-    """Return a value in quotes, on one line, cut to at most ``most`` characters."""
+    """Return a value on one line, cut to at most ``most`` characters, in quotes besides."""
     return f"'{one_line(value, most)}'"
 
 

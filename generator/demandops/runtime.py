@@ -26,7 +26,7 @@ Thread = threading.Thread
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
 _STEADY_S = 2 * _LONGEST_PAUSE_S
-"""A thread has recovered if it has run for this many seconds since its last failure."""
+"""A thread counts as recovered if its last failure is at least this many seconds ago."""
 _LONGEST_REASON = 300
 
 
@@ -87,7 +87,10 @@ class Runtime:
 
     @property
     def failures(self) -> dict[str, str]:
-        """The failure of each thread that has not recovered, by the thread's name."""
+        """The last failure of each thread that has not recovered since, by the thread's name.
+
+        A failure is over if :meth:`recovered` is called, or after two minutes.
+        """
         now = self.monotonic()
         known = sorted(self._failures.items())
         return {name: text for name, (text, at) in known if now - at < _STEADY_S}
@@ -95,7 +98,8 @@ class Runtime:
     def failed(self, name: str, error: Exception) -> None:
         """Record that the work of a thread failed, and log the error.
 
-        If the same failure repeats, it is logged at the level DEBUG only.
+        If the thread's last failure was the same and is not over yet (:attr:`failures`), the error
+        is logged at the level DEBUG only.
         """
         is_known = self.failures.get(name) == _reason(error)
         self._failures[name] = (_reason(error), self.monotonic())
@@ -115,7 +119,8 @@ class Runtime:
         """Start a thread that runs ``target``, and return the thread.
 
         If ``target`` raises an error, the thread pauses and runs ``target`` again. The pause grows
-        with each error. After :class:`Unsound` the thread ends, because the process must end.
+        with each error, up to a minute. The thread ends if ``target`` returns. It also ends after
+        :class:`Unsound`, because the process must end.
         """
         return self.start_thread(name, lambda: self._supervise(name, target))
 

@@ -1,7 +1,7 @@
 """Constants of the program, and the locations of the program's own files.
 
-The versions below are written in the files of a state repo. A generator refuses a file with a newer
-version of the format, and a state repo with another render version.
+The versions below are written in the files of a state repo. A generator refuses a file whose format
+it does not know, and a state repo with another render version.
 """
 
 from __future__ import annotations
@@ -36,10 +36,16 @@ QUEUE_LIMIT = 10_000
 """How many demands may be queued; a further demand is rejected."""
 
 REQUESTER_QUEUE_LIMIT = 1_000
-"""How many demands of one requester may be queued; a further demand is rejected."""
+"""How many demands of one requester may have no answer yet; a further demand is rejected.
+
+Demands that await approval do not count.
+"""
 
 PROPOSAL_LIMIT = 100
-"""How many demands of one requester may await approval; a further demand is refused."""
+"""How many proposals of one requester may await approval.
+
+A demand that needs a further proposal is refused.
+"""
 
 GENERATED_ROOTS = ("bootstrap", "clusters")
 """The top-level folders whose files are all rendered from ledger and configuration."""
@@ -92,8 +98,9 @@ def forge_token_file() -> Path | None:
 def data_home(state_repo: str) -> Path:
     """Return the folder of the generator's journal and clone for one state repo.
 
-    It is inside ``DEMANDOPS_DATA_HOME`` or, if that is not set, ``$XDG_STATE_HOME/demandops``. Its
-    name is a digest of the state repo's address, because the address may contain a password.
+    It is inside ``DEMANDOPS_DATA_HOME`` or, if that is not set, ``$XDG_STATE_HOME/demandops``
+    (``~/.local/state/demandops``). Its name is a digest of the state repo's address, because the
+    address may contain a password.
     """
     if Path(state_repo).exists():  # all spellings of a path give the same folder
         state_repo = str(Path(state_repo).resolve())

@@ -1,8 +1,8 @@
 """Strict reading and deterministic writing of YAML.
 
-The program reads every file with :func:`load`, for which duplicate keys, anchors and further
-documents are errors. It writes every file with :func:`dump`, which writes strings so that YAML 1.1
-and 1.2, PyYAML and Go's parsers read the same value.
+The program reads a YAML file with :func:`load` or, if the file may have several documents, with
+:func:`load_all`. Duplicate keys, anchors and tags are errors. :func:`dump` writes strings so that
+YAML 1.1 and 1.2, PyYAML and Go's parsers read the same value.
 """
 
 from __future__ import annotations
@@ -198,7 +198,7 @@ def _text(text: str) -> yaml.ScalarEvent:
 
 
 def _readable_block(text: str) -> bool:
-    """Return whether a literal block (``|``) can hold a text of several lines unchanged."""
+    """Return whether to write a text of several lines as a literal block (``|``)."""
     return (
         text.endswith("\n")
         and not text.endswith("\n\n")
@@ -238,7 +238,8 @@ def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]
     """Yield the documents of ``text``; more than ``most`` are an error.
 
     Raises:
-        InvalidInput: if ``text`` is not strict YAML; the fault names ``file``.
+        InvalidInput: if ``text`` is not strict YAML, maybe only after some documents; the fault
+            names ``file``.
     """
     if len(text) > MAX_LENGTH:
         message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
@@ -287,7 +288,8 @@ def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which mo
     """Return the only document of ``text``, or ``None`` if ``text`` has no document.
 
     Raises:
-        InvalidInput: if ``text`` is not strict YAML; the fault names ``file``.
+        InvalidInput: if ``text`` is not strict YAML or has several documents; the fault names
+            ``file``.
     """
     try:
         if len(text) > _MOST_KEPT:
@@ -326,7 +328,7 @@ def dump(data: Mapping[str, Any]) -> str:
 
 
 class _NotSimple(Exception):
-    """Raised for a text with escapes or several lines, which only PyYAML writes."""
+    """Raised for a text that only PyYAML writes: with escapes, of several lines, or long."""
 
 
 _SIMPLE = re.compile(r"[ !#-\[\]-~]{0,1000}")
@@ -377,10 +379,11 @@ def _scalar(text: str) -> str:
 def set_key(text: str, key: str, value: object) -> str:
     """Return a file's text with one top-level key set; the rest stays, including comments.
 
-    A plain value is replaced in place. A missing key is added at the end.
+    A text, number, truth value or null is replaced in place. A missing key is added at the end.
 
     Raises:
-        InvalidInput: if the form of the file does not permit the change.
+        InvalidInput: if the text is not valid YAML, or if its form does not permit the change. A
+            list or a mapping, for example, cannot be replaced.
     """
     with _strict(""):
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -407,6 +410,10 @@ def to_json(value: object) -> str:
     """Return ``value`` as JSON that is also valid YAML. ``{{ … }}`` in a template writes this text.
 
     Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
+
+    Raises:
+        TypeError: if a part of ``value`` is no JSON, as a method is none.
+        ValueError: if a number in ``value`` is infinite or not a number.
     """
     text = _JSON.encode(value)
     if "e-" in text or "e+" in text:
@@ -414,8 +421,19 @@ def to_json(value: object) -> str:
     return _UNPRINTABLE.sub(lambda match: f"\\u{ord(match[0]):04x}", text)
 
 
+def not_writable(value: object) -> str:
+    """Return the message about a value that a template must not write, because it is no data."""
+    kind = getattr(type(value), "__name__", "object")
+    if callable(value):
+        kind += "; add '()' to call it"
+    return (
+        "a template may write text, numbers, true, false, null, lists and mappings, but not a "
+        f"{kind}"
+    )
+
+
 def _unknown(value: object) -> object:
-    raise TypeError(f"a template may write text, numbers, lists and mappings, not {type(value)}")
+    raise TypeError(not_writable(value))
 
 
 _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=_unknown)

@@ -9,8 +9,8 @@ from typing import TypeAlias
 TopicKey: TypeAlias = "tuple[str, ...]"
 """The identity of a topic within its subject.
 
-In an application, that is role, topic and source. In a connection, that is the topic's name on the
-source node.
+In an application, that is role, topic and source; an application without inputs has one empty key.
+In a connection, that is the topic's name on the source node.
 """
 
 

@@ -22,8 +22,8 @@ STATION_CLOUD: Topic = ("/stations/station00/pointcloud", "station00")
 
 BODY = "apps[0].object_detection_fusion_app"
 ROS_NAMES = (
-    "is not a topic name that ROS 2 allows; use letters, digits and '_', with a single '/' "
-    "between parts; no part may start with a digit"
+    "is not a topic name that ROS 2 allows; begin each part with a single '/', and write letters, "
+    "digits and '_' after it, with no digit first"
 )
 
 EXPERIMENT = sorted((Path(__file__).parents[2] / "examples" / "experiment").glob("[1-8]-*.yaml"))

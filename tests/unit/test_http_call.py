@@ -19,6 +19,7 @@ from demandops.http_call import HttpAnswer, NoAnswer
 from tests.kit.http import Answer, serving
 
 SECRET = "s3cret"  # noqa: S105 - no real secret
+INVALID = "the URL, a header or the proxy's address is not valid; check them"
 
 
 @pytest.fixture(autouse=True)
@@ -92,8 +93,8 @@ def test_an_answer_that_drips_is_cut_off() -> None:
             "http://127.0.0.1:1/s3cret",
             "Connection refused; check that the server runs and can be reached",
         ),
-        ("http://s3cret:pass:word@:x/", "the URL or a header is not valid; check them"),
-        ("ftp://127.0.0.1/s3cret", "the URL or a header is not valid; check them"),
+        ("http://s3cret:pass:word@:x/", INVALID),
+        ("ftp://127.0.0.1/s3cret", INVALID),
     ],
 )
 def test_an_error_tells_no_secret(url: str, message: str) -> None:
@@ -103,10 +104,34 @@ def test_an_error_tells_no_secret(url: str, message: str) -> None:
     assert SECRET not in str(error.value)
 
 
-def test_an_answer_that_is_not_http_is_quoted_on_one_line() -> None:
-    with speaking(b"\x1b[31mhello\n\n") as url, pytest.raises(NoAnswer) as error:
+def test_an_answer_that_is_not_http_is_not_quoted_because_it_may_echo_the_request() -> None:
+    echo = f"POST /{SECRET} HTTP/1.1\r\nAuthorization: {SECRET}\r\n\r\n".encode()
+    with speaking(echo) as url, pytest.raises(NoAnswer) as error:
         call(url)
-    assert str(error.value).isprintable()
+    assert str(error.value) == (
+        "the answer is not HTTP, or not complete; check the URL and the server"
+    )
+
+
+def test_an_answer_whose_end_is_late_is_refused() -> None:
+    head = b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n1\r\nx\r\n"
+    with (
+        speaking(head, *[b"1\r\ny\r\n"] * 2, b"0\r\n\r\n", pause=0.3) as url,
+        pytest.raises(NoAnswer, match=r"no complete answer within 0\.4 s"),
+    ):
+        call(url, timeout=0.4)
+
+
+def test_a_proxy_that_cannot_be_used_is_told_apart_from_a_wrong_url(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.delenv("no_proxy")
+    monkeypatch.setenv("ALL_PROXY", "socks5://127.0.0.1:1")
+    with pytest.raises(NoAnswer, match="a SOCKS proxy is set, but only HTTP proxies can be used"):
+        call("http://127.0.0.1:1/")
+    monkeypatch.setenv("ALL_PROXY", "foo://127.0.0.1:1")
+    with pytest.raises(NoAnswer, match=INVALID):
+        call("http://127.0.0.1:1/")
 
 
 def test_only_trusted_certificates_are_accepted(
@@ -133,3 +158,8 @@ def test_only_trusted_certificates_are_accepted(
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
     with speaking(answer, tls=tls) as url:
         assert call(url).body == b"ok"
+    with (
+        speaking(answer, tls=tls) as url,
+        pytest.raises(NoAnswer, match="use a host that the certificate names"),
+    ):
+        call(url.replace("127.0.0.1", "localhost"))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
@@ -24,7 +24,6 @@ from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput, fault, suggestion
 from demandops.identifiers import PATTERN_WORDS, control_character
 from demandops.quoting import escaped, quoted
-from demandops.settings import API_VERSION
 
 Model = TypeVar("Model", bound=BaseModel)
 Item = TypeVar("Item")
@@ -41,7 +40,7 @@ DnsLabel = Annotated[
 """A name that is valid in Kubernetes (RFC 1123 label)."""
 
 Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
-"""The name of a role or a channel in a configuration file."""
+"""A short name in a configuration file, such as that of a role, a channel or a capability."""
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
@@ -57,7 +56,7 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 def readable_by(parse: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that rejects a text for which ``parse`` raises an error.
+    """Return a validator that rejects a text for which ``parse`` raises a ValueError.
 
     The validator leaves a valid text unchanged.
     """
@@ -75,13 +74,13 @@ def _hidden(value: str) -> str:
 
 
 Visible = without(_hidden)
-"""A validator that rejects control characters that hide or reorder text.
+"""A validator that rejects control characters, and characters that reorder text.
 
 Line breaks and tabs are valid.
 """
 
 Text = Annotated[str, Visible]
-"""Any text without hidden control characters."""
+"""Any text that :data:`Visible` accepts."""
 
 Approval = Literal["none", "required"]
 """Whether a demand needs a person's approval."""
@@ -190,7 +189,8 @@ def parse(model: type[Model], data: object, file: str = "") -> Model:
     """Validate plain data, and return it as an instance of ``model``.
 
     Raises:
-        InvalidInput: with every fault; each names ``file``.
+        InvalidInput: with the faults of all fields; each names ``file``. Rules about several fields
+            are checked only if each field is valid.
     """
     try:
         return model.model_validate(data)
@@ -202,10 +202,12 @@ def parse_file(model: type[Model], text: str, file: str) -> Model:
     """Parse the text of a YAML file, and return its content as an instance of ``model``.
 
     Raises:
-        InvalidInput: with every fault.
+        InvalidInput: if the text is not strict YAML or not a mapping, or as :func:`parse` does.
     """
     data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
-        message = f"must be a mapping that starts with apiVersion: {API_VERSION}"
+        message, version = "must be a mapping", model.model_fields.get("apiVersion")
+        if version is not None:
+            message += f" that starts with apiVersion: {get_args(version.annotation)[-1]}"
         raise InvalidInput.at("", message, file=file)
     return parse(model, data, file)

@@ -94,7 +94,7 @@ class Config:
     services: Mapping[str, Services]
     """For each appdef, its own services and those of ``definitions`` that it uses."""
     domain_of: Mapping[str, AccessDomain]
-    """The access domain of each node."""
+    """The access domain of each node that is in one."""
     files: Mapping[str, str]
     """The text of each file below ``appdefs/``, such as a template or a chart, by path."""
     hosts: Mapping[str, str] = field(default_factory=dict)

@@ -120,8 +120,8 @@ class ConfigReader:
     def head(self, file: str, model: type[Model]) -> Model | None:
         """Return a file without its items, as an instance of ``model``.
 
-        :meth:`read_items` must have read the file. Return ``None`` if the other fields of the file
-        are not valid.
+        :meth:`read_items` must have read the file. Return ``None`` if the file has no items, or if
+        its other fields are not valid.
         """
         head = self._heads.get(file)
         return head if isinstance(head, model) else None
@@ -134,12 +134,16 @@ class ConfigReader:
         """Register ``name`` as a further name of ``item``."""
         self._places[collection][name] = self._places[collection][item]
 
+    def is_complete(self, collection: str) -> bool:
+        """Return whether every item of a collection, and every file with items, is valid."""
+        return collection not in self._incomplete
+
     def is_missing(self, collection: str, name: str) -> bool:
         """Return whether a collection lacks an item.
 
         Return False if an item of the collection is invalid, because it may be the missing item.
         """
-        return collection not in self._incomplete and name not in self._places[collection]
+        return self.is_complete(collection) and name not in self._places[collection]
 
     def check_reference(self, file: str, field: str, name: str, known_in: str) -> None:
         """Add a fault if the collection ``known_in`` has no item ``name`` (:meth:`is_missing`)."""
@@ -166,8 +170,8 @@ class ConfigReader:
     def _items(self, file: str, whole: type[BaseModel], field: str, kind: type[Any]) -> Any:  # noqa: ANN401 - raw data of the kind
         """Return the unchecked items of a file: the value of ``field``.
 
-        Check the other fields of the file, and add their faults. Return ``None`` if ``field`` is
-        missing or not of the type ``kind``.
+        Check the other fields of the file, and add their faults. Return ``None`` if the file cannot
+        be read as YAML, or if ``field`` is missing or not of the type ``kind``.
         """
         raw = None
         try:

@@ -17,7 +17,7 @@ def seconds_of(text: str) -> int:
     """Return the seconds of a duration like ``1h30m``.
 
     Raises:
-        ValueError: if the text is not a duration.
+        ValueError: if the text is not a duration, or is one of more than a year.
     """
     match = _DURATION.fullmatch(text)
     if not text or match is None:
@@ -30,7 +30,10 @@ def seconds_of(text: str) -> int:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration, rounded to seconds, as text for :func:`seconds_of`: ``1h30m``."""
+    """Return a duration, rounded to seconds, as text like ``1h30m``.
+
+    The duration must not be negative. :func:`seconds_of` reads the text if it is at most a year.
+    """
     text, left = "", round(seconds)
     for size, name in _UNITS:
         whole, left = divmod(left, size)
@@ -39,9 +42,10 @@ def duration_text(seconds: float) -> str:
 
 
 def span(seconds: float) -> str:
-    """Return an approximate duration in one or two units, like ``12d`` or ``3h20m``.
+    """Return a duration, rounded down, in one or two units, like ``12d`` or ``3h20m``.
 
-    The second unit is given only if the number of the first unit has one digit.
+    The sign is left out. The second unit is given only if the number of the first unit has one
+    digit.
     """
     left = int(abs(seconds))
     for place, (size, unit) in enumerate(_UNITS):

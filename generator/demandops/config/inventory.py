@@ -1,8 +1,8 @@
 """The inventory: nodes, clusters and brokers.
 
 A node is a vehicle, a roadside station, an edge or a cloud server, or anything else that runs
-services. A node belongs to one cluster and to one or more access domains. A node selector
-identifies the node in its cluster.
+services. A node belongs to one cluster. It runs services only in access domains: in the one whose
+patterns match it, and in those that it lists. A node selector identifies the node in its cluster.
 """
 
 from __future__ import annotations
@@ -58,8 +58,8 @@ class Zenoh(CamelModel):
     """The Zenoh bridge that a node runs when a connection needs it.
 
     Other nodes' bridges connect to ``endpoint``. The bridge listens at ``listen``, by default on
-    the endpoint's port at every address. It always connects to the routers in ``connect``. If none
-    of these fields is given, the bridge only connects to bridges that have an endpoint.
+    the endpoint's port at every IPv4 address. It always connects to the routers in ``connect``. If
+    none of these fields is given, the bridge only connects to bridges that have an endpoint.
     """
 
     endpoint: Endpoint | None = None
@@ -113,7 +113,8 @@ def amount_of(text: str) -> int:
     """Return a quantity of a resource in thousandths: 500 for ``500m``, 2000 for ``2``.
 
     Raises:
-        ValueError: if the text is not a quantity as Kubernetes writes it.
+        ValueError: if the text is not a plain quantity (``2``, ``1.5``, ``16Gi``), or is finer than
+            a thousandth. Of Kubernetes' notations, exponents and the units above Ti are refused.
     """
     match = _QUANTITY.fullmatch(text)
     if match is None:
@@ -272,7 +273,7 @@ class Node(CamelModel):
     """The value of each property: a number, text, true or false."""
     position: Position | None = None
     drained: bool = False
-    """The generator chooses no drained node."""
+    """The generator chooses no drained node, and moves away what it placed there."""
     capacity: Resources | None = None
     """What all services on the node may request together (:mod:`demandops.plan.nodes.capacity`)."""
     access_domains: Items[FurtherDomain] = ()
@@ -286,8 +287,8 @@ class Node(CamelModel):
         if self.selector is None and not _LABEL_VALUE.fullmatch(self.id):
             raise ValueError(
                 "the id is not a valid label value, so no node of the cluster can have it in the "
-                "label node_id; choose an id of up to 63 letters, digits, '-', '_' and '.', or "
-                "add a selector"
+                "label node_id; choose an id of up to 63 letters, digits, '-', '_' and '.' with a "
+                "letter or digit at both ends, or add a selector"
             )
         return self
 

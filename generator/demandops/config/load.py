@@ -195,7 +195,7 @@ def _read_versions(reader: ConfigReader) -> Mapping[str, VersionList]:
 def _read_definitions(
     reader: ConfigReader, file: str, model: type[Definition]
 ) -> Mapping[str, Definition]:
-    """Return the definitions in all files ``appdefs/<name>/<file>``, by name."""
+    """Return the definitions in all valid files ``appdefs/<folder>/{file}``, by folder."""
     found = {}
     for path in sorted(reader.files):
         parts = path.split("/")
@@ -247,8 +247,8 @@ def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
             reader.add_fault(
                 path,
                 "",
-                "is not an override file; rename it to overrides/<name>.yaml, with lower-case "
-                "letters, digits and '-', or remove it",
+                "is not an override file; rename it to overrides/<name>.yaml, where <name> has up "
+                "to 63 lower-case letters, digits and '-' between them, or remove it",
             )
             continue
         file = reader.read_file(path, OverrideFile)
@@ -285,8 +285,11 @@ def _in_further_domains(
             domain = domains.get(further.name)
             reader.check_reference(file, f"{where}.name", further.name, DOMAINS_FILE)
             if first is None:
-                message = f"no access domain has '{node.id}' in its nodes; add it to one"
-                reader.add_fault(file, where, message)
+                # the node may be in an invalid domain, or in several, which has a fault of its own
+                known = any(matches(node.id, one.nodes) for one in domains.values())
+                if not known and reader.is_complete(DOMAINS_FILE):
+                    message = f"no access domain has '{node.id}' in its nodes; add it to one"
+                    reader.add_fault(file, where, message)
             elif domain is first or id in nodes:
                 message = f"'{node.id}' is already in '{further.name}'; remove this entry"
                 if domain is not first and id not in hosts:

@@ -105,7 +105,7 @@ Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_lin
 
 
 def _filled_in(model: FrozenModel) -> None:
-    """Raise ValueError if the file has a field without a value, which would have no effect."""
+    """Raise ValueError if a field is given without a value, because it would have no effect."""
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(
@@ -177,7 +177,7 @@ class OverrideFile(FileModel):
         return self
 
     def _misplaced(self) -> Iterable[str]:
-        """Yield a problem for each effect that the selected releases and claims cannot have."""
+        """Yield a problem for each selector whose releases and claims cannot have an effect."""
         effects = self.effects()
         if self.values is not None and self.selects_clients() and not self.patches_clients():
             yield (
@@ -204,11 +204,14 @@ class OverrideFile(FileModel):
                 )
 
     def selects_clients(self) -> bool:
-        """Return whether the override selects connections, and so their clients."""
+        """Return whether a selector has patterns for connections, and so selects only clients."""
         return any(selector.connections for selector in self.select)
 
     def patches_clients(self) -> bool:
-        """Return whether ``values`` patches the settings of clients instead of Helm values."""
+        """Return whether ``values`` patches the settings of clients instead of Helm values.
+
+        So it is if every selector has patterns for connections.
+        """
         return all(selector.connections for selector in self.select)
 
     def effects(self) -> tuple[str, ...]:
@@ -248,7 +251,7 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
-    """The overrides that shape a release, each with the names of its effects.
+    """The overrides that shape a release, each with the names of its effects on the release.
 
     The overrides are in the order in which they apply; the last one wins.
     """
@@ -256,7 +259,10 @@ class Shaping:
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, name: str, image: Image) -> Image:
-        """Return ``image`` as the overrides pin it; ``name`` is its name in the registry."""
+        """Return ``image`` as the overrides pin it, or unchanged if none pins it.
+
+        ``name`` is the image's name in the registry.
+        """
         for override, effects in self.by:
             if "images" in effects and override.images and name in override.images:
                 image = override.images[name].over(image)

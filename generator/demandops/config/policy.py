@@ -56,6 +56,7 @@ class Rule(CamelModel):
 class Quotas(CamelModel):
     """The upper limits of an access domain. A field that is not given sets no limit.
 
+    What exceeds a limit already, because the limit was lowered, may stay, but not grow.
     ``demands_per_minute`` limits the demands that one generator receives from a requester.
     """
 
@@ -71,7 +72,8 @@ class LeasePolicy(CamelModel):
     neither is set, the demand's claims last forever.
 
     If ``deployment_requests`` is true, goals of the reference's ``DeploymentRequest`` get the
-    default lease. Their client must send a goal again before its lease ends.
+    default lease. Their client must send a goal again before its lease ends. Otherwise their claims
+    last forever.
 
     The recorded end of a lease may lag behind the last renewal by ``slack``, so the generator may
     release a claim late by that much.

@@ -156,7 +156,11 @@ class ImagesFile(FileModel):
 
 
 class ImagePin(FrozenModel):
-    """Changes to an image of the registry; an absent field changes nothing."""
+    """Changes to an image of the registry.
+
+    An absent field changes nothing, except that a new tag removes the image's digest, and a new
+    digest its tag (:meth:`over`).
+    """
 
     repository: Repository | None = None
     tag: Tag | None = None
@@ -254,7 +258,10 @@ class ApplicationVersion:
         return tuple(map(precedence, [self.name] if self.name else charts))
 
     def image(self, name: str, image: Image) -> Image:
-        """Return ``image`` as this version pins it; ``name`` is its name in the registry."""
+        """Return ``image`` as this version pins it, or unchanged if it does not pin the image.
+
+        ``name`` is the image's name in the registry.
+        """
         return self.images[name].over(image) if name in self.images else image
 
 

@@ -124,10 +124,10 @@ class Proposals(FrozenModel):
 class Limits(CamelModel):
     """The sizes above which a demand is refused.
 
-    ``demand_items`` limits how many applications, connections, topics and requesters the demand
-    lists in total. ``parameter_bytes`` limits the parameters of an application, written as JSON.
-    ``file_bytes`` limits each file that the generator writes for the demand, because Kubernetes
-    stores no object above 1.5 MB.
+    ``demand_items`` limits how many things (applications, connections, topics, requesters and so
+    on) the demand lists in total. ``parameter_bytes`` limits the parameters of an application,
+    written as JSON. ``file_bytes`` limits each file that the generator writes for the demand,
+    because Kubernetes stores no object above 1.5 MB.
     """
 
     demand_items: Positive = 20_000

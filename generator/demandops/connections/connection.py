@@ -81,7 +81,8 @@ class Connection:
     def matches_listed(self, listed: object) -> bool:
         """Return whether a shutdown that lists ``listed`` means this connection.
 
-        An empty source, target or type in ``listed`` matches any value.
+        The caller has found that both have the same id. An empty source, target or type in
+        ``listed`` matches any value.
         """
         return (
             isinstance(listed, Connection)

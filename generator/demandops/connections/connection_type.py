@@ -100,9 +100,10 @@ class Client(ABC):
         return {}
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Yield (file, entry, what the entry decides) for each entry that affects the client.
+        """Yield (file, entry, what the entry decides) for entries that affect the client.
 
-        An entry is a part of a configuration file, such as a node.
+        An entry is a part of a configuration file, such as a broker. The client's node, access
+        domain and images are left out, because they affect every release.
         """
         file = config.entry_files.get(CLIENTS_FILE, {}).get(self.type.word)
         if file is not None:

@@ -72,7 +72,10 @@ def choose_type(connection: Connection, config: Config) -> ConnectionType | None
 
 
 def no_type_fault(connection: Connection, config: Config) -> Fault:
-    """Return a fault that says for each type why this type cannot carry a connection."""
+    """Return a fault that says for each type one reason why it cannot carry a connection.
+
+    No type may be able to carry the connection (:func:`choose_type`).
+    """
     reasons = []
     for kind in CONNECTION_TYPES:
         reason = next(type_faults(kind, connection, config))
@@ -115,7 +118,10 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
 def route_faults(
     kind: ConnectionType, topics: Iterable[Route], ends: tuple[str, str], config: Config
 ) -> Iterator[Fault]:
-    """Yield a fault for everything in a connection's routes that ``kind`` does not support."""
+    """Yield a fault for everything in a connection's routes that ``kind`` does not support.
+
+    ``ends`` are the source and the target. Topics whose names are not valid are left out.
+    """
     for index, route in enumerate(topics):
         if topic_problem(route.source) or topic_problem(route.target):
             continue  # the checks of the request report this topic

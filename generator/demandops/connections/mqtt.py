@@ -111,8 +111,10 @@ class Mqtt(ConnectionType):
             return None
         broker = choose_broker(connection, config)
         if broker is None:
-            message = f"connection '{key.id}' has no broker; add one to "
-            message += config.place_of(BROKERS_FILE)
+            message = (
+                f"connection '{key.id}' has no broker; add one on '{connection.target}' or "
+                f"'{connection.source}' to {config.place_of(BROKERS_FILE)}"
+            )
             raise Refused.at("broker", message, code=_NO_BROKER)
         channel = naming.object_name(self.word, key.id)
         if broker.topic_prefix:

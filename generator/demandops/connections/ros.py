@@ -65,8 +65,8 @@ class Ros(ConnectionType):
         if route.durability and not route.reliability:
             yield fault(
                 f"{where}.reliability",
-                f"is not given, but durability of '{route.source}' is set; ROS needs both, so "
-                "add reliability",
+                f"is not given, but durability of '{route.source}' is; the router takes durability "
+                "only with reliability, so add reliability",
             )
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:
@@ -185,7 +185,11 @@ class RosEnd(End):
         }
 
     def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return what a router reads only at its start: all but the list of topics."""
+        """Return what a router reads only at its start: all but ``allowlist``.
+
+        So a new topic restarts the router if it has QoS settings or is a reverse topic, because it
+        then needs an entry elsewhere too.
+        """
         return {name: value for name, value in configuration.items() if name != "allowlist"}
 
 

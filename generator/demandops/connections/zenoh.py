@@ -84,7 +84,10 @@ class Zenoh(ConnectionType):
         return ClientKey(self, source), ClientKey(self, target)
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Bridge | None:
-        """Return a node's bridge, the client of all its connections; ``None`` without topics."""
+        """Return a node's bridge, the client of all its Zenoh connections.
+
+        Return ``None`` if they carry no topic.
+        """
         publishers: dict[str, tuple[float, str]] = {}
         subscribers: set[str] = set()
         peers: dict[str, str] = {}
@@ -170,7 +173,7 @@ class Bridge(Client):
         return f"Zenoh bridge on {self.node.id}"
 
     def facts(self) -> list[str]:
-        """Return the bridge's connections, topics, rates and endpoints."""
+        """Return the bridge's connections, topics and rates, and the endpoints it connects to."""
         return [
             *(f"connection {id}" for id in self.connections),
             *(f"reads {topic}" for topic in self.publishers),

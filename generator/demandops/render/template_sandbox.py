@@ -33,6 +33,8 @@ from jinja2.runtime import Context, Undefined
 from jinja2.sandbox import ImmutableSandboxedEnvironment
 from jinja2.visitor import NodeTransformer
 
+from demandops.strict_yaml import not_writable
+
 MAX_STEPS = 1_000_000
 """How many steps a rendering may take: a few seconds of work.
 
@@ -107,8 +109,8 @@ def _size(value: object, *, data: bool = True) -> int:
     """Return the size of a value with all its parts. A part that occurs twice counts twice.
 
     Raise SecurityError if the value has too many parts. With ``data``, also raise it for an object
-    that is no text, number, true, false, null, list or mapping. Its text could contain a memory
-    address, which differs between machines.
+    that is no data, such as a method. Its text could contain a memory address, which differs
+    between machines.
     """
     if isinstance(value, str):
         return 1 + (len(value) >> 4)
@@ -130,10 +132,7 @@ def _size(value: object, *, data: bool = True) -> int:
             elif isinstance(part, range):
                 size += len(part)
             elif data and not isinstance(part, _PLAIN):
-                raise SecurityError(
-                    "a template may write only text, numbers, true, false, null, lists and "
-                    "mappings; if this is a method or a macro, add its parentheses, as in name()"
-                )
+                raise SecurityError(not_writable(part))
         if size + (text >> 4) > MAX_SIZE:
             raise SecurityError(f"a value is too large: it has more than {MAX_SIZE} parts")
     return size + (text >> 4)

@@ -104,8 +104,8 @@ def test_a_decommission_that_leaves_a_connection_without_a_broker_changes_nothin
     assert demandops("decommission", "edge", "--state-repo", bare) == (
         1,
         "",
-        "error: broker: connection 'vehicle01/edge' has no broker; add one to "
-        "inventory/brokers.yaml\n",
+        "error: broker: connection 'vehicle01/edge' has no broker; add one on 'station00' "
+        "or 'vehicle01' to inventory/brokers.yaml\n",
     )
     assert rig.tip(bare) == tip
 

@@ -159,6 +159,33 @@ def test_a_library_that_is_not_there_is_a_fault(path: str, old: str, new: str, t
 
 
 @pytest.mark.parametrize(
+    ("path", "old", "new", "told"),
+    [
+        (
+            "registry/charts.yaml",
+            "folder: appdefs/object-detection-fusion/charts/object-detection\n",
+            "folder: charts/object-detection\n",
+            "registry/charts.yaml: charts.object-detection.folder: 'charts/object-detection' is "
+            "not in appdefs/; move the chart there",
+        ),
+        (
+            METADATA,
+            "\nversion: 0.1.0",
+            "\n",
+            "registry/charts.yaml: charts.object-detection.version: is 0.1.0, but "
+            f"{METADATA} has no version; add it there",
+        ),
+    ],
+)
+def test_a_chart_that_does_not_fit_the_registry_is_a_fault(
+    path: str, old: str, new: str, told: str
+) -> None:
+    with pytest.raises(InvalidInput) as invalid:
+        load(configuration(edited(path, old, new)))
+    assert told in [str(fault) for fault in invalid.value.faults]
+
+
+@pytest.mark.parametrize(
     ("chart", "path", "value"),
     [
         ("object-detection", "replica", 1),

@@ -49,7 +49,7 @@ def test_a_file_names_each_cluster_and_how_it_is_reached(tmp_path: Path) -> None
 SIGNED = "clusters: {a: {receiver: 'http://h/hook', secret_file: SECRET}}\n"
 NO_FILE = "cannot be read: No such file or directory"
 FILL = "write the secret into this file"
-OPEN = "SECRET may be read by everybody on this machine; run chmod o= on it"
+OPEN = "SECRET is open to everybody on this machine; run chmod o= on it"
 
 
 @pytest.mark.parametrize(
@@ -58,12 +58,14 @@ OPEN = "SECRET may be read by everybody on this machine; run chmod o= on it"
         (None, None, 0, f"{NO_FILE}; check the path"),
         ("clusters: {a: {}}\n", None, 0, "clusters.a: needs a kubeconfig, a receiver or a webhook"),
         ("", None, 0, "clusters: is missing; add it"),
-        (SIGNED, None, 0, f"clusters.a.secret_file: SECRET {NO_FILE}; {FILL}"),
+        (SIGNED, None, 0,
+         f"clusters.a.secret_file: SECRET {NO_FILE}; {FILL}, and make it readable"),
         (SIGNED, "", 0o600, f"clusters.a.secret_file: SECRET is empty; {FILL}"),
         (SIGNED, " \r\n", 0o600, f"clusters.a.secret_file: SECRET is empty; {FILL}"),
         (SIGNED, "x", 0o644, f"clusters.a.secret_file: {OPEN}"),
         ('clusters: {a: {receiver: "http://h/hook", secret_file: "/\\0"}}\n', None, 0,
-         f"clusters.a.secret_file: /\\x00 cannot be read: embedded null byte; {FILL}"),
+         f"clusters.a.secret_file: /\\x00 cannot be read: embedded null byte; {FILL}, "
+         "and make it readable"),
         ("clusters: {a: {kubeconfig: /k, secret_file: /s}}\n", None, 0,
          "clusters.a: has a secret_file but no URL; add a receiver or a webhook"),
     ],

@@ -210,6 +210,22 @@ def test_a_domain_that_does_not_fit_is_a_fault(
     assert fault in str(raised.value)
 
 
+@pytest.mark.parametrize(
+    "domains",
+    [(FLEET, {**CITY, "nodes": ["edge"]}), ({**FLEET, "serviceAccount": 1}, CITY)],
+    ids=["the node is in two domains", "the node's domain is not valid"],
+)
+def test_a_fault_of_the_domains_is_not_told_as_one_of_the_node(domains: tuple[Any, ...]) -> None:
+    moved = (
+        "{apiVersion: demandops/v1, kind: Override, reason: r, owner: o, node: edge, "
+        "select: [{nodes: [cloud]}]}\n"
+    )
+    with pytest.raises(InvalidInput) as raised:
+        MemoryRepo(files([{"name": "city"}], *domains) | {"overrides/a.yaml": moved})
+    assert "no access domain has" not in str(raised.value)
+    assert "is not in any access domain" not in str(raised.value)
+
+
 def test_no_node_has_the_id_that_another_node_gets_in_a_further_domain() -> None:
     taken = {"id": "edge@city", "type": "edge", "cluster": "c-its", "selector": {"host": "other"}}
     given = files([{"name": "city"}])

@@ -71,8 +71,7 @@ APPENDED: dict[str, tuple[str, str]] = {
     "a division by nothing": ("x: {{ 1 / 0 }}\n", "zero"),
     "a value that YAML has no word for": (
         "x: {{ ''.join }}\n",
-        "a template may write only text, numbers, true, false, null, lists and mappings; if this "
-        "is a method or a macro, add its parentheses, as in name()",
+        "lists and mappings, but not a builtin_function_or_method; add '()' to call it",
     ),
     "a method that is not listed": (
         "x: {{ ''.swapcase() }}\n",

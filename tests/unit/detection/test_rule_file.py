@@ -139,8 +139,9 @@ def test_mistakes_of_sources_are_told_together() -> None:
         "rules.yaml:4: sources.a: must say at exactly one place where the name of the entity is: "
         "either write {entity} as a part of 'topic', or set 'entity' to the field of the message "
         "that has the name",
-        "rules.yaml:8: sources.b.topic: 'b/{entity}' is not a topic name that ROS 2 allows; use "
-        "letters, digits and '_', with a single '/' between parts; no part may start with a digit",
+        "rules.yaml:8: sources.b.topic: 'b/{entity}' is not a topic name that ROS 2 allows; begin "
+        "each part with a single '/', and write letters, digits and '_' after it, with no digit "
+        "first",
         "rules.yaml:9: sources.b.type: 'PoseStamped' is not a message type; write it like "
         "std_msgs/msg/String",
         "rules.yaml:11: sources.c.topic: has {entity} twice; name the entity once",

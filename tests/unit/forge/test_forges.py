@@ -118,7 +118,8 @@ Write = Callable[[Path], object]
     [
         (
             lambda path: None,
-            ": cannot be read: No such file or directory; write the secret into this file",
+            ": cannot be read: No such file or directory; write the secret into this file, and "
+            "make it readable",
         ),
         (lambda path: path.write_text("two\nlines"), " must hold a token: one line of plain text"),
         (lambda path: path.write_bytes(b"\xff\xfe"), " must hold a token: one line of plain text"),

@@ -51,7 +51,7 @@ class Service(Deployed):
 
     @property
     def is_movable(self) -> bool:
-        """Whether the service may run on another node than its application."""
+        """Whether an override may move the service to another node."""
         return not self.at_source and not self.nodes
 
     @property
@@ -79,7 +79,10 @@ Problem: TypeAlias = "tuple[str, str]"
 def resolved_services(
     appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
 ) -> tuple[Services, list[Problem]]:
-    """Return all services of an appdef and no problem, or no service and all problems."""
+    """Return all services of an appdef and no problem, or no service and the problems.
+
+    Problems that depend on mended ones are found only in a later call.
+    """
     services = {
         name: Service.model_construct(
             **{**dict(own), "inputs": _with_each(own)},

@@ -43,7 +43,7 @@ class Sizes(CamelModel):
         """Return the number of replicas for a parameter's value.
 
         For a list of sizes, return the number for the largest size. Return ``None`` if the value,
-        or an item of the list, is not a size.
+        or an item of the list, is not a size, or if the list is empty.
         """
         names = value if isinstance(value, list) else [value]
         known = [self.replicas[name] for name in names if name in [*self.replicas]]
@@ -125,7 +125,7 @@ class Scaling(CamelModel):
 
     @property
     def most(self) -> int:
-        """The highest number of replicas that the service may have."""
+        """The highest number of replicas that the service may have without an override."""
         if self.sizes:
             return max(self.sizes.replicas.values())
         return self.max if self.per or self.autoscaler else self.min

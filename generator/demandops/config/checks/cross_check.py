@@ -26,6 +26,7 @@ from demandops.config.config import (
 from demandops.config.config_reader import ConfigReader
 from demandops.config.node_property import comparable_kind, kind_of
 from demandops.config.override import Override, patched_settings
+from demandops.config.policy import matches
 from demandops.config.registry import ChartSource
 from demandops.connections import connection_types
 from demandops.errors import InvalidInput, suggestion
@@ -135,6 +136,8 @@ def _check_chart(
     text = config.files.get(path)
     if text is None:
         message = f"'{path}' does not exist; correct the folder"
+        if not path.startswith("appdefs/"):
+            message = f"'{chart.folder}' is not in appdefs/; move the chart there"
         reader.add_fault(file, f"{where}.folder", message)
         return
     try:
@@ -147,7 +150,9 @@ def _check_chart(
         reader.add_fault(
             file,
             f"{where}.version",
-            f"is {chart.version}, but {path} says {version}; make them equal",
+            f"is {chart.version}, but {path} has no version; add it there"
+            if version is None
+            else f"is {chart.version}, but {path} says {version}; make them equal",
         )
     reader.faults += chart_files.faults(chart.folder, config.files)
 
@@ -368,7 +373,10 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
             "its definition lists; change its definition, or remove 'node'"
         )
         reader.add_fault(override.path, "node", message)
-    if node in config.nodes and node not in config.domain_of and config.domains:
+    in_none = node not in config.domain_of and not any(
+        matches(node, domain.nodes) for domain in config.domains.values()
+    )
+    if node in config.nodes and in_none and config.domains and reader.is_complete(DOMAINS_FILE):
         message = f"'{node}' is not in any access domain; add it to one in "
         message += config.place_of(DOMAINS_FILE)
         reader.add_fault(override.path, "node", message)
