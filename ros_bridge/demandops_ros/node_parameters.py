@@ -60,7 +60,8 @@ def read(given: Mapping[str, str | None]) -> dict[str, Any]:
     A temporary node reads them, because the generator starts before the node.
 
     Args:
-        given: values that replace defaults; None and "" keep the default.
+        given: values that replace defaults; None and "" keep the default. A value in the ROS
+            arguments replaces both.
 
     Raises:
         click.UsageError: if a value is not valid.

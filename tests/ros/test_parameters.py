@@ -63,8 +63,9 @@ def told(folder: Path, text: str, **files: str) -> list[str]:
 
 
 REPLACED = [
-    f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; give "
-    "--clusters if the node shall not answer a goal before its releases are reconciled or healthy",
+    f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; if the "
+    "node shall not answer a goal before its releases are reconciled or healthy, give --clusters, "
+    "and set the parameter answer to one of them",
     f"parameter k3d_image_registry {UNUSED} set the field 'registry' to "
     "k3d-registry.localhost:41671 in registry/images.yaml, and give the images the names that they "
     "have in that registry (docs/migration.md)",
