@@ -136,7 +136,7 @@ class GoalSender:
         self._wait_until_discovered(deadline)
         handle, lost = self._send_until_heard(goal, on_feedback, deadline)
         if not handle.accepted:
-            message = "the node accepts no demands now (its log says why); send the demand later"
+            message = "the node did not accept the demand (its log says why); send it again later"
             raise DemandError("rejected", message)
         answer = self._await(handle.get_result_async(), deadline)
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost

@@ -271,8 +271,8 @@ class DemandNode(Node):  # type: ignore[misc]
         if isinstance(outcome, Unsound):  # send no answer: the process ends
             return
         level = goal.adapter.answer_level(goal.message) or self._level
-        if not isinstance(outcome, Receipt) or level == "pushed":
-            self._finish(goal, outcome)
+        if not isinstance(outcome, Receipt) or level == "pushed" or outcome.outcome == "waiting":
+            self._finish(goal, outcome)  # a waiting demand has no releases yet
             return
         status, problem = self._status, "this node has no access to the clusters"
         if status is not None:
