@@ -99,9 +99,10 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
             continue
         port, node = values.get(f"{name.removesuffix('host')}port"), match["node"]
         brokers = [broker for one, broker in config.brokers.items() if node in (None, one)]
-        if not any(is_host(broker, host, port) for broker in brokers):
+        if not any(is_host(one, host, one.port if port is None else port) for one in brokers):
             place = f"of node {quoted(node)} " if node else ""
+            address = host if port is None else f"{host}:{port}"
             yield (
                 f"parameter {name} of the reference is not used: the broker {place}at "
-                f"{host}:{port} is not in {config.place_of(BROKERS_FILE)}; add it there"
+                f"{address} is not in {config.place_of(BROKERS_FILE)}; add it there"
             )

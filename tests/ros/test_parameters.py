@@ -108,6 +108,14 @@ def test_what_the_state_repo_lacks_is_named(ros: None, tmp_path: Path) -> None:
     ]
 
 
+def test_a_broker_without_a_port_is_any_broker_of_the_host() -> None:
+    name = "connections.communication_broker.host"
+    config = load(configuration({}))
+    assert [*reference_parameters.warnings({name: "service-mqtt-broker-edge"}, config)] == []
+    (warning,) = reference_parameters.warnings({name: "elsewhere"}, config)
+    assert "the broker at elsewhere is not in inventory/brokers.yaml" in warning
+
+
 def test_the_parameters_of_an_older_file(ros: None, tmp_path: Path) -> None:
     assert told(tmp_path, OLDER) == [
         f"parameter helm_release_tag {UNUSED} the GitOps controller removes releases that are no "

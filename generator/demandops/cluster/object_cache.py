@@ -30,7 +30,10 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
 class ObjectCache:
-    """Caches the objects of one cluster that were passed to one of its methods."""
+    """Caches objects of one cluster.
+
+    These are the objects that :meth:`watch`, :meth:`read_once` or :meth:`refresh` was called for.
+    """
 
     def __init__(
         self,
@@ -113,7 +116,9 @@ class ObjectCache:
             self._read(selector)
 
     def pods(self, namespace: str, deployment: str) -> list[Any]:
-        """Read and return the pods of a Deployment; none if the Deployment is not in the cache.
+        """Read and return the pods of a Deployment.
+
+        The list is empty if the Deployment is not in the cache, or selects its pods without labels.
 
         Raises:
             Exception: from the library, if the cluster does not answer or refuses.
