@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import OrderedDict
 from collections.abc import Callable, Iterable
+from concurrent.futures import Future
 from typing import Any
 
 import rclpy
@@ -30,13 +31,18 @@ _ASK_AGAIN_S = 0.2
 _GOAL_KEPT_S = 10
 """How many seconds ROS keeps a goal that has ended."""
 _RESULT_S = 900
-"""How many seconds :class:`LastingResults` keeps a result after ROS has forgotten the goal."""
+"""How many seconds at least :class:`LastingResults` keeps a result that ROS has forgotten."""
 _MOST_RESULTS = 2_000
-"""How many results :class:`LastingResults` keeps; if there are more, it forgets the oldest."""
+"""How many results :class:`LastingResults` keeps; if there are more, it forgets the oldest ones,
+even before that time."""
 
 
 class DemandError(Exception):
-    """Raised when a demand fails. ``code`` tells programs the reason, such as ``unknown-node``."""
+    """Raised when a demand fails or gets no answer in time.
+
+    ``code`` tells programs the reason, such as ``unknown-node``. After ``timeout``, nobody knows
+    whether the demand is booked.
+    """
 
     def __init__(self, code: str, message: str) -> None:
         super().__init__(message)
@@ -118,16 +124,19 @@ class GoalSender:
         Raises:
             DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
                 answer came in time.
+            ValueError: if ROS cannot carry a text of the goal, because it is not Unicode.
         """
         deadline = REAL.monotonic() + self.timeout_s
         if not self._client.wait_for_server(timeout_sec=self.timeout_s):
             raise DemandError(
-                "no-server", f"no node serves {self._action_name}; start one with demandops serve"
+                "no-server",
+                f"no node in this ROS domain serves {self._action_name}; start one with demandops "
+                "serve, or correct the action's name or ROS_DOMAIN_ID",
             )
         self._wait_until_discovered(deadline)
         handle, lost = self._send_until_heard(goal, on_feedback, deadline)
         if not handle.accepted:
-            message = "the node accepts no demands now (its log says why); send the demand later"
+            message = "the node did not accept the demand (its log says why); send it again later"
             raise DemandError("rejected", message)
         answer = self._await(handle.get_result_async(), deadline)
         return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
@@ -149,7 +158,8 @@ class GoalSender:
         """Send a goal until a node responds; return its handle, and whether an attempt was lost.
 
         A response is lost if a new node replaced the old one and has not yet discovered this
-        client. Sending the goal again is harmless, because a demand that is put twice counts once.
+        client. Sending the goal again is harmless: a demand that is put twice counts once, and a
+        second release finds nothing to release.
         """
         lost = False
         while True:
@@ -173,21 +183,24 @@ class GoalSender:
         another thread sent the goal, a response could arrive between the two registrations. The
         response would then resolve only the first future, for which nobody waits.
         """
-        sent: list[Any] = []
+        sent: Future[Any] = Future()
         done = REAL.event()
 
         def send() -> None:
-            sent.append(
-                self._client.send_goal_async(
-                    goal, feedback_callback=lambda message: on_feedback(message.feedback)
+            try:
+                sent.set_result(
+                    self._client.send_goal_async(
+                        goal, feedback_callback=lambda message: on_feedback(message.feedback)
+                    )
                 )
-            )
+            except Exception as error:  # the caller must get it, not the executor
+                sent.set_exception(error)
             done.set()
 
         self._thread.call(send)
         if not done.wait(max(0.0, deadline - REAL.monotonic())):
             raise self._no_answer()
-        return sent[0]
+        return sent.result()
 
     def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
         done = REAL.event()
@@ -239,7 +252,7 @@ class LastingResults(ActionServer):  # type: ignore[misc]
 
 
 class OtherServers:
-    """Finds other nodes that serve the same actions as ``node``; logs when they come or go."""
+    """Finds other nodes that serve the same actions as ``node``."""
 
     def __init__(self, node: Node, actions: Iterable[str]) -> None:
         self._node = node
@@ -247,7 +260,10 @@ class OtherServers:
         self._found = {node.resolve_service_name(action): list[str]() for action in actions}
 
     def find(self) -> dict[str, list[str]]:
-        """Return, for each action, the names of the other nodes that serve it."""
+        """Return, for each action, the names of the other nodes that serve it; log changes.
+
+        A change is logged only here, so a node that comes and goes between two calls is not seen.
+        """
         for action, others in self._found.items():
             now = self._others(action)
             if now and now != others:

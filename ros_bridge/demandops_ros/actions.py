@@ -58,11 +58,17 @@ class DeploymentRequestAdapter:
         return DeploymentRequest.Feedback(message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return the result of a goal: ``<outcome>: <commit>``, or ``<code>: <field>: <remedy>``.
+        """Return the result of a goal, as lines of text.
+
+        After success, the first line is ``<outcome>: <commit>``. A line follows for each placed
+        application, each warning and each listed item that was not held. After a refusal, each
+        fault has a line ``<code>: <field>: <remedy>``. After another error, the line is
+        ``<code>: <reason>``; for a canceled goal, only the reason.
 
         Args:
             outcome: the receipt, or the error.
             reached: how far the demand's releases came: ``pushed``, ``reconciled`` or ``healthy``.
+                The results of ``DeploymentRequest`` do not contain it.
         """
         return DeploymentRequest.Result(message=_text(outcome))
 
@@ -89,9 +95,9 @@ class DemandAdapter(DeploymentRequestAdapter):
         return Demand.Feedback(stage=stage, message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return a result with a code and a text.
+        """Return a result with a code and, as its message, the text of the other adapter.
 
-        After success, the result also has the fields of the receipt.
+        After success, the result also has ``reached`` and fields of the receipt.
         """
         result = Demand.Result(code=_code(outcome), message=_text(outcome))
         if isinstance(outcome, Receipt):

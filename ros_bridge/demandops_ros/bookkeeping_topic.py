@@ -24,8 +24,8 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
     """Fill the response with the bookkeeping at the revision ``request.at``, and return it.
 
-    If ``request.at`` is empty, the revision is the newest commit. If the bookkeeping cannot be
-    computed, the response has the reason.
+    ``request.at`` may also be a time. If it is empty, the revision is the newest commit. If the
+    bookkeeping cannot be computed, the response has the reason.
     """
     try:
         snapshot = generator.snapshot_at(request.at) if request.at else generator.snapshot
@@ -53,10 +53,11 @@ _PAUSE_FACTOR = 20
 
 
 class BookkeepingTopic:
-    """Publishes the bookkeeping on the latched topic ``~/bookkeeping`` after each change.
+    """Publishes the bookkeeping on the latched topic ``~/bookkeeping``: at the start and on change.
 
     The larger the ledger, the longer it takes to compute the bookkeeping. So a separate thread
-    computes it, and then pauses for 20 times as long as the computation took.
+    computes it, and then pauses for 20 times as long as the computation took, at least a second.
+    Changes during a pause share one message.
     """
 
     def __init__(

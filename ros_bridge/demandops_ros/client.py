@@ -37,13 +37,18 @@ StageListener = Callable[[str, str], None]
 _RENEW_AFTER = 1 / 3
 """The fraction of a lease after which to renew it; two more attempts fit before the lease ends."""
 _RETRY_S = 5.0
+_PROBABLY_RELEASED = (
+    "the demand holds nothing; an earlier attempt to release it got no response, and has probably "
+    "released it"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class Answer:
     """The result of a goal.
 
-    ``outcome`` is booked, waiting, released or unchanged. ``lease_s`` is 0 without a lease.
+    ``outcome`` is booked, waiting, released or unchanged. ``commit`` is empty if only an earlier
+    attempt, which got no response, can have released the demand. ``lease_s`` is 0 without a lease.
     ``reached`` is pushed, reconciled or healthy.
     """
 
@@ -108,14 +113,19 @@ class DemandClient:
         Args:
             demand: the demand's id.
             applications, connections: as in a YAML document of the kind ``Demand``.
-            answer: the call returns once the change is ``pushed``, ``reconciled`` or ``healthy``.
-            lease: seconds, or a duration like ``10m``; by default the access domain's lease.
+            lease: seconds, which the node rounds up to whole ones, or a duration like ``10m``. With
+                None or 0, the access domain's lease, if it has one.
+            answer: the call returns once the change is ``pushed``, ``reconciled`` or ``healthy``. A
+                node without access to the clusters answers at ``pushed``, with a warning.
             request: free text for the commit.
             on_stage: called with each stage and its text.
 
         Raises:
-            DemandError: if the demand fails or no answer arrives in time.
-            ValueError, TypeError: for a field or a value that the message cannot carry.
+            DemandError: if the demand fails or no answer arrives in time. After the code
+                ``timeout``, nobody knows whether the demand is booked. After ``not-reconciled``
+                and ``not-healthy``, it is booked.
+            ValueError, TypeError, AssertionError, AttributeError, OverflowError: for a field or a
+                value that the message cannot carry.
         """
         data = {
             "demand": demand,
@@ -140,6 +150,8 @@ class DemandClient:
 
         Raises:
             DemandError: as in :meth:`put`; with the code ``not-held`` if the demand holds nothing.
+                But if an earlier attempt to send the release got no response, the call returns an
+                answer with a warning.
         """
         return self.send({"operation": "release", "demand": demand})
 
@@ -153,15 +165,16 @@ class DemandClient:
     def send(
         self, data: Mapping[str, Any], on_stage: StageListener = lambda stage, text: None
     ) -> Answer:
-        """Send a document of the kind ``Demand`` and return the answer; see :meth:`put`."""
+        """Send a document of the kind ``Demand`` and return the answer; see :meth:`put`.
+
+        If the document has no ``requesters``, those of the client are added.
+        """
         goal = demand_goal_from_data({"requesters": list(self.requesters), **data})
         succeeded, result, lost = self._sender.send(
             goal, lambda feedback: on_stage(feedback.stage, feedback.message)
         )
         if lost and result.code == "not-held" and goal.operation == Demand.Goal.OPERATION_RELEASE:
-            return Answer(
-                "released", "", 0.0, ("released by an attempt whose answer was lost",), "pushed"
-            )
+            return Answer("released", "", 0.0, (_PROBABLY_RELEASED,), "pushed")
         if not succeeded:
             raise DemandError(result.code or "aborted", result.message)
         lease_s = result.lease.sec + result.lease.nanosec / 1e9
@@ -170,7 +183,11 @@ class DemandClient:
 
 
 class HeldDemand:
-    """A demand that is put at the start of a block, renewed during it and released at its end."""
+    """A demand that is put at the start of a block, renewed during it and released at its end.
+
+    Only a demand with a lease is renewed. If it has ended all the same, it is put again.
+    ``answer`` and ``commit`` are those of the last put; before it, None and empty.
+    """
 
     def __init__(self, client: DemandClient, demand: str, put: Callable[[], Answer]) -> None:
         self.id = demand
@@ -182,14 +199,24 @@ class HeldDemand:
         self._renewer: Thread | None = None
 
     def __enter__(self) -> HeldDemand:
-        """Put the demand, start to renew its lease, and return this object."""
+        """Put the demand, start to renew its lease if it has one, and return this object.
+
+        Raises:
+            DemandError: as in :meth:`DemandClient.put`, and its other errors.
+        """
         lease_s = self._put_and_remember().lease_s
         if lease_s:
             self._renewer = REAL.keep_running("lease", partial(self._renew_until_over, lease_s))
         return self
 
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
-        """Release the demand."""
+        """Release the demand.
+
+        A failure is only logged if the block raised an error, or if the demand holds nothing.
+
+        Raises:
+            DemandError: otherwise, as in :meth:`DemandClient.release`.
+        """
         self._over.set()
         if self._renewer is not None:
             self._renewer.join()

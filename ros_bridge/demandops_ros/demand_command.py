@@ -80,7 +80,7 @@ def _read_document(file: str) -> dict[str, Any]:
     if not isinstance(data, dict) or data.get("kind") != "Demand":
         message = (
             "the file must be a mapping whose kind is Demand; "
-            "to send a DeploymentRequest, use demandops request"
+            "to book a DeploymentRequest, use demandops request, which needs no node"
         )
         raise InvalidInput([fault("kind", message).within(name)])
     return data
@@ -105,7 +105,8 @@ def _print_answer(answer: Answer, output: str) -> None:
         )
         return
     lease = f", for {duration_text(answer.lease_s)} unless renewed" if answer.lease_s else ""
-    console().print(f"{answer.outcome} in {answer.commit}{lease}")
+    commit = f" in {answer.commit}" if answer.commit else ""
+    console().print(f"{answer.outcome}{commit}{lease}")
     for warning in answer.warnings:
         errors.print(f"warning: {warning}")
 

@@ -83,21 +83,22 @@ def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return the ``Demand.Goal`` for a document of the kind ``Demand``.
 
     Raises:
-        ValueError: for an unknown field or word.
-        TypeError, AssertionError, AttributeError, OverflowError: for a value of the wrong type.
+        ValueError: for an unknown field or word, or a lease that is no duration.
+        TypeError, AssertionError, AttributeError, OverflowError: for a value of the wrong type, or
+            a number that is too large.
     """
     more = {"apiVersion", "kind", "lease", "operation", "answer"}
     more |= {"applications", "connections", "positions"}
-    goal = DemandMessage.Goal(**_fields(data, _DEMAND, more, "a demand"))
+    goal = _message(DemandMessage.Goal, **_fields(data, _DEMAND, more, "a demand"))
     goal.operation = _number(_OPERATIONS, data.get("operation", "put"), "operation")
     goal.answer = _number(ANSWER_LEVELS, data.get("answer", "pushed"), "answer")
     lease = data.get("lease") or 0
     seconds = seconds_of(lease) if isinstance(lease, str) else lease
-    goal.lease = Duration(sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
+    goal.lease = _message(Duration, sec=int(seconds), nanosec=int(seconds % 1 * 1e9))
     goal.applications = [_application_message(app) for app in data.get("applications", ())]
     goal.connections = [_connection_message(item) for item in data.get("connections", ())]
     goal.positions = [
-        messages.Position(**_fields(position, _POSITION, set(), "a position"))
+        _message(messages.Position, **_fields(position, _POSITION, set(), "a position"))
         for position in data.get("positions", ())
     ]
     return goal
@@ -122,20 +123,24 @@ def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     others = {"inputs", "parameters", "parameters_json", "connect", "place", "deliver", "services"}
     values = {name: json.dumps(value) for name, value in data.get("parameters", {}).items()}
     values |= data.get("parameters_json", {})
-    return messages.Application(
+    return _message(
+        messages.Application,
         **_fields(data, _APPLICATION, others, "an application"),
         **_fields(data.get("place", {}), _PLACE, set(), "a place"),
         services=[f"{name}={node}" for name, node in data.get("services", {}).items()],
         deliver=[
-            messages.Delivery(**_fields(delivery, _DELIVERY, set(), "a delivery"))
+            _message(messages.Delivery, **_fields(delivery, _DELIVERY, set(), "a delivery"))
             for delivery in data.get("deliver", ())
         ],
         inputs=[
-            messages.Input(role=role, **_fields(topic, _INPUT, set(), "an input"))
+            _message(messages.Input, role=role, **_fields(topic, _INPUT, set(), "an input"))
             for role, topics in data.get("inputs", {}).items()
             for topic in topics
         ],
-        parameters=[messages.Parameter(name=name, value_json=v) for name, v in values.items()],
+        parameters=[
+            _message(messages.Parameter, name=name, value_json=text)
+            for name, text in values.items()
+        ],
         connect=_number(_TYPES, data.get("connect", "auto"), "connect"),
     )
 
@@ -160,8 +165,9 @@ def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
         fields = _fields(route, _ROUTE, set(), "a topic of a connection")
         if "rate" in fields:
             fields["rate"] = float(fields["rate"])
-        topics.append(messages.Route(**fields))
-    return messages.Connection(
+        topics.append(_message(messages.Route, **fields))
+    return _message(
+        messages.Connection,
         **_fields(data, _CONNECTION, {"type", "topics"}, "a connection"),
         type=_number(_TYPES[:-1], data.get("type", "auto"), "type"),
         topics=topics,
@@ -189,6 +195,24 @@ def _fields(
     return {field: data[name] for name, field in names.items() if name in data}
 
 
+def _message(kind: Any, **values: Any) -> Any:  # noqa: ANN401 - a generated class
+    message = _checking(kind())
+    for name, value in values.items():
+        setattr(message, name, value)
+    return message
+
+
+def _checking(message: Any) -> Any:  # noqa: ANN401
+    """Make a message check the values that are assigned to it, and return it.
+
+    Messages may not check them by default. A value of a wrong type then ends the process when the
+    message is sent.
+    """
+    if hasattr(message, "_check_fields"):
+        message._check_fields = True
+    return message
+
+
 def _number(words: tuple[str, ...], word: str, field: str) -> int:
     if word not in words:
         raise ValueError(f"{field}: '{word}' is not one of {', '.join(words)}")
@@ -204,8 +228,9 @@ def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
 
     Raises:
         AttributeError: for a field that the message does not have.
-        AssertionError, TypeError: for a value of the wrong type.
+        AssertionError, TypeError, AttributeError: for a value of the wrong type.
     """
+    _checking(message)
     types = message.get_fields_and_field_types()
     for name, value in data.items():
         if name not in types:

@@ -223,7 +223,10 @@ class DemandNode(Node):  # type: ignore[misc]
             )
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """Withdraw the demand of a goal; reject the cancellation if the demand is committed."""
+        """Withdraw the demand of a goal; reject the cancellation if it is too late.
+
+        It is too late once the demand is committed or answered.
+        """
         goal = self._goals.get(id(handle.request))
         if goal is not None and self._generator.withdraw(goal.ticket.operation):
             return CancelResponse.ACCEPT
@@ -268,8 +271,8 @@ class DemandNode(Node):  # type: ignore[misc]
         if isinstance(outcome, Unsound):  # send no answer: the process ends
             return
         level = goal.adapter.answer_level(goal.message) or self._level
-        if not isinstance(outcome, Receipt) or level == "pushed":
-            self._finish(goal, outcome)
+        if not isinstance(outcome, Receipt) or level == "pushed" or outcome.outcome == "waiting":
+            self._finish(goal, outcome)  # a waiting demand has no releases yet
             return
         status, problem = self._status, "this node has no access to the clusters"
         if status is not None:
@@ -288,7 +291,7 @@ class DemandNode(Node):  # type: ignore[misc]
             self._finish(goal, receipt, level)
             return
         prefix = f"{health.object}: " if health.object else ""
-        message = f"{prefix}{health.reason}; the demand is booked in {receipt.commit}"
+        message = f"{prefix}{health.reason}; the demand is {receipt.outcome} in {receipt.commit}"
         self._finish(goal, NotReached(level, message))
 
     def _finish(

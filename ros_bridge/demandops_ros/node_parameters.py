@@ -39,8 +39,9 @@ _DESCRIPTIONS = {
     "answer": "When a DeploymentRequest is answered.",
     "answer_timeout": "How many seconds a goal may take to be reconciled or healthy.",
     "state_repo": "Folder or URL of the state repo.",
-    "fetch_interval": "How often people's commits are fetched while no demand comes; 0 for never.",
-    "requester_queue_limit": "How many demands of one requester may be queued; more are refused.",
+    "fetch_interval": "How often people's commits are fetched while no demand comes; 0 for no "
+    "interval.",
+    "requester_queue_limit": "How many demands of one requester may be queued; more are rejected.",
     "log_level": "Lowest level of messages in the log.",
 }
 
@@ -60,7 +61,8 @@ def read(given: Mapping[str, str | None]) -> dict[str, Any]:
     A temporary node reads them, because the generator starts before the node.
 
     Args:
-        given: values that replace defaults; None and "" keep the default.
+        given: values that replace defaults; None and "" keep the default. A value in the ROS
+            arguments replaces both.
 
     Raises:
         click.UsageError: if a value is not valid.

@@ -1,9 +1,9 @@
-"""Reads the parameters of the reference's node, and warns about those without effect.
+"""Reads the parameters of the reference's node, and warns about those to act on.
 
 A fleet may start our node with the parameter file of the reference's node. The file calls that node
 ``application_manager``. Our node takes the action's name from the file. Brokers, topics and
 namespaces come from the state repo. If the file names a broker, a topic or a namespace that the
-state repo lacks, the node warns.
+state repo lacks, the node warns. It also warns about parameters that it replaces by other means.
 """
 
 from __future__ import annotations
@@ -23,8 +23,9 @@ _RENAMES = re.compile(r".*__(node|name):=.*")
 _BROKER = re.compile(r"connections\.communication_broker(_params\.(?P<node>.+))?\.host")
 
 _REPLACED = {
-    "cluster_config": "a GitOps controller applies what is committed; give --clusters if the node "
-    "shall not answer a goal before its releases are reconciled or healthy",
+    "cluster_config": "a GitOps controller applies what is committed; if the node shall not "
+    "answer a goal before its releases are reconciled or healthy, give --clusters, and set the "
+    "parameter answer to one of them",
     "helm_release_tag": "the GitOps controller removes releases that are no longer demanded",
     "url_application_registry": "registry/charts.yaml names where each chart comes from",
     "applications": "values of services are in the application definitions, appdefs/",
@@ -55,9 +56,10 @@ def read(ros_args: Sequence[str]) -> dict[str, Any]:
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
-    """Yield a warning for each parameter in ``values`` that has no effect.
+    """Yield a warning for each parameter in ``values`` that our node replaces by other means.
 
-    The warning says what replaces the parameter.
+    The parameters of namespace, image registry, brokers and topics get a warning only if the state
+    repo lacks their value. The warning says what replaces the parameter, or what to add.
     """
     for name in dict.fromkeys(each.partition(".")[0] for each in values):
         if name in _REPLACED:
@@ -97,9 +99,10 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
             continue
         port, node = values.get(f"{name.removesuffix('host')}port"), match["node"]
         brokers = [broker for one, broker in config.brokers.items() if node in (None, one)]
-        if not any(is_host(broker, host, port) for broker in brokers):
+        if not any(is_host(one, host, one.port if port is None else port) for one in brokers):
             place = f"of node {quoted(node)} " if node else ""
+            address = host if port is None else f"{host}:{port}"
             yield (
                 f"parameter {name} of the reference is not used: the broker {place}at "
-                f"{host}:{port} is not in {config.place_of(BROKERS_FILE)}; add it there"
+                f"{address} is not in {config.place_of(BROKERS_FILE)}; add it there"
             )

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import click
 import rclpy
-from demandops.quoting import OneLineFormatter
+from demandops.quoting import OneLineFormatter, one_line
 from demandops.runtime import REAL
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
@@ -45,7 +45,7 @@ class ExecutorThread:
         self._executor.create_task(callback)
 
     def close(self) -> None:
-        """End the thread, so that the node may be destroyed.
+        """End the thread, so that the node may be destroyed; wait up to 20 s for a callback.
 
         A second call does nothing.
         """
@@ -113,7 +113,8 @@ def started(
     """Run the block with ROS initialized from ``arguments``, and yield the arguments as a list.
 
     Raises:
-        click.UsageError: if ``arguments`` begin with anything but ``--ros-args``.
+        click.UsageError: if ``arguments`` begin with anything but ``--ros-args``, or ROS refuses
+            them.
     """
     ros_args = list(arguments)
     if ros_args and ros_args[0] != "--ros-args":
@@ -123,7 +124,14 @@ def started(
     if not (os.environ.get("HOME") or os.environ.get("ROS_LOG_DIR")):
         # ROS's log library does not start in a container without a home folder
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
-    rclpy.init(args=["demandops", *ros_args], signal_handler_options=signals)
+    try:
+        rclpy.init(args=["demandops", *ros_args], signal_handler_options=signals)
+    except Exception as error:  # rclpy raises errors of many kinds
+        if not ros_args:
+            raise
+        raise click.UsageError(
+            f"ROS does not start with the arguments after --ros-args: {one_line(str(error))}"
+        ) from None
     try:
         yield ros_args
     finally:

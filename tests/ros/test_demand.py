@@ -17,7 +17,8 @@ import yaml
 from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
-from demandops_ros import DemandClient, DemandError
+from demandops_ros import Answer, DemandClient, DemandError
+from demandops_ros.demand_command import _print_answer
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
@@ -110,6 +111,8 @@ def test_a_refusal_names_code_field_and_remedy(
         ValueError, match="'node_id' is not a field of an application; did you mean"
     ):
         vehicle.put("refused", [{"node_id": "edge"}])
+    with pytest.raises(ValueError, match="surrogates not allowed"):
+        vehicle.put("refused \ud800")
     assert tip(shared.state_repo) == before
     assert vehicle.put("refused", connections=[link("refused")]).outcome == "booked"
     assert shared.bookkeeping()["connections"]["refused"]["topics"] == {
@@ -249,6 +252,12 @@ def test_the_command_line_sends_holds_and_gives_up(
     assert sent.json()["outcome"] == "booked"
     assert demandops("demand", file).out.startswith("unchanged in ")
     assert demandops("demand", file, "--release").out.startswith("released in ")
+    file.write_text(yaml.safe_dump(document | {"request": 5}))
+    wrong = demandops("demand", file)
+    assert wrong.code == 1
+    fault = "is not a demand: The 'request_id' field must be of type 'str'"
+    assert wrong.err == f"error: {file}: {fault}\n"
+    file.write_text(yaml.safe_dump(document))
     gone = demandops("demand", file, "--release", "--output", "json")
     assert [each["code"] for each in gone.json()["faults"]] == ["not-held"]
     assert gone.code == 1 and "not-held: demand: 'typed' holds nothing" in gone.err
@@ -266,6 +275,11 @@ def test_the_command_line_sends_holds_and_gives_up(
     assert holding.returncode == 0, err
     assert out.startswith("booked in ") and err.endswith("released\n")
     assert operations(shared, before) == [*held, "release"]
+
+
+def test_an_answer_without_a_commit_names_none(capfd: pytest.CaptureFixture[str]) -> None:
+    _print_answer(Answer("released", "", 0.0, ("probably",), "pushed"), "text")
+    assert capfd.readouterr() == ("released\n", "warning: probably\n")
 
 
 def test_a_requester_without_permission_is_refused_with_the_rule(shared: Served) -> None:

@@ -117,6 +117,38 @@ def test_the_bookkeeping_is_a_service() -> None:
     )
 
 
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"demand": 5},
+        {"priority": 2**31},
+        {"lease": 2**31},
+        {"requesters": [1]},
+        {"applications": [{"id": 3}]},
+        {"applications": [{"inputs": {"points": [{"topic": 1}]}}]},
+        {"connections": [{"topics": [{"qos": -1}]}]},
+        {"positions": [{"x": "far"}]},
+    ],
+)
+def test_a_value_that_a_demand_cannot_carry_is_refused_before_it_is_sent(
+    wrong: dict[str, Any],
+) -> None:
+    """Without the refusal, the value ends the process that sends it."""
+    from demandops_ros.messages import demand_goal_from_data
+
+    with pytest.raises(AssertionError, match="field must be"):
+        demand_goal_from_data(wrong)
+
+
+@pytest.mark.parametrize("wrong", [{"id": 5}, {"apps": [{"header": {"id": 5}}]}])
+def test_a_value_that_a_deployment_request_cannot_carry_is_refused(wrong: dict[str, Any]) -> None:
+    from application_manager_interfaces.action import DeploymentRequest
+    from demandops_ros.messages import fill_message
+
+    with pytest.raises(AssertionError, match="field must be"):
+        fill_message(DeploymentRequest.Goal(), wrong)
+
+
 # The round trip
 
 

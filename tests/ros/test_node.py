@@ -11,16 +11,22 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import rclpy
 from action_msgs.msg import GoalStatusArray
 from builtin_interfaces.msg import Time
+from demandops.cluster.health.release_health import Health
 from demandops.quoting import is_visible
+from demandops.service import Receipt
 from demandops.settings import DEFAULT_ACTION_NAME
 from demandops_interfaces.srv import GetBookkeeping
+from demandops_ros.actions import DemandAdapter
+from demandops_ros.node import DemandNode
 from demandops_ros.ros_process import RosLogHandler
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_action_status_default
@@ -84,6 +90,41 @@ def test_a_hostile_id_stands_on_one_line_in_result_and_log(shared: Served, calle
     told = [line for line in shared.log.read_text().splitlines() if "forged" in line]
     assert [line.count("goal 'a\\n[ERROR] forged") for line in told] == [1]
     assert is_visible(told[0]) and len(told[0]) < 5000
+
+
+@dataclass
+class Answers:
+    """What a node's methods need to answer a goal; it keeps the answers."""
+
+    _level: str = "healthy"
+    _status: Any = None
+    given: list[Any] = field(default_factory=list)
+
+    def _finish(self, goal: Any, outcome: Any, reached: str = "pushed") -> None:
+        self.given.append((outcome, reached))
+
+
+def goal_of_a_demand() -> Any:
+    adapter = DemandAdapter()
+    return SimpleNamespace(adapter=adapter, message=adapter.action.Goal(answer=2))
+
+
+def test_a_waiting_demand_reaches_no_more_than_pushed() -> None:
+    answers, receipt = Answers(_status=object()), Receipt("o", "d", "waiting", "a commit")
+    DemandNode._answer(answers, goal_of_a_demand(), receipt)  # type: ignore[arg-type]
+    assert answers.given == [(receipt, "pushed")]
+
+
+@pytest.mark.parametrize("outcome", ["booked", "released"])
+def test_a_level_that_is_not_reached_is_reported_with_what_became_of_the_demand(
+    outcome: Any,
+) -> None:
+    answers, receipt = Answers(), Receipt("o", "d", outcome, "a commit")
+    health = Health("reconciled", "is still being removed", "Deployment ns/one")
+    DemandNode._answer_rollout(answers, receipt, "healthy", goal_of_a_demand(), health)  # type: ignore[arg-type]
+    ((error, _),) = answers.given
+    told = f"Deployment ns/one: is still being removed; the demand is {outcome} in a commit"
+    assert (error.level, str(error)) == ("healthy", told)
 
 
 def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> None:

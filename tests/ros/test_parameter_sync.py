@@ -122,7 +122,7 @@ def test_a_node_follows_without_a_restart_and_after_one(
     client.wait(lambda: f"{fault}; {TARGET} keeps its parameters" in log.read_text())
     for value in ("9223372036854775808", "[-9223372036854775809]"):
         cluster.hold(text=f"of_edge_fusion: {{ros__parameters: {{length: {value}}}}}")
-        fault = f"parameter length: '{value.strip('[]')}' is too large for ROS"
+        fault = f"parameter length: '{value.strip('[]')}' is out of ROS's range"
         client.wait(lambda fault=fault: fault in log.read_text())
     cluster.hold("")
     client.wait(lambda: read_by_the_fusion(client) == set())

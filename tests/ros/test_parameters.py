@@ -63,8 +63,9 @@ def told(folder: Path, text: str, **files: str) -> list[str]:
 
 
 REPLACED = [
-    f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; give "
-    "--clusters if the node shall not answer a goal before its releases are reconciled or healthy",
+    f"parameter cluster_config {UNUSED} a GitOps controller applies what is committed; if the "
+    "node shall not answer a goal before its releases are reconciled or healthy, give --clusters, "
+    "and set the parameter answer to one of them",
     f"parameter k3d_image_registry {UNUSED} set the field 'registry' to "
     "k3d-registry.localhost:41671 in registry/images.yaml, and give the images the names that they "
     "have in that registry (docs/migration.md)",
@@ -105,6 +106,14 @@ def test_what_the_state_repo_lacks_is_named(ros: None, tmp_path: Path) -> None:
         f"parameter connections.communication_broker_params.edge.host {UNUSED} the broker of node "
         "'edge' at service-mqtt-broker-edge:1994 is not in inventory/brokers.yaml; add it there",
     ]
+
+
+def test_a_broker_without_a_port_is_any_broker_of_the_host() -> None:
+    name = "connections.communication_broker.host"
+    config = load(configuration({}))
+    assert [*reference_parameters.warnings({name: "service-mqtt-broker-edge"}, config)] == []
+    (warning,) = reference_parameters.warnings({name: "elsewhere"}, config)
+    assert "the broker at elsewhere is not in inventory/brokers.yaml" in warning
 
 
 def test_the_parameters_of_an_older_file(ros: None, tmp_path: Path) -> None:

@@ -12,6 +12,9 @@ from xml.etree import ElementTree
 import numpy
 import pytest
 import yaml
+from demandops.detection.rules import rule_file
+from demandops_ros.detector.recorded_bag import REST_OF_BAG
+from demandops_ros.detector.replay import Replay, show
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
@@ -159,3 +162,15 @@ def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
         "has no topic that the rules read: /cars/{entity}/pose (geometry_msgs/msg/PoseStamped); "
         "it has /vehicles/tram/pose (std_msgs/msg/String), "
     )
+
+
+def test_a_damaged_end_of_a_bag_is_told_without_a_count(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    file = rule_file.read(RULES.read_text(), str(RULES))
+    lost = {(REST_OF_BAG, "cannot be read: damaged"): 1, ("/a", "cannot be decoded"): 2}
+    show(Replay("bag", file, (0.0, 1.0), ["/a"], left_out=lost), "json")
+    assert capfd.readouterr().err.splitlines() == [
+        "warning: the rest of the bag is left out: cannot be read: damaged",
+        "warning: /a: 2 messages are left out: cannot be decoded",
+    ]

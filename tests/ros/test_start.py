@@ -33,6 +33,11 @@ LOG_LEVEL = "parameter log_level is 'loud'; it takes debug, info, warn, error, f
         (["--ros-args", "-p", "fetch_interval:=-3"], 2, "fetch interval: '-3' is not a duration"),
         (["--ros-args", "-p", "log_level:=loud"], 2, LOG_LEVEL),
         (
+            ["--ros-args", "-p", "log_level"],
+            2,
+            "ROS does not start with the arguments after --ros-args: failed to initialize rcl",
+        ),
+        (
             ["--ros-args", "-p", "answer_timeout:=120"],
             2,
             "Trying to set parameter 'answer_timeout' to '120' of type 'INTEGER', expecting type",

@@ -55,15 +55,16 @@ class ClusterAccess(FrozenModel):
         Each call reads the file again, so that the secret can be replaced.
 
         Raises:
-            InvalidInput: if the file is empty, cannot be read, or can be read by other users.
+            InvalidInput: if the file is empty, cannot be read, or can be read by everybody on this
+                machine.
         """
         return read_secret(self.secret_file, private=True) if self.secret_file else None
 
     def api(self) -> Any:  # noqa: ANN401 - the library has no types
-        """Return the cluster's API for objects of any kind.
+        """Return the cluster's API for objects of any kind. The access must have a kubeconfig.
 
         Raises:
-            ConfigException, OSError: from the library, if the kubeconfig cannot be used.
+            Exception: of any kind, from the library, if the kubeconfig cannot be used.
         """
         from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
 
@@ -107,7 +108,8 @@ def read(path: Path) -> AccessFile:
     """Return the content of the operator's file.
 
     Raises:
-        InvalidInput: with all faults of the file and of the secrets that it names.
+        InvalidInput: with all faults of the file. If it has none, with those of the secrets that it
+            names.
     """
     name, text = read_input(path)
     with located_in(text):

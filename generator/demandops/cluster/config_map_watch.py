@@ -1,4 +1,4 @@
-"""Watches one ConfigMap, and passes on its data: once at the start, and after each change."""
+"""Watches one ConfigMap, and passes on its data: as soon as it exists, and when the data change."""
 
 from __future__ import annotations
 
@@ -78,7 +78,8 @@ class ConfigMapWatch:
         for item in listed.items:
             self._take(item)
         if not listed.items:
-            self._tell("does not exist yet")
+            is_new = self._data is None
+            self._tell("does not exist yet" if is_new else "is gone; its last data stay valid")
         for event in watch.Watch().stream(
             read,
             **self._request,
@@ -108,7 +109,7 @@ class ConfigMapWatch:
 
 def _client(kubeconfig: Path | None) -> Any:  # noqa: ANN401 - the library has no types
     if kubeconfig is None:
-        return own_cluster_api("--kubeconfig").api_client
+        return own_cluster_api("without --kubeconfig").api_client
     try:
         return ClusterAccess(kubeconfig=kubeconfig).api().api_client
     except Exception as error:  # the library raises errors of many kinds

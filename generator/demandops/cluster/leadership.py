@@ -46,8 +46,8 @@ class Leadership:
     ) -> None:
         """Start to compete for the Lease.
 
-        A leader that cannot renew the Lease raises :class:`Unsound` in its thread, because another
-        process becomes the leader soon.
+        A leader that cannot renew the Lease, or has lost it, raises :class:`Unsound` in its thread,
+        because another process is the leader soon or already.
 
         Args:
             lease: the Lease's namespace and name, with a slash between. The Lease must exist.
@@ -136,7 +136,8 @@ class Leadership:
 
     def _require_renewed(self) -> None:
         if self.is_leader and self._runtime.monotonic() - self._renewed >= _RENEW_WITHIN_S:
-            self._end(f"was not renewed for {_RENEW_WITHIN_S} s ({self._told})")
+            why = f" ({self._told})" if self._told else ""  # empty if this process was suspended
+            self._end(f"was not renewed for {_RENEW_WITHIN_S} s{why}")
 
     def _read(self) -> dict[str, Any]:
         lease: dict[str, Any] = self._api.get_namespaced_custom_object(

@@ -30,7 +30,10 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
 class ObjectCache:
-    """Caches objects of one cluster: those passed to :meth:`watch` or :meth:`read_once`."""
+    """Caches objects of one cluster.
+
+    These are the objects that :meth:`watch`, :meth:`read_once` or :meth:`refresh` was called for.
+    """
 
     def __init__(
         self,
@@ -107,7 +110,7 @@ class ObjectCache:
         behind each other.
 
         Raises:
-            Exception: from the library, if the cluster does not answer.
+            Exception: from the library, if the cluster does not answer or refuses.
         """
         for selector in wanted:
             self._read(selector)
@@ -115,13 +118,17 @@ class ObjectCache:
     def pods(self, namespace: str, deployment: str) -> list[Any]:
         """Read and return the pods of a Deployment.
 
+        The list is empty if the Deployment is not in the cache, or selects its pods without labels.
+
         Raises:
-            Exception: from the library, if the cluster does not answer.
+            Exception: from the library, if the cluster does not answer or refuses.
         """
         from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
 
         item = self.objects().get(("Deployment", namespace, deployment)) or {}
         labels = ((item.get("spec") or {}).get("selector") or {}).get("matchLabels") or {}
+        if not labels:  # an empty selector would select all pods of the namespace
+            return []
         listed = client.CoreV1Api(self._api().api_client).list_namespaced_pod(
             namespace,
             label_selector=",".join(f"{key}={value}" for key, value in labels.items()),

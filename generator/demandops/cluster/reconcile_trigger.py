@@ -1,11 +1,12 @@
 """Wakes Flux or Argo CD after a push, so that it fetches at once and not at its next interval.
 
-Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure,
-and the controller fetches at its next interval.
+Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure
+and tries again for a minute. After that, the controller fetches at its next interval.
 
-Flux is woken only while it is idle. If kustomize-controller 1.9 begins a second reconciliation
-right after the first, the second may read the status from before the first. Kustomize-controller
-then forgets which objects the first reconciliation created, and never removes them.
+While Flux is known to be busy, it is not woken, but for a minute at most. If kustomize-controller
+1.9 begins a second reconciliation right after the first, the second may read the status from before
+the first. Kustomize-controller then forgets which objects the first reconciliation created, and
+never removes them.
 """
 
 from __future__ import annotations
@@ -118,7 +119,7 @@ class ReconcileTrigger:
         self._changed.set()
 
     def close(self) -> None:
-        """Make the calls that are still due for the last push, and stop.
+        """Make the calls for the last push that have not been tried yet, and stop.
 
         If Flux stays busy for five seconds, it is not woken, and fetches at its next interval.
         """
@@ -203,7 +204,7 @@ class ReconcileTrigger:
     def _try(self, wake: _Wake) -> None:
         """Make the call. If it fails, plan another attempt; give up after about a minute.
 
-        Only the first failure is logged.
+        Only the first failure after a push is logged.
         """
         assert self._config is not None  # noqa: S101 - without a push there is no wake
         objects = self._caches[wake.cluster].objects() if wake.cluster in self._caches else {}

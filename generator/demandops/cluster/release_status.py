@@ -22,8 +22,8 @@ from demandops.cluster.object_cache import ObjectCache
 class ReleaseStatus:
     """The health of a release, as its cluster reports it.
 
-    ``seen`` is the commit that the cluster has applied. ``since`` is the time when the state last
-    changed. Both are empty if the cluster does not report them.
+    ``seen`` is the commit that the release's access domain has applied. ``since`` is the time when
+    the state last changed. Both are empty if the cluster does not report them.
     """
 
     health: Health
@@ -32,7 +32,10 @@ class ReleaseStatus:
 
     @property
     def state(self) -> State | Literal["unknown"]:
-        """The state of the release; ``unknown`` if the cluster reports nothing."""
+        """The state of the release; ``unknown`` without access to the cluster.
+
+        If the cluster cannot be read, the state is ``waiting``, and the reason says so.
+        """
         return self.health.state if self.seen or self.health.object else "unknown"
 
 
@@ -53,8 +56,8 @@ def statuses(
     """Return the status of each release at a commit, from the caches of the clusters.
 
     ``changed`` returns the paths in which two commits differ. If a cluster has applied only an
-    earlier commit, each release whose file is not among these paths counts as applied. So a new
-    commit does not hide the health of unchanged releases.
+    earlier commit and reports no failure to apply the new one, each release whose file is not among
+    these paths counts as applied. So a new commit does not hide the health of unchanged releases.
     """
     changed = cache(changed)
     known = _CachedHistory(history)

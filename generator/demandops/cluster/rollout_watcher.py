@@ -100,11 +100,11 @@ class RolloutWatcher:
             targets: the releases; :meth:`why_unreachable` must be empty for their domains.
             level: what the releases have to reach, such as ``healthy``.
             timeout: seconds after which the future is resolved, whatever the health is then.
-            on_progress: called with each new state, from the status thread.
+            on_progress: called with each new state or failure, from the status thread.
 
         Returns:
-            A future of the health. It is resolved when the health reaches ``level``, or after the
-            timeout. After the timeout, the health gives the reason why it is not at ``level``.
+            A future of the health. It is resolved when the health reaches ``level``, after the
+            timeout, or by :meth:`close`. If the health is not at ``level`` then, it says why.
         """
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))

@@ -75,8 +75,8 @@ class DemandSender:
         """Return the current counts and failures.
 
         Returns:
-            How many events have a demand, how many of these demands are still to be booked or
-            released, and the events whose last goal failed, each with the reason.
+            How many events want or hold a demand, how many of these demands are still to be booked
+            or released, and the events whose last goal failed, each with the reason.
         """
         with self._changed:
             return len(self._wanted), self._wanted.unanswered(), list(self._wanted.refusals())

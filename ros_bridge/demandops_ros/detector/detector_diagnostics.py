@@ -44,7 +44,7 @@ class DetectorDiagnostics:
         level, text = DiagnosticStatus.OK, "valid"
         if problems:
             level = DiagnosticStatus.WARN
-            text = "the changed file is invalid; the last valid rules are in effect"
+            text = "the file cannot be read or is invalid; the last valid rules are in effect"
         values = {"rules": str(len(detector.file.rules))}
         values |= {f"problem {at}": one for at, one in enumerate(problems, start=1)}
         return status("demandops_detector: rules", self._rules, level, text, values)
@@ -54,7 +54,7 @@ class DetectorDiagnostics:
     ) -> DiagnosticStatus:
         level, text = DiagnosticStatus.OK, "detecting"
         if not is_started:
-            level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping"
+            level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping or /clock"
         values = {
             "topics": str(topics.topics),
             "entities": str(detector.entities),

@@ -51,7 +51,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         """Start to watch.
 
         Args:
-            rules: the file of rules; if left out, the parameter ``rules`` names it.
+            rules: the file of rules; the parameter ``rules``, if it is set, replaces it.
 
         Raises:
             click.UsageError: if a parameter is not valid.
@@ -92,7 +92,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self.create_timer(1.0, self._report)
 
     def close(self) -> None:
-        """Stop the node. Its demands stay booked until their leases end.
+        """Stop the node. Its demands stay booked; those with a lease, until their leases end.
 
         If the node starts again in time, it continues with these demands.
         """
@@ -187,7 +187,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._detector.set_clock(jumped)
 
     def _reload_if_changed(self) -> None:
-        """If the file is invalid, log each new problem once and keep the last valid rules."""
+        """If the file is invalid, keep the last valid rules; log the problems if they changed."""
         try:
             _, text = read_input(self._path)
         except InvalidInput as error:
@@ -225,7 +225,8 @@ def _read_rules(path: Path) -> tuple[RuleFile, str]:
     """Return the rules in a file, and the file's text.
 
     Raises:
-        InvalidInput: with every fault, including message types that are not installed.
+        InvalidInput: with all faults of the file. If it has none, with all message types that are
+            not installed.
     """
     name, text = read_input(path)
     file = read(text, name)

@@ -30,13 +30,18 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     ),
     "settling_time": (
         10.0,
-        "After the start, an entity of a booked demand counts as gone if it stays unseen for this "
-        "many seconds, or for the timeout of its source if that is longer.",
+        "After the start or a change of the rules, an entity of a booked demand counts as gone if "
+        "it stays unseen for this many seconds, or for the timeout of its source if that is "
+        "longer.",
         (0.1, 3_600.0),
     ),
     "period": (0.1, "Seconds between two evaluations of received messages.", (0.01, 10.0)),
     "answer_timeout": (60.0, "How many seconds a goal may wait for its answer.", (1.0, 86_400.0)),
-    "log_level": ("info", "Lowest level of messages in the log: debug, info, warn, error.", None),
+    "log_level": (
+        "info",
+        "Lowest level of messages in the log: debug, info, warn, error or fatal.",
+        None,
+    ),
 }
 """Each parameter: its default, its description and, if it is a number, its range."""
 
@@ -48,7 +53,8 @@ def declare(node: Node, rules: str | None) -> dict[str, Any]:
 
     Args:
         node: the node.
-        rules: the file of rules that the command line names; None if it names none.
+        rules: the file of rules that the command line names; None if it names none. The parameter
+            ``rules``, if it is set, replaces it.
 
     Raises:
         click.UsageError: if a value is not valid.

@@ -15,13 +15,17 @@ from rosbags.highlevel import AnyReader
 from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
+REST_OF_BAG = "the rest of the bag"
+"""Stands for a topic in ``left_out``, because nobody knows how many messages could not be read."""
+
 
 class RecordedBag:
     """The messages that rules read from a bag.
 
     ``topics`` are the topics that the sources read. ``unread`` has the topics whose name matches a
     source but whose message type does not, each with its message type. ``left_out`` counts
-    unreadable messages by topic and reason.
+    unreadable messages by topic and reason; a message counts once for each source that reads it.
+    If the end of the bag is damaged, ``left_out`` also has :data:`REST_OF_BAG` with the count 1.
     """
 
     def __init__(self, path: Path, file: RuleFile) -> None:
@@ -53,9 +57,10 @@ class RecordedBag:
                     self.unread[connection.topic] = connection.msgtype
         if not self.topics:
             wanted = ", ".join(f"{one.topic} ({one.type})" for one in file.sources.values())
-            recorded = sorted({f"{one.topic} ({one.msgtype})" for one in self._reader.connections})
+            found = sorted({f"{one.topic} ({one.msgtype})" for one in self._reader.connections})
+            recorded = ", ".join(found) or "no topic"
             self.close()
-            message = f"has no topic that the rules read: {wanted}; it has {', '.join(recorded)}"
+            message = f"has no topic that the rules read: {wanted}; it has {recorded}"
             raise InvalidInput.at("", message, file=str(path))
 
     def close(self) -> None:
@@ -68,7 +73,10 @@ class RecordedBag:
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
-        """Yield an observation for each readable message, in the order of recording."""
+        """Yield an observation for each readable message and each source that reads it.
+
+        The observations have the order of recording.
+        """
         chosen = [one for one in self._reader.connections if one.id in self._sources]
         messages = self._reader.messages(connections=chosen)
         while True:
@@ -77,7 +85,7 @@ class RecordedBag:
             except StopIteration:
                 return
             except Exception as error:  # the rest of a damaged bag
-                self._leave_out("the rest of the bag", f"cannot be read: {error!r}")
+                self._leave_out(REST_OF_BAG, f"cannot be read: {error!r}")
                 return
             yield from self._read(connection, nanoseconds / 1e9, data)
 

@@ -16,7 +16,7 @@ from demandops.detection.events.detection_state import Event, Key, Observation
 from demandops.detection.rules.rule_demand import Goal
 from demandops.detection.rules.rule_file import RuleFile
 
-from demandops_ros.detector.recorded_bag import RecordedBag
+from demandops_ros.detector.recorded_bag import REST_OF_BAG, RecordedBag
 
 _TOGETHER = 1_000
 """How many messages the detector gets at a time; the number does not change the events."""
@@ -29,7 +29,8 @@ class Replay:
     """The events and demands that rules make from a bag.
 
     ``span`` has the times of the first and the last message. ``lasting`` has the events that have
-    not stopped at the end. ``tracks`` has each entity's path, for a plot.
+    not stopped at the end. ``tracks`` has each entity's path, for a plot. ``messages`` counts the
+    readable messages, each once for every source that reads it.
     """
 
     bag: str
@@ -78,7 +79,7 @@ def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
 
 
 def show(replay: Replay, output: str) -> None:
-    """Print the events, as a table or as JSON."""
+    """Print the events, as a table with a summary or as JSON, and warn of what was left out."""
     columns = [
         Column("Second"),
         Column("Change"),
@@ -105,7 +106,8 @@ def show(replay: Replay, output: str) -> None:
     )
     json_output.show(output, as_data(replay), [Table(columns, rows), summary])
     for (topic, why), count in replay.left_out.items():
-        errors.print(f"warning: {topic}: {count} messages are left out: {why}")
+        lost = " is" if topic == REST_OF_BAG else f": {count} messages are"
+        errors.print(f"warning: {topic}{lost} left out: {why}")
 
 
 def as_data(replay: Replay) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Draws a replay as a picture.
 
-The upper part of the picture is a map with tracks and areas. In the lower part, each event has a
-row that shows when the event lasted.
+The upper part of the picture is a map with tracks and areas. In the lower part, each event, up to
+the 200th, has a row that shows when the event lasted.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
 _QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
-"""A subscription is reliable if its publisher is. The queue is deep, because many entities may
-share a topic."""
+"""A subscription is reliable if all publishers that it finds are. The queue is deep, because many
+entities may share a topic."""
 
 
 def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class

@@ -42,7 +42,8 @@ class ParameterSetter:
         """Replace the parameters that the target must have; any thread may call this method.
 
         Raises:
-            TypeError, ValueError: if ROS has no type for a value; the message names the parameter.
+            TypeError, ValueError: if ROS has no type for a value, or a number is out of ROS's
+                range; the message names the parameter.
         """
         wanted = [_parameter(name, value).to_parameter_msg() for name, value in parameters.items()]
         with self._lock:
@@ -101,7 +102,7 @@ def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401
     for number in value if isinstance(value, list) else [value]:
         if isinstance(number, int) and not -_LARGEST - 1 <= number <= _LARGEST:
             raise ValueError(
-                f"parameter {name}: {quoted(str(number))} is too large for ROS; write a number "
+                f"parameter {name}: {quoted(str(number))} is out of ROS's range; write a number "
                 f"between {-_LARGEST - 1} and {_LARGEST}"
             )
     try:

@@ -81,7 +81,7 @@ FAILED = {"kind": "Application", "name": "od-edge", "status": "SyncFailed", "mes
 @pytest.mark.parametrize(
     ("found", "state", "reason", "failing"),
     [
-        (None, "waiting", "does not exist; apply bootstrap/", False),
+        (None, "waiting", "does not exist; apply bootstrap/c-its.yaml to the cluster", False),
         (over(), "waiting", "has not applied the commit yet", False),
         (over(sync="Synced", at="a"), "waiting", "has not applied the commit yet", False),
         (over(sync="Synced", at="b"), "reconciled", "", False),

@@ -40,7 +40,7 @@ def release(*conditions: Any, generation: int = 2, observed: int = 2) -> dict[st
 @pytest.mark.parametrize(
     ("found", "state", "reason", "failing"),
     [
-        (None, "waiting", "does not exist; apply bootstrap/", False),
+        (None, "waiting", "does not exist; apply bootstrap/c-its.yaml to the cluster", False),
         (kustomization("a", "a"), "waiting", "has not applied the commit yet", False),
         (kustomization("b", "b"), "reconciled", "", False),
         (kustomization("c", "c"), "reconciled", "", False),

@@ -189,6 +189,17 @@ def test_a_leader_that_cannot_renew_ends_before_another_leads(server: Server) ->
     )
 
 
+def test_a_leader_that_was_suspended_ends_without_a_reason(server: Server) -> None:
+    first = Process(server)
+    server.turns.sleep(1)
+    server.takes = lambda: 12
+    server.turns.sleep(30)
+    assert str(first.unsound) == (
+        "the Lease its/generator was not renewed for 10 s; another process may be the leader now, "
+        "so this one must start again"
+    )
+
+
 def test_a_leader_whose_lease_somebody_took_ends(server: Server) -> None:
     first = Process(server)
     server.turns.sleep(1)

@@ -67,6 +67,11 @@ def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
     assert read.why_unknown([DEPLOYMENTS]) == "some objects have not been read yet"
 
 
+def test_a_deployment_that_is_not_known_has_no_pods(api: Api) -> None:
+    assert store(api).pods("perception", "mqtt-edge") == []
+    assert api.asked == []
+
+
 def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:
     away = ClusterAccess(kubeconfig=kubeconfig(tmp_path, "http://127.0.0.1:1"))
     read = ObjectCache("away", away, lambda: None)

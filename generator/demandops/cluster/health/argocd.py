@@ -21,6 +21,7 @@ from demandops.cluster.health.release_health import (
     deployment_health,
     name_of,
 )
+from demandops.render.gitops.paths import bootstrap_path
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 _DETAILS = 3
@@ -48,7 +49,8 @@ class ArgoCd(HealthReader):
         name = name_of(self.follower(domain))
         app = objects.get(self.follower(domain))
         if app is None:
-            return Health("waiting", "does not exist; apply bootstrap/ to the cluster", name)
+            missing = f"does not exist; apply {bootstrap_path(domain.cluster)} to the cluster"
+            return Health("waiting", missing, name)
         if any(history.includes(revision, commit) for revision in _applied_commits(app)):
             return Health("reconciled")
         waiting = "has not applied the commit yet"

@@ -21,6 +21,7 @@ from demandops.cluster.health.release_health import (
     name_of,
     worst,
 )
+from demandops.render.gitops.paths import bootstrap_path
 
 REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
 """The annotation that makes a controller reconcile an object now."""
@@ -39,7 +40,10 @@ class Flux(HealthReader):
     service_kind = "HelmRelease"
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return all objects of Flux, and all Deployments, in the domain's namespace."""
+        """Return all Deployments and the objects of Flux that count, in the domain's namespace.
+
+        These are the Kustomizations, GitRepositories and HelmReleases.
+        """
         kinds = ("Kustomization", "GitRepository", "HelmRelease", "Deployment")
         return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
@@ -50,7 +54,8 @@ class Flux(HealthReader):
         kustomization = objects.get(self.follower(domain))
         name = name_of(self.follower(domain))
         if kustomization is None:
-            return Health("waiting", "does not exist; apply bootstrap/ to the cluster", name)
+            missing = f"does not exist; apply {bootstrap_path(domain.cluster)} to the cluster"
+            return Health("waiting", missing, name)
         status = kustomization.get("status") or {}
         reached = _commit(status.get("lastAppliedRevision"))
         if reached and history.includes(reached, commit):

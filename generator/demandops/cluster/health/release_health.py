@@ -120,7 +120,7 @@ class HealthReader(ABC):
     def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
         """Return the objects to read again before a release counts as healthy.
 
-        The objects that represent services come first, then the Deployments that they own.
+        The objects that represent services come first, then all Deployments of the namespace.
         """
         kinds = (self.service_kind, "Deployment")
         return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
