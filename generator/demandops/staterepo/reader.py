@@ -257,7 +257,7 @@ class Reader:
         return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
-        """Return the path of a release's file; None if no commit up to ``revision`` has it.
+        """Return the path of a release's file; None if none was made up to ``revision``.
 
         If the release was stopped, return its last path.
         """
@@ -322,7 +322,7 @@ def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
     """Yield a reader of the state repo at an address, and close it after the block.
 
     The folder of a checkout is allowed only with ``only_read``. Raises StateRepoError if the state
-    repo cannot be read, also during the block.
+    repo cannot be read, also during the block, and Unsound if its disk fails.
     """
     try:
         with closing(Reader.of(address, only_read=only_read)) as reader:

@@ -74,6 +74,7 @@ class Signer:
 
 def _key_fault(key: Path, output: str) -> str:
     """Return the problem of a key and its remedy, from ssh-keygen's output."""
+    output = output.replace(str(key), "the key")  # the path may have any of the words below
     if "UNPROTECTED PRIVATE KEY" in output or "bad permissions" in output:
         return f"signing key {key} can be read by others; run: chmod 600 {key}"
     if "Permission denied" in output:

@@ -97,7 +97,7 @@ class Journal:
         self._unsound: Unsound | None = None
         self.pending = read(path)
         self._chain, self._size, self._limit, self._is_broken = "", 0, 0, True
-        with self._explained("start again"):
+        with self._explained("try again"):
             self._file = path.open("ab", buffering=0)
             self._rewrite()
 
