@@ -264,7 +264,10 @@ class Reader:
         return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
-        """Return the names of all releases that a commit up to ``revision`` stopped."""
+        """Return the names of all releases that a commit up to ``revision`` stopped or moved.
+
+        Some of these releases may run again.
+        """
         return commit_log.stopped_release_names(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str]) -> list[str]:

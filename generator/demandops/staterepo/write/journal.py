@@ -1,8 +1,9 @@
 """The journal: a file with all accepted, unpublished demands, so that a crash loses none of them.
 
-The journal has one JSON line for each demand received and one for each demand done. A demand is
-written and fsynced before it is evaluated. After a restart, demands that are not done are evaluated
-again. Their operation ids show which of them already have a published commit.
+The journal has one JSON line for each demand received, for each change of its proposal, and for
+each demand done. A demand is written and fsynced before it is evaluated. After a restart, demands
+that are not done are evaluated again. Their operation ids show which of them already have a
+published commit.
 
 The last key of a line is a digest of the line and of the previous line's digest. So a reader
 detects a changed, missing or moved line, but not that whole lines at the end are missing
@@ -112,6 +113,8 @@ class Journal:
     def append(self, entries: Iterable[JournalEntry]) -> None:
         """Write and fsync all ``entries``, or raise StateRepoError and write none of them.
 
+        An entry replaces the pending entry with the same operation id.
+
         Raises Unsound if nobody knows whether they are written.
         """
         entries = list(entries)
@@ -127,8 +130,9 @@ class Journal:
         Operations without a pending demand are ignored.
 
         If ``durably`` is true, the removal is fsynced; a failure raises StateRepoError and keeps
-        the demands. Otherwise the next :meth:`append` makes the removal durable. If the process
-        dies before that, the demands are evaluated again after a restart, which is harmless.
+        the demands. Otherwise the next :meth:`append` makes the removal durable. If the process or
+        the machine fails before that, the demands may be evaluated again after a restart. This is
+        harmless only if a commit records their outcome; a refused demand could then be booked.
         Raises Unsound if the content of the file is unknown.
         """
         done = [each for each in dict.fromkeys(operations) if each in self.pending]
@@ -145,9 +149,8 @@ class Journal:
 
     def close(self) -> None:
         """Close the journal; pending demands stay for the next process."""
-        with suppress(
-            OSError, Unsound
-        ):  # the demands are in the file; evaluating a done one again is harmless
+        # if the write fails, the next process may evaluate again a demand that is done
+        with suppress(OSError, Unsound):
             self._write([], durably=True)
         self._file.close()
 
