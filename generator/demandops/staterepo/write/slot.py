@@ -31,6 +31,13 @@ class Slot:
     """
 
     def __init__(self, root: Path) -> None:
+        """Take a slot below ``root``.
+
+        Raises:
+            StateRepoError: ``root`` cannot be made or has no free slot, or a journal is damaged or
+                cannot be written.
+            OSError: the slot's folder cannot be used.
+        """
         try:
             root.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
