@@ -194,6 +194,7 @@ class TestInit:
             assert (ran.code, ran.out) == (1, "")
             assert ran.err.startswith("error: ")
             assert str(tmp_path / "file") in ran.err
+            assert "is not empty" not in ran.err
         assert (tmp_path / "file").read_text() == "precious"
 
 
@@ -725,8 +726,8 @@ class TestStateRepo:
             ran = demandops(*command, "--state-repo", folder, stdin=text(perception()))
             assert (ran.code, ran.out) == (1, "")
             assert ran.err == (
-                "error: this is not a state repo, because it has no demandops.yaml; `demandops "
-                "init DIR` makes one\n"
+                "error: this is not a state repo, because it has no demandops.yaml; if the file "
+                "was deleted, restore it; `demandops init DIR` makes a new state repo\n"
             )
 
     def test_a_newer_generators_state_repo_is_refused(self, demandops: Run, state: Any) -> None:

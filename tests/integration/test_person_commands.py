@@ -169,6 +169,21 @@ class TestSuspend:
         carried_out(joined)
         assert joined.manifests() == files
 
+    def test_a_lock_that_a_killed_program_left_is_told_with_the_remedy(
+        self, demandops: Run, joined: GitRepo
+    ) -> None:
+        lock, before = joined.path / "refs/heads/main.lock", joined.tip
+        lock.write_text("")
+        command = ("suspend", "--requester", "vehicle00", "-m", "Sold", "--state-repo", joined.path)
+        ran = demandops(*command)
+        assert (ran.code, joined.tip) == (1, before)
+        assert ran.err.splitlines()[-1] == (
+            f"error: another program locks main of {joined.path}, so nothing was changed; try "
+            "again; if no program writes there, remove refs/heads/main.lock in it"
+        )
+        lock.unlink()
+        assert demandops(*command).code == 0
+
     def test_a_suspended_demand_that_is_sent_again_is_told(
         self, demandops: Run, joined: GitRepo, where: tuple[str, str]
     ) -> None:

@@ -231,8 +231,9 @@ class TestKeysThatCannotSign:
             f"error: signing key {key} can be read by others; run: chmod 600 {key}\n"
         )
 
-    def test_no_key(self, book: Run, state: Any, tmp_path: Path) -> None:
-        key = tmp_path / "key"
+    @pytest.mark.parametrize("name", ["key", "agent-key", "passphrase"])
+    def test_no_key(self, book: Run, state: Any, tmp_path: Path, name: str) -> None:
+        key = tmp_path / name
         key.write_text("hello\n")
         key.chmod(stat.S_IRUSR)
         assert self.told(book, state, key).startswith(f"error: signing key {key} cannot sign: ")

@@ -30,7 +30,7 @@ def init(  # noqa: PLR0913 - what a state repo begins with
     schemas: Mapping[str, str] | None = None,
     signer: Signer | None = None,
 ) -> str:
-    """Make a state repo and return its first commit.
+    """Make a state repo and return the id of its first commit.
 
     Args:
         target: the folder of the state repo; it must be empty or not exist.
@@ -39,16 +39,18 @@ def init(  # noqa: PLR0913 - what a state repo begins with
         url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
         example: whether to include the fleet and the application of the paper's experiment.
         schemas: name → JSON Schema, which is written to the folder ``schemas/``.
-        signer: signs the first commit.
+        signer: signs the first commit; if None, the commit is not signed.
 
     Raises:
-        StateRepoError: the folder is not empty or cannot be made; nothing was written.
+        StateRepoError: the folder is not empty or cannot be made, or the signer failed; no state
+            repo was made.
         InvalidInput: clusters cannot fetch from ``url``.
     """
     target = target.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
         raise StateRepoError(
-            f"{target} exists and is not empty; name a new folder (nothing was changed)"
+            f"{target} exists and is not {'empty' if target.is_dir() else 'a folder'}; name a new "
+            "folder (nothing was changed)"
         )
     content = skeleton.files(gitops, url, example=example)
     content |= {f"{SCHEMAS_ROOT}/{name}.json": text for name, text in (schemas or {}).items()}
@@ -65,8 +67,8 @@ def init(  # noqa: PLR0913 - what a state repo begins with
                 partial.rename(target)
         finally:
             shutil.rmtree(partial, ignore_errors=True)
-    except OSError as error:
-        reason = error.strerror or str(error)
+    except (OSError, pygit2.GitError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
         raise StateRepoError(f"{target} cannot be made: {reason}; name another folder") from None
     return commit
 

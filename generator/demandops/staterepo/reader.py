@@ -51,15 +51,20 @@ class Reader:
         """Return a reader of the state repo at an address.
 
         A URL is cloned, and the clone stays on the disk for later readers. The folder of a checkout
-        is allowed only with ``only_read``.
+        is allowed only with ``only_read``. Raises StateRepoError if the address cannot be used.
         """
-        slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
+        try:
+            slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
+        except OSError as error:
+            raise access_error(error, f"the data folder of {address}") from None
         try:
             repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
             return cls(repository, repository.refresh(), slot)
-        except BaseException:
+        except BaseException as error:
             if slot is not None:
                 slot.close()
+            if isinstance(error, Exception):
+                raise access_error(error, address) from None
             raise
 
     def close(self) -> None:
@@ -108,7 +113,10 @@ class Reader:
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Return the state in effect at a commit (:func:`state_in_effect.snapshot_at`)."""
+        """Return the state in effect at a commit (:func:`state_in_effect.snapshot_at`).
+
+        The faults of the InvalidInput that this may raise have the numbers of their lines.
+        """
         commit = self.commit(revision)
         try:
             return state_in_effect.snapshot_at(self._objects, commit, progress)
@@ -120,12 +128,13 @@ class Reader:
     ) -> Snapshot:
         """Return the snapshot of a commit, with the last valid versions of invalid files.
 
-        Unlike :meth:`snapshot`, this works before a generator has quarantined the files.
+        Unlike :meth:`snapshot`, this works before a generator has quarantined the files. Raises
+        InvalidInput or StateRepoError if there never was a valid state.
         """
         try:
             return self.snapshot(revision, progress)
         except InvalidInput:
-            return state_in_effect.state_at(self._objects, revision, progress)
+            return state_in_effect.state_at(self._objects, self.commit(revision), progress)
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
         """Return :meth:`last_valid_snapshot` of the newest commit.
@@ -185,14 +194,18 @@ class Reader:
         return lambda path: trees.read_text(tree, path)
 
     def config(self) -> Config:
-        """Return the configuration at the newest commit; raise InvalidInput if it is not valid."""
+        """Return the configuration at the newest commit.
+
+        Raises InvalidInput if it is not valid, and StateRepoError if there is none.
+        """
         return last_valid_config.config_at(self._tree())
 
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
         """Yield commits, newest first.
 
         ``spec`` is ``REV`` for the commits up to REV, ``A..B`` for those after A up to B, or None
-        for all. With ``path``, yield only the commits that changed this file or folder.
+        for all. With ``path``, yield only the commits that changed this file or folder. Raises
+        StateRepoError if there is no such commit.
         """
         since, until = self._sides(spec or "")
         if path is not None:
@@ -244,14 +257,17 @@ class Reader:
         return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
-        """Return the path of a release's file; None if there never was such a release.
+        """Return the path of a release's file; None if none was made up to ``revision``.
 
         If the release was stopped, return its last path.
         """
         return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
-        """Return the names of all releases that a commit up to ``revision`` stopped."""
+        """Return the names of all releases that a commit up to ``revision`` stopped or moved.
+
+        Some of these releases may run again.
+        """
         return commit_log.stopped_release_names(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str]) -> list[str]:
@@ -274,7 +290,10 @@ class Reader:
         return sorted(path for path, _ in trees.differences(trees.parent_tree(made), made.tree))
 
     def changes_node(self, commit: str, node: str) -> bool:
-        """Return whether a commit changed a release on a node, or a claim that names the node."""
+        """Return whether a commit changed a release on a node, or a claim that names the node.
+
+        For the first commit of the state repo, return false.
+        """
         return ledger_files.changes_node(self._objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
@@ -305,18 +324,24 @@ class Reader:
 def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
     """Yield a reader of the state repo at an address, and close it after the block.
 
-    The folder of a checkout is allowed only with ``only_read``.
+    The folder of a checkout is allowed only with ``only_read``. Raises StateRepoError if the state
+    repo cannot be read, also during the block, and Unsound if its disk fails.
     """
     try:
         with closing(Reader.of(address, only_read=only_read)) as reader:
             yield reader
-    except pygit2.GitError as error:  # an object is missing, or its file cannot be read
+    except (pygit2.GitError, OSError) as error:  # an object is missing, or its file is unreadable
+        if getattr(error, "errno", None) is not None:  # not from libgit2, so about another file
+            raise
         raise access_error(error, address) from None
 
 
 @contextmanager
 def opened_offline(address: str) -> Iterator[Reader | None]:
-    """Yield a reader that does not use the network, or None for a URL that was never cloned."""
+    """Yield a reader that does not use the network.
+
+    Yield None for a URL that no reader on this machine has cloned.
+    """
     if not is_url(address):
         with opened(address) as found:
             yield found

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import socket
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -12,6 +13,7 @@ from pathlib import Path
 import git as gitpython
 import pygit2
 import pytest
+from demandops import settings
 from demandops.errors import StateRepoError, Unsound
 from demandops.runtime import Runtime
 from demandops.service import Generator
@@ -24,12 +26,15 @@ from demandops.staterepo.git.repository import (
     StateRepository,
     disk_error,
 )
+from demandops.staterepo.git.signing import create_commit
 from demandops.staterepo.git.tree import commit_of
+from demandops.staterepo.history.commit_message import generator_signature
 from pygit2 import Oid, Repository
 
 from tests.kit import rig
 from tests.kit.cli import Run
 from tests.kit.limits import files_end_at
+from tests.kit.memory import NOW
 from tests.kit.repo import git, tip
 from tests.kit.rig import Person, Stages, goal
 
@@ -397,3 +402,44 @@ def test_a_repo_of_this_disk_that_lost_a_file_is_told_with_the_remedy(
     assert told.code == 1
     assert f"error: {bare} cannot be read: " in told.err
     assert "check its disk and its files" in told.err
+
+
+def test_a_branch_that_cannot_be_read_is_no_fault_of_the_program(
+    bare: Path, demandops: Run
+) -> None:
+    branch = bare / "refs" / "heads" / "main"
+    branch.unlink()
+    branch.symlink_to(branch.name)  # not even root can read a link to itself
+    ran = demandops("log", "--state-repo", bare)
+    assert ran.code == 1, ran.err
+    assert ran.err.startswith(f"error: {bare} cannot be read: ")
+
+
+def test_a_folder_for_the_clone_that_cannot_be_used_is_no_fault_of_the_program(
+    url: str, demandops: Run
+) -> None:
+    slot = settings.data_home(url) / "reader" / "slot-0"
+    slot.parent.mkdir(parents=True)
+    slot.write_text("")
+    ran = demandops("log", "--state-repo", url)
+    assert ran.code == 1, ran.err
+    assert ran.err.startswith(f"error: the data folder of {url} cannot be read: ")
+
+
+def test_a_full_disk_of_the_clone_is_told_at_a_push(url: str, bare: Path, tmp_path: Path) -> None:
+    repository = RemoteRepository(url, tmp_path / "clone.git", print, allow_offline=False)
+    before = repository.tip()
+    tree, who = repository.objects[before].peel(pygit2.Tree).id, generator_signature(NOW)
+    commit = create_commit(repository.new, None, (who, who), "Again\n", tree, [before])
+    with files_end_at(10), pytest.raises(DiskFull, match=r"clone\.git cannot be written"):
+        repository.publish(before, commit)
+
+
+def test_a_remote_that_does_not_answer_is_told(url: str, tmp_path: Path) -> None:
+    repository = RemoteRepository(url, tmp_path / "clone.git", print, allow_offline=False)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        place = f"git://127.0.0.1:{silent.getsockname()[1]}/state.git"
+        with pytest.raises(gitpython.GitCommandError) as error:
+            repository._run_git(repository._git, "ls-remote", place, timeout=0.2)
+    message = str(repository.push_error(error.value))
+    assert message == f"{url} cannot be pushed to: fatal: git timed out after 0.2 s"

@@ -179,6 +179,25 @@ def test_a_folder_that_is_no_repository_is_told_with_the_remedy(tmp_path: Path) 
     )
 
 
+def test_a_folder_in_which_no_state_repo_can_be_made_is_told_with_a_remedy_that_works(
+    tmp_path: Path,
+) -> None:
+    (tmp_path / "mine").write_text("precious")
+    with pytest.raises(StateRepoError) as error:
+        connect(str(tmp_path), tmp_path / "data")
+    assert str(error.value) == (
+        f"{tmp_path} is not a Git repository; name another folder, or make one in a new folder "
+        "with `demandops init DIR --bare`"
+    )
+
+
+def test_a_file_is_not_told_to_be_missing(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("precious")
+    with pytest.raises(StateRepoError) as error:
+        connect(str(tmp_path / "file"), tmp_path / "data")
+    assert str(error.value) == (f"{tmp_path}/file is not a folder; name the folder of a state repo")
+
+
 def test_a_repository_without_main_is_told_with_the_remedy(tmp_path: Path) -> None:
     empty = tmp_path / "empty.git"
     pygit2.init_repository(str(empty), bare=True)

@@ -16,7 +16,8 @@ from demandops.staterepo.history.commit_log import entry_of
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
     """Return the verdicts, each with the result of checking its commit's signature.
 
-    If a required signature is missing or not valid, ``holds`` of the verdict is false.
+    Only commits by the generator are checked. If a required signature is missing or not valid,
+    ``holds`` of the verdict is false.
     """
     found = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
     checks = allowed_signers.checks(

@@ -48,6 +48,7 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
 
     These are files that people write, claims of demands that the message does not name, claims in
     another format than the generator's, and records that the commit's operation must not change.
+    The first commit may change everything, and an upgrade also ``demandops.yaml``.
     """
     if not commit.parents:
         return

@@ -1,8 +1,8 @@
 """Verifies commits: renders their generated files again, and compares them with the committed ones.
 
 A commit is verified whole or by differences. To verify a commit whole, the program loads and
-renders everything. It does so for the first and the last commit, and for each commit that records
-invalid files.
+renders everything. It does so for the first and the last commit, for each commit that records
+invalid files, and for each commit whose configuration differs from that of the commit before.
 
 To verify a commit by differences, the program starts from the commit that it verified before. It
 assumes that equal object ids mean equal files, and that plans and rendered files depend only on
@@ -46,12 +46,13 @@ _CHARTS = "/_charts/"
 class Verdict:
     """The result of verifying one commit.
 
-    ``holds`` is true if no fault was found. ``skipped`` is the reason why the commit was not
-    verified, or empty. ``fault`` is the error of rendering the commit again, or empty.
-    ``differing`` lists the generated files that differ from the rendered ones. ``touched`` lists
-    the files that the commit changed, but was not allowed to change. ``signature`` is the reason
-    why a required signature is not valid, or empty. ``signer`` names who signed the commit, or is
-    empty.
+    ``holds`` is true if no fault was found, also in a commit that was skipped. ``skipped`` is the
+    reason why the commit was not rendered again, or empty. ``fault`` is the error of reading or
+    rendering the commit again, or empty. ``differing`` lists the generated files that differ from
+    the rendered ones. ``touched`` lists the files that the commit changed, but was not allowed to
+    change. ``signed`` is true if the commit has a signature, valid or not. ``signature`` is the
+    reason why a required signature is not valid, or empty. ``signer`` names who signed the commit,
+    if a signature is required and valid; otherwise it is empty.
     """
 
     commit: str
@@ -162,6 +163,9 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         repo: the repository.
         commits: the commits to verify, oldest first.
         whole: whether all commits are verified whole; otherwise most are verified by differences.
+
+    Raises:
+        StateRepoError: the repository lacks one of the commits.
     """
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):

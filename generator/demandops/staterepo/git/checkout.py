@@ -26,7 +26,7 @@ def checkout_around(folder: Path) -> Path | None:
 
 
 def origin_of(checkout: Path) -> str | None:
-    """Return the URL that a checkout was cloned from and is pushed to, or None."""
+    """Return the URL of a checkout's remote ``origin``, or None if it has none."""
     try:
         remotes = {remote.name: remote.url for remote in Repository(str(checkout)).remotes}
     except pygit2.GitError:

@@ -45,13 +45,11 @@ class LocalRepository(StateRepository):
         try:
             self.objects = Repository(str(path))
         except pygit2.GitError as error:
-            raise unopened(path, error) or StateRepoError(
-                f"{path} is not a Git repository; make one with `demandops init {path} --bare`"
-            ) from None
+            raise unopened(path, error) or _not_a_repository(path) from None
         self.new = NewObjects(self.objects)
         try:
             self._require_usable(path)
-        except (pygit2.GitError, KeyError) as error:
+        except (pygit2.GitError, KeyError, OSError) as error:
             raise disk_error(error, self.address) or self._unreadable(str(error)) from None
 
     def _unreadable(self, what: str) -> StateRepoError:
@@ -104,7 +102,10 @@ class LocalRepository(StateRepository):
         _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def tip(self) -> Oid:
-        """Return the newest commit; raise StateRepoError if there is no branch of its own."""
+        """Return the newest commit of main.
+
+        Raises StateRepoError if there is no main, or if main is only another name of a branch.
+        """
         found = self.objects.references.get(self.main_reference)
         if found is None:
             raise missing_main(self.address)
@@ -185,6 +186,13 @@ class LocalRepository(StateRepository):
                     f"{self.address} cannot be written: {lock} cannot be removed "
                     f"({error.strerror}); remove it"
                 ) from None
+
+
+def _not_a_repository(path: Path) -> StateRepoError:
+    remedy = f"make one with `demandops init {path} --bare`"
+    if any(path.iterdir()):  # `demandops init` would refuse this folder
+        remedy = "name another folder, or make one in a new folder with `demandops init DIR --bare`"
+    return StateRepoError(f"{path} is not a Git repository; {remedy}")
 
 
 def _is_partial(repo: Repository) -> bool:

@@ -46,7 +46,8 @@ def connect(
     """Return the state repo at an address.
 
     Args:
-        address: the folder of a bare repository, or a URL.
+        address: the folder of a repository in which main is not checked out, such as a bare one,
+            or a URL.
         folder: the folder in which the clone of a URL is made.
         notify: called with a text before work that takes a while.
         allow_offline: whether an existing clone may be used if its remote cannot be reached.
@@ -55,25 +56,29 @@ def connect(
 
     Raises:
         StateRepoError: the address is not usable, or the remote cannot be reached.
+        Unsound: the disk failed.
     """
     if is_url(address):
         _check_url(address)
         return RemoteRepository(address, folder / "clone.git", notify, allow_offline)
     try:
         path = Path(address).expanduser()
-        is_folder = path.is_dir()
+        is_folder, exists = path.is_dir(), path.exists()
+        is_read_only = is_checkout(path) and only_read
     except (OSError, ValueError, RuntimeError) as error:  # for example ``~x`` without a user x
         reason = getattr(error, "strerror", None) or str(error)
         raise StateRepoError(
             f"{quoted(address)} cannot be opened: {reason}; name the folder of a state repo"
         ) from None
+    if exists and not is_folder:
+        raise StateRepoError(f"{address} is not a folder; name the folder of a state repo")
     if not is_folder:
         place = "" if path.is_absolute() else f" in {Path.cwd()}"
         raise StateRepoError(
             f"{address} does not exist{place}; correct the path, or make a state repo there with "
             f"`demandops init {address} --bare`"
         )
-    return Checkout(path) if only_read and is_checkout(path) else LocalRepository(path)
+    return Checkout(path) if is_read_only else LocalRepository(path)
 
 
 def _check_url(url: str) -> None:

@@ -30,6 +30,7 @@ from demandops.staterepo.git.repository import (
     RemoteAway,
     StateRepository,
     Unavailable,
+    access_error,
     missing_main,
 )
 from demandops.staterepo.git.slow_git import SlowGit
@@ -87,9 +88,9 @@ _REMEDIES = (
 _AMBIGUOUS = re.compile(r"dst refspec \S+ matches more than one")
 """Matches git's error if the remote also has a reference like ``refs/heads/refs/heads/main``."""
 _POLL_S = 0.02
-_DOING = {"fetch": "fetching", "push": "pushing to"}
+_DOING = {"fetch": "fetching", "push": "pushing to", "fsck": "checking the clone of"}
 _CLONE_TIMEOUT_S = 3600
-"""How many seconds a clone may take. Git ends an idle connection much earlier."""
+"""How many seconds a clone may take. Git ends an idle HTTP transfer much earlier."""
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
 _NO_CLONE = re.compile(
     r"^(?!remote:).*fatal: (not a git repository|'origin' does not appear to be a git|"
@@ -174,7 +175,7 @@ class RemoteRepository(StateRepository):
             return False
 
     def renew_if_damaged(self) -> bool:
-        """Clone again if git finds the clone damaged; return whether that was necessary."""
+        """Clone again if git's check of the clone fails or times out; return whether it did."""
         try:
             with git.Repo(self._folder) as repo:
                 self._run_git(repo, "fsck", "--no-dangling", "--no-progress")
@@ -182,7 +183,9 @@ class RemoteRepository(StateRepository):
         except RemoteAway:  # the check was aborted
             return False
         except Exception as error:
-            log.warning("the clone %s is damaged (%s); making it anew", self._folder, error)
+            log.warning(
+                "the clone %s does not pass git's check (%s); making it anew", self._folder, error
+            )
         self._clone(log.info)
         self._open()
         return True
@@ -217,19 +220,25 @@ class RemoteRepository(StateRepository):
         self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Fetch, and return the remote's tip; raise RemoteAway if the remote cannot be reached.
+        """Fetch and return the remote's tip.
 
-        Raises FetchInterrupted as soon as ``urgent`` returns true, so that a demand need not wait
-        for the fetch.
+        If ``urgent`` returns true before the fetch ends, git is ended and FetchInterrupted is
+        raised, so that a demand need not wait. Raises Unavailable if git cannot fetch now, and
+        StateRepoError if the remote has no main.
         """
         self._fetch(self._git, urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Push ``commit`` and return True; return False if the remote's tip is not ``expected``."""
+        """Push ``commit`` and return True; return False if the remote's tip is not ``expected``.
+
+        Return True also if the answer to the push was lost, but the remote has the commit.
+        """
         try:  # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
+        except (pygit2.GitError, OSError) as error:
+            raise access_error(error, f"the clone {self._folder}") from None
         except git.GitCommandError as error:
             if _REMOTE_MOVED.search(str(error)):  # git sent nothing
                 return False
@@ -253,14 +262,14 @@ class RemoteRepository(StateRepository):
     def list_references(self, *patterns: str) -> dict[str, str]:
         """Return the remote's references that match ``patterns``, as name → commit.
 
-        Raises RemoteAway if the remote cannot be reached.
+        The patterns are those of ``git ls-remote``. Raises Unavailable if git cannot read now.
         """
         out = self._read(self._git, ("ls-remote",), *patterns)
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
-        """Fetch the branches whose names begin with ``prefix``, or raise RemoteAway.
+        """Fetch the branches whose names begin with ``prefix``, or raise Unavailable.
 
         If the remote has deleted such a branch, this clone deletes its copy of the branch.
         """
@@ -269,6 +278,8 @@ class RemoteRepository(StateRepository):
 
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
         """Push one reference and return git's output, or raise GitCommandError.
+
+        After :meth:`abort`, raise RemoteAway.
 
         Args:
             spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
@@ -305,7 +316,7 @@ class RemoteRepository(StateRepository):
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
         """Return the error to raise for a failed push.
 
-        The error is ``PushDenied`` if a further attempt would fail too.
+        The error is PushDenied if a further attempt would fail too, and otherwise Unavailable.
         """
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
         if _NO_ROOM.search(text):
@@ -331,7 +342,10 @@ class RemoteRepository(StateRepository):
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = TIMEOUT_S,
     ) -> str:
-        """Return the output of a git command that reads from the remote, or raise RemoteAway."""
+        """Return the output of a git command that reads from the remote, or raise Unavailable.
+
+        Raises StateRepoError if the remote has no main.
+        """
         command = (*command, "--quiet", "origin", *references)
         try:
             return self._run_git(repo, *command, urgent=urgent, timeout=timeout)[0]
@@ -382,6 +396,7 @@ class RemoteRepository(StateRepository):
         if self._aborted:  # another thread has called abort since the first check
             self.abort()
         slow = SlowGit(f"{_DOING.get(command[0], 'asking')} {self.address}")
+        began = REAL.monotonic()
         try:
             out, err = _wait_for(process, urgent, timeout, slow)
         finally:
@@ -389,6 +404,8 @@ class RemoteRepository(StateRepository):
             slow.ends()
         if process.returncode < 0:
             err += f"\nfatal: git was ended by signal {-process.returncode}".encode()
+        if process.returncode and REAL.monotonic() - began >= timeout:
+            err += f"\nfatal: git timed out after {timeout:g} s".encode()
         if process.returncode:
             raise git.GitCommandError(list(command), process.returncode, err, out)
         return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")

@@ -29,18 +29,24 @@ _REPACK = ("repack", "--geometric=2", "-d", "-l", "--quiet")
 ENVIRONMENT = {
     "GIT_TERMINAL_PROMPT": "0",
     "LC_ALL": "C",
-    # git cuts off a connection that carries nothing for this many seconds
+    # git ends an HTTP transfer with less than 1 byte a second for 60 seconds
     "GIT_HTTP_LOW_SPEED_LIMIT": "1",
     "GIT_HTTP_LOW_SPEED_TIME": "60",
 }
 
 
 class Unavailable(StateRepoError):
-    """Raised when the state repo cannot be written now. The journal keeps the demands meanwhile."""
+    """Raised when the state repo cannot be read or written now, but perhaps later.
+
+    A generator keeps its demands in the journal and tries again.
+    """
 
 
 class RemoteAway(Unavailable):
-    """Raised when the remote cannot be reached."""
+    """Raised when git cannot fetch from the remote or push to it now, for example without network.
+
+    Missing rights to fetch, and a push that the remote rejects for a temporary reason, count too.
+    """
 
 
 class DiskFull(Unavailable):
@@ -52,7 +58,11 @@ class FetchInterrupted(StateRepoError):
 
 
 class PushDenied(StateRepoError):
-    """Raised when a hook, a protected branch or missing rights prevent a write."""
+    """Raised when a write fails for a reason that another attempt does not change.
+
+    Examples are a hook, a protected branch, missing rights, a read-only file system, and a checkout
+    as the state repo.
+    """
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -63,10 +73,11 @@ _TOLD["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objec
 
 
 def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
-    """Return the error to raise if a write failed with ``error`` because of the disk, else None.
+    """Return the error to raise if a read or a write failed because of the disk, else None.
 
-    libgit2 gives the system's error only as text, so this function recognizes the text. For an
-    I/O error it returns Unsound, because the content of the disk is then unknown.
+    ``error`` is the error of the read or write. libgit2 gives the system's error only as text, so
+    this function recognizes the text. For an I/O error, it returns Unsound, because the content of
+    the disk is then unknown.
     """
     number = getattr(error, "errno", None)
     if number is None:
@@ -76,13 +87,15 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
         what = os.strerror(number)
     if number in _NO_ROOM:
         return DiskFull(f"{address} cannot be written: its disk has no room ({what}); free some")
+    if number == errno.EROFS:
+        return PushDenied(f"{address} cannot be written: {what}; make its file system writable")
     if number in _NOT_ALLOWED:
         return PushDenied(
-            f"{address} cannot be written: {what}; give the generator's user the "
-            "right to write all files and folders there"
+            f"{address} cannot be used: {what}; give the user of this program the right to read "
+            "and write all files and folders there"
         )
     if number in _BROKEN:
-        return Unsound(f"{address} cannot be written: {what}; check its disk, then start again")
+        return Unsound(f"{address} cannot be used: {what}; check its disk, then start again")
     return None
 
 
@@ -121,17 +134,17 @@ class StateRepository(ABC):
 
     objects: Repository
     new: NewObjects
-    """The objects that were written since the last publication."""
+    """The new objects that are in memory and not on the disk yet."""
     address: str
     signer: Signer | None = None
     """Signs the commits that this process makes. If None, the commits are not signed."""
     runtime: Runtime = REAL
     """The clock, randomness and threads of the code that writes to the state repo."""
     always_current: bool
-    """Whether :meth:`tip` is always the newest commit, as in a repository on this disk."""
+    """Whether :meth:`tip` needs no fetch, as in a repository on this disk."""
     _tidying: subprocess.Popen[bytes] | None = None
     main_reference = MAIN
-    """The reference of main, or of its remote-tracking branch."""
+    """The reference of the tip: main, its remote-tracking branch, or HEAD of a checkout."""
     branches = "refs/heads/"
     """The prefix of the references of branches in this repository."""
 
@@ -143,34 +156,46 @@ class StateRepository(ABC):
 
     @abstractmethod
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Fetch and return the newest published commit, or raise RemoteAway.
+        """Fetch and return the newest published commit.
 
-        Raises FetchInterrupted as soon as ``urgent`` returns true.
+        Raises:
+            Unavailable: git cannot fetch now.
+            StateRepoError: the state repo has no main.
+            FetchInterrupted: ``urgent`` returned true before the fetch ended.
         """
 
     @abstractmethod
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Make ``commit`` the tip, durably, and return true.
+        """Make ``commit``, a descendant of ``expected``, the tip, durably, and return true.
 
-        If the current tip is not ``expected``, change nothing and return false. Raises Unavailable
-        or PushDenied if the commit could not be published for another reason. Raises Unsound if
-        nobody knows whether the commit was published.
+        If the current tip is not ``expected``, or another writer holds the lock of main, change
+        nothing and return false.
+
+        Raises:
+            Unavailable: the commit could not be published now, or the remote cannot be reached and
+                nobody knows whether it got the commit. So look for the commit before you publish
+                it again.
+            PushDenied: the commit was not published, and another attempt would fail too.
+            Unsound: the disk failed, and nobody knows whether the commit was published.
         """
 
     def write_anew(self, since: str) -> None:  # noqa: B027 - a remote confirms what it stored
         """Write the commits after ``since`` again, so that they are durable.
 
-        Raises Unavailable or Unsound if that fails.
+        With a remote, this does nothing. Raises Unavailable or Unsound if the write fails.
         """
 
     def reopened(self) -> Repository:
-        """Return the repository opened again, for use in another thread."""
+        """Return the repository opened again, for use in another thread.
+
+        The result has no objects that are only in memory.
+        """
         return Repository(self.objects.path)
 
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or descends from ``other``.
 
-        Return false if either commit is unknown here. Any thread may call this method.
+        Return false if the two differ and either is unknown here. Any thread may call this method.
         """
         if commit == other:
             return True
@@ -208,7 +233,7 @@ class StateRepository(ABC):
 
     @abstractmethod
     def renew_if_damaged(self) -> bool:
-        """Replace a damaged clone by a new one; return whether that was necessary.
+        """Let git check the files, and replace a damaged clone; return whether it was replaced.
 
         Raises:
             Unavailable: the files are damaged and cannot be replaced now.
@@ -216,7 +241,7 @@ class StateRepository(ABC):
         """
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
-        """End the running transfer with a remote, if any."""
+        """End the running transfer with a remote, if any; later ones raise RemoteAway."""
 
     def tidy(self) -> None:
         """Start git in the background to join the packs, unless it is still joining them."""

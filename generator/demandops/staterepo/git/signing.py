@@ -1,8 +1,8 @@
 """Commits signed by an SSH key, in the same way as git signs them.
 
 ``ssh-keygen`` signs the commit's bytes, and the signature goes into the header ``gpgsig``, so
-``git verify-commit`` and every forge accept it. This module knows only the key's path;
-``ssh-keygen`` reads the key or asks an SSH agent.
+``git verify-commit`` accepts it, and so do forges that check SSH signatures. This module knows only
+the key's path; ``ssh-keygen`` reads the key or asks an SSH agent.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _PROBE = b"demandops: can this key sign?\n"
 
 
 class SigningFailed(StateRepoError):
-    """Raised when the key cannot sign; then no commit is made."""
+    """Raised when ``ssh-keygen`` or the key cannot sign; then no commit is made."""
 
 
 class Signer:
@@ -74,6 +74,7 @@ class Signer:
 
 def _key_fault(key: Path, output: str) -> str:
     """Return the problem of a key and its remedy, from ssh-keygen's output."""
+    output = output.replace(str(key), "the key")  # the path may have any of the words below
     if "UNPROTECTED PRIVATE KEY" in output or "bad permissions" in output:
         return f"signing key {key} can be read by others; run: chmod 600 {key}"
     if "Permission denied" in output:
@@ -100,7 +101,10 @@ def create_commit(
     tree: Oid,
     parents: Sequence[Oid],
 ) -> Oid:
-    """Add a commit by ``people`` (author, committer), signed by ``signer``; return its id."""
+    """Add a commit by ``people`` (author, committer) to ``objects``, and return its id.
+
+    ``signer`` signs the commit or raises SigningFailed. If it is None, the commit is not signed.
+    """
     content = str(objects.repo.create_commit_string(*people, text, tree, list(parents)))
     if signer is not None:
         head, end, message = content.partition("\n\n")

@@ -102,7 +102,10 @@ def _printable(name: bytes) -> str:
 
 
 def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
-    """Yield (path, file) of every file at or below the paths ``roots``, in Git's order."""
+    """Yield (path, file) of every file and link at or below the paths ``roots``.
+
+    The order is Git's.
+    """
     for path, found in entries(tree, roots):
         if isinstance(found, Blob):
             yield path, found
@@ -114,7 +117,10 @@ def is_file(found: Object) -> bool:
 
 
 def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
-    """Return all files at or below the paths ``roots``, as path → text."""
+    """Return all files at or below the paths ``roots``, as path → text.
+
+    The text of a link is the path that it points to.
+    """
     return {path: text_of(blob) for path, blob in blobs(tree, roots)}
 
 
@@ -129,7 +135,8 @@ def differences(
     """Yield (path, new id) of each file that differs between two trees.
 
     The new id is the file's id in ``after``, or None if the file was removed. Only files at or
-    below the paths ``roots`` are compared; by default all files. Equal subtrees are not read.
+    below the paths ``roots`` are compared; by default all files. A file whose mode alone changed,
+    and a file deeper than :data:`MAX_DEPTH`, is left out. Equal subtrees are not read.
     """
     if not roots:
         yield from _differences_below(before, after, "")
@@ -168,8 +175,9 @@ def is_readme(path: str) -> bool:
 def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
     """Write the tree ``base`` with the changes in ``files``, and return the new tree's id.
 
-    ``files`` maps paths to new texts; None removes the file. Only the folders above a changed file
-    are written again. A folder that becomes empty is removed, because Git has no empty folders.
+    ``files`` maps paths to new texts; None removes the file or folder. Only the folders above a
+    changed file are written again. A folder that becomes empty is removed, because Git has no empty
+    folders.
     """
     return _write(objects, base.id if base is not None else None, files) or objects.add_folder({})
 

@@ -3,11 +3,11 @@
 If a file is invalid, its last valid version is in effect. The same holds for the files that apply
 only together with the invalid file:
 
-- all files of each commit that changed the invalid file, because a commit applies whole or not at
-  all;
+- all files of each commit that changed the invalid file since all files were valid, because a
+  commit applies whole or not at all;
 - the other files of the application definition, if the invalid file belongs to one.
 
-All other changes apply. If the result is still not valid, no change applies.
+All other changes apply. If the result is still not valid, no change of the configuration applies.
 """
 
 from __future__ import annotations
@@ -29,7 +29,8 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
 
 NO_STATE_REPO = (
-    "this is not a state repo, because it has no demandops.yaml; `demandops init DIR` makes one"
+    "this is not a state repo, because it has no demandops.yaml; if the file was deleted, restore "
+    "it; `demandops init DIR` makes a new state repo"
 )
 
 Replacements = Mapping[str, Oid | None]
@@ -69,7 +70,11 @@ class LastValidConfig:
 
 
 def config_at(tree: Tree) -> Config:
-    """Return the configuration of a tree; raise InvalidInput with the faults of all files."""
+    """Return the configuration of a tree.
+
+    Raises InvalidInput with the faults of all files, or StateRepoError if there is no
+    ``demandops.yaml``.
+    """
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
@@ -82,14 +87,15 @@ def end_markers_at(tree: Tree) -> dict[str, str]:
 
 
 def ended_overrides_at(tree: Tree) -> dict[str, str]:
-    """Return the end time of each ended override, by the override's name."""
+    """Return the end that each ended override had when it ended, by the override's name."""
     return ended_override_file.read(end_markers_at(tree))
 
 
 def refuse_other_render_version(tree: Tree) -> None:
     """Raise StateRepoError if the state repo needs a generator of another render version.
 
-    Generators of two render versions would undo each other's changes.
+    Generators of two render versions would undo each other's changes. If ``demandops.yaml`` states
+    no version that can be read, raise nothing.
     """
     for folder in RESERVED_FOLDERS:
         if trees.entry_id(tree, folder) is not None:

@@ -38,7 +38,7 @@ class ClaimFiles:
 
 
 def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
-    """Return the claims in files, which are given as (path, text).
+    """Return the claims and the faults in files, which are given as (path, text).
 
     Files that are not claim files are skipped.
     """
@@ -123,7 +123,7 @@ def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
 def claims_by_people(
     repo: Repository, last_valid_commit: Oid, to: Oid, known: Ledger
 ) -> list[ClaimChange]:
-    """Return the claims that people added or edited, each with what the generator last wrote.
+    """Return the valid claims that people added or edited, each with the last valid claim before.
 
     Args:
         repo: the repository.
@@ -167,8 +167,8 @@ def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
     """Return the request to roll back to the ledger of the commit ``to``.
 
-    ``more`` are the other fields of the request. If claim files of the commit are not valid, raises
-    InvalidInput with all their faults.
+    ``more`` are the other fields of the request. Raises InvalidInput with the faults of all claim
+    files if some are not valid, and StateRepoError if there is no such commit.
     """
     commit = trees.commit_of(repo, to)
     found = read(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
@@ -196,7 +196,10 @@ def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
 
 
 def changes_node(repo: Repository, revision: str | Oid, node: str) -> bool:
-    """Return whether a commit changed a release on a node, or a claim that names the node."""
+    """Return whether a commit changed a release on a node, or a claim that names the node.
+
+    For the first commit of the history, return false.
+    """
     commit = trees.commit_of(repo, revision)
     before, after = trees.parent_tree(commit), commit.tree
     if before is None:

@@ -1,8 +1,9 @@
 """The problem report: a file in the state repo that lists the invalid files.
 
-The report names each fault, the commit that caused it, and the author of the commit. The same
-problems give the same bytes, so an unchanged report causes no commit. This module only converts
-between problems and text; it reads and writes no files.
+The report names the first 100 faults and counts the others. A fault has the commit that caused it
+and the author of the commit, if the commit was found. The same problems give the same bytes, so an
+unchanged report causes no commit. This module only converts between problems and text; it reads and
+writes no files.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _WRITTEN = ("file", "field", "message", "since", "author")
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """A fault, with the id and the author of the commit that caused it."""
+    """A fault, with the id and the author of the commit that caused it, or empty texts."""
 
     file: str
     field: str

@@ -131,8 +131,8 @@ def advance(
 ) -> Advance:
     """Return the snapshot of the commit ``to``, and the changes since the snapshot ``before``.
 
-    Only files that differ are read. Invalid changes are not applied. They are in ``problems`` of
-    the new snapshot.
+    Only files that differ are read. Invalid changes are not applied; ``problems`` of the new
+    snapshot has their faults. Raises InvalidInput if the files of ``recorded`` are not valid.
 
     Args:
         repo: the repository.

@@ -1,11 +1,11 @@
 """The state in effect at a commit, even if some files are not valid.
 
-The generator's commits record this state in trailers. ``In-Force`` names the newest commit where
-all files were valid. ``Configuration`` names the commit whose configuration is in effect. Each
-``Stands-In`` names a file that is in effect in another version, as path and blob. Each
-``Held-Back`` names a file of the ledger that is not in effect. A restart and ``demandops verify``
-start from these trailers. They then apply people's later changes with the same code as a running
-generator.
+While some files are not valid, the generator's commits record this state in trailers. ``In-Force``
+names the newest commit where all files were valid. ``Configuration`` names the commit whose
+configuration is in effect. Each ``Stands-In`` names a file that is in effect in another version, as
+path and blob. Each ``Held-Back`` names a file of the ledger that is not in effect. A restart and
+``demandops verify`` start from these trailers. They then apply people's later changes with the same
+code as a running generator.
 
 If a person's change of a claim is refused or cannot be planned, for example because the claim names
 an unknown node, the change is quarantined: the generator leaves the file alone, but the file's last
@@ -65,6 +65,9 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
 
     The caller then applies later changes by people with
     :func:`demandops.staterepo.load.snapshot.advance`.
+
+    Raises InvalidInput or StateRepoError if there never was a valid state, and StateRepoError if
+    the state repo needs a generator of another render version.
     """
     objects, tip = repository.objects, repository.tip()
     last_valid_config.refuse_other_render_version(trees.commit_of(objects, tip).tree)
@@ -334,7 +337,8 @@ def _located_in_claim_files(
 ) -> list[Fault]:
     """Return the faults of a subject, each located in a claim file.
 
-    If a fault is not in a claim file, it gets the path of a changed claim of the subject.
+    If a fault is not in a claim file, it gets the path of one of the subject's claims, of a changed
+    one if there is any. If the subject has no claim, the fault stays where it is.
     """
     claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]

@@ -1,8 +1,8 @@
 """The commits of one batch, made on top of a snapshot and published together.
 
-Each demand becomes one commit with the changed ledger and rendered files. :class:`CommitBatch`
-holds the commits until they are published. If another writer publishes first, the batch is
-dropped and its demands are evaluated again on the new tip.
+Each demand that changes the ledger becomes one commit with the changed ledger and rendered files.
+:class:`CommitBatch` holds the commits until they are published. If another writer publishes first,
+the batch is dropped and its demands are evaluated again on the new tip.
 """
 
 from __future__ import annotations
@@ -125,10 +125,11 @@ class CommitBatch:
         return str(made)
 
     def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:
-        """Record the outcome of a demand that changed nothing, in the message of the next commit.
+        """Record the outcome of a demand that changed nothing, in the next commit of a demand.
 
         The process may die before it answers the demand. After a restart, the generator must not
-        evaluate the demand again, because later demands could change the outcome.
+        evaluate the demand again, because later demands could change the outcome. If this batch
+        gets no further commit of a demand, nothing is recorded.
         """
         self._settled.append((commit_log.settled_trailer(outcome), operation))
 
@@ -136,7 +137,8 @@ class CommitBatch:
         """Render people's changes, and commit the generated files that differ, if any.
 
         A claim or file may be impossible to plan or render, for example because its node left the
-        inventory. It then stays unchanged, and the problems of ``head`` list it.
+        inventory. Then its last valid version stays in effect, and the problems of ``head`` list
+        the fault.
         """
         self.head, change, keys = self._followed(advance, before, now)
         state, tip, problems = self.head.state, self.head.commit, self.head.problems
@@ -265,7 +267,10 @@ class CommitBatch:
     def drain(self, node: str, operation: str, now: datetime) -> Decision:
         """Commit the move of placed applications off a drained node, and return the decision.
 
-        The commit's author is the person who last changed the node's file.
+        If no application can be moved, there is no commit. The commit's author is the person who
+        last changed the node's file, or the generator if there is no such person.
+
+        Raises Refused or InvalidInput if the state after the move cannot be planned or rendered.
         """
         decision = decide(self.head.state, Drain(node), now, self.read)
         if decision.files:
@@ -334,9 +339,10 @@ class CommitBatch:
         return made
 
     def publish(self) -> bool:
-        """Publish the commits and return true; return false if the state repo got other commits.
+        """Publish the commits, if any, and return true.
 
-        Raises RemoteAway or PushDenied if the state repo cannot be written.
+        If the state repo got other commits, or another writer locks it, return false. Raises
+        Unavailable, PushDenied or Unsound like :meth:`StateRepository.publish`.
         """
         if self.is_empty:
             return True

@@ -1,12 +1,14 @@
 """The journal: a file with all accepted, unpublished demands, so that a crash loses none of them.
 
-The journal has one JSON line for each demand received and one for each demand done. A demand is
-written and fsynced before it is evaluated. After a restart, demands that are not done are evaluated
-again. Their operation ids show which of them already have a published commit.
+The journal has one JSON line for each demand received, for each change of its proposal, and for
+each demand done. A demand is written and fsynced before it is evaluated. After a restart, demands
+that are not done are evaluated again. Their operation ids show which of them already have a
+published commit.
 
 The last key of a line is a digest of the line and of the previous line's digest. So a reader
-detects a changed, missing or moved line (docs/decisions/0020-journal.md). Journals of the first
-version have no digests, and can still be read.
+detects a changed, missing or moved line, but not that whole lines at the end are missing
+(docs/decisions/0020-journal.md). Journals of the first version have no digests, and can still be
+read.
 """
 
 from __future__ import annotations
@@ -49,7 +51,8 @@ class ProposalRecord:
     the push of the newest may have failed.
     ``base``: the commit of main on which the newest of ``commits`` was made.
     ``pushed``: whether the branch was pushed. If a pushed branch is missing, somebody deleted it.
-    ``link``: the address of the branch's merge request.
+    After a person merges only some of the demands, this is false until the branch is pushed again.
+    ``link``: the address of the branch's merge request, if GitLab printed it at a push, or empty.
     ``withdrawn``: the reason why the demand was withdrawn, or empty.
     """
 
@@ -95,7 +98,7 @@ class Journal:
         self._unsound: Unsound | None = None
         self.pending = read(path)
         self._chain, self._size, self._limit, self._is_broken = "", 0, 0, True
-        with self._explained():
+        with self._explained("try again"):
             self._file = path.open("ab", buffering=0)
             self._rewrite()
 
@@ -110,6 +113,8 @@ class Journal:
     def append(self, entries: Iterable[JournalEntry]) -> None:
         """Write and fsync all ``entries``, or raise StateRepoError and write none of them.
 
+        An entry replaces the pending entry with the same operation id.
+
         Raises Unsound if nobody knows whether they are written.
         """
         entries = list(entries)
@@ -122,9 +127,13 @@ class Journal:
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
         """Remove demands that are published, refused or withdrawn.
 
+        Operations without a pending demand are ignored.
+
         If ``durably`` is true, the removal is fsynced; a failure raises StateRepoError and keeps
-        the demands. Otherwise the next :meth:`append` makes the removal durable. If the process
-        dies before that, the demands are evaluated again after a restart, which is harmless.
+        the demands. Otherwise the next :meth:`append` makes the removal durable. If the process or
+        the machine fails before that, the demands may be evaluated again after a restart. This is
+        harmless only if a commit records their outcome; a refused demand could then be booked.
+        Raises Unsound if the content of the file is unknown.
         """
         done = [each for each in dict.fromkeys(operations) if each in self.pending]
         records = [{"done": operation} for operation in done]
@@ -140,9 +149,8 @@ class Journal:
 
     def close(self) -> None:
         """Close the journal; pending demands stay for the next process."""
-        with suppress(
-            OSError, Unsound
-        ):  # the demands are in the file; evaluating a done one again is harmless
+        # if the write fails, the next process may evaluate again a demand that is done
+        with suppress(OSError, Unsound):
             self._write([], durably=True)
         self._file.close()
 
@@ -204,21 +212,21 @@ class Journal:
             raise told from None
 
     @contextmanager
-    def _explained(self) -> Iterator[None]:
+    def _explained(self, remedy: str = "send the demand again") -> Iterator[None]:
         try:
             yield
         except OSError as error:
             self._require_known(error)
             raise StateRepoError(
                 f"the journal {self._path} cannot be written: {error.strerror or error}; check its "
-                "disk, then send the demand again"
+                f"disk, then {remedy}"
             ) from None
 
 
 def read(path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands in a journal's file, by operation id.
+    """Return the pending demands in a journal's file, by operation id; none if it is missing.
 
-    Raises DamagedJournal like :func:`parse`.
+    Raises DamagedJournal like :func:`parse`, and OSError if the file cannot be read.
     """
     return parse(path.read_bytes() if path.exists() else b"", path)
 
@@ -226,7 +234,7 @@ def read(path: Path) -> dict[str, JournalEntry]:
 def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
     """Return the pending demands of a journal's text, by operation id, or raise DamagedJournal.
 
-    An incomplete last line is dropped. A crash interrupted the write, so the line's demand was
+    A last line that is cut off is dropped. A crash interrupted the write, so the line's demand was
     never acknowledged.
     """
     *lines, last = text.split(b"\n")
@@ -246,7 +254,10 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
 
 
 def readable_entries(path: Path) -> list[JournalEntry]:
-    """Return the pending demands that can be read in a journal, even if it is damaged."""
+    """Return the pending demands that can be read in a journal, even if it is damaged.
+
+    Raises OSError if the file cannot be read.
+    """
     pending: dict[str, JournalEntry] = {}
     for line in path.read_bytes().split(b"\n"):
         found = _SEALED.fullmatch(line)

@@ -18,7 +18,7 @@ from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import signing
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.repository import StateRepository
+from demandops.staterepo.git.repository import MAIN, StateRepository
 from demandops.staterepo.history import commit_message
 from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.history.message_format import compose
@@ -71,8 +71,11 @@ def commit_to_main(
         details: the person, the time and the message.
 
     Raises:
-        InvalidInput: the files are not valid; nothing was changed.
-        StateRepoError: the commit could not be published.
+        InvalidInput: with the files, the configuration has faults that main does not have; nothing
+            was changed.
+        StateRepoError: the commit could not be published, or the remote cannot be reached and
+            nobody knows whether it got the commit.
+        Unsound: the disk failed, and nobody knows whether the commit was published.
     """
     return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), details)
 
@@ -86,10 +89,11 @@ def commit_to_branch(
 ) -> Published:
     """Commit files to a new branch on top of main, and return what was published.
 
-    ``options`` are push options for the server.
+    ``options`` are push options, for a server that supports them.
 
     Raises:
-        InvalidInput: the files are not valid; nothing was changed.
+        InvalidInput: with the files, the configuration has faults that main does not have; nothing
+            was changed.
         StateRepoError: the branch exists, or could not be pushed.
     """
     tip = trees.commit_of(repository.objects, repository.refresh())
@@ -104,11 +108,14 @@ def commit_to_branch(
 def merge(
     repository: StateRepository, proposal: PendingProposal, details: CommitDetails
 ) -> Published:
-    """Merge a proposal into main, and return the merge commit.
+    """Merge a proposal into main, and return what was published.
 
     Raises:
+        InvalidInput: with the proposal, the configuration has faults that main does not have;
+            nothing was changed.
         StateRepoError: main has other changes to the same files, or cannot be written, or the
             proposal has a file that is not plain text.
+        Unsound: the disk failed, and nobody knows whether the merge was published.
     """
     objects = repository.objects
     head = trees.commit_of(objects, proposal.commit)
@@ -125,7 +132,8 @@ def merge(
         if not {path for path, _ in trees.differences(start, tip.tree)}.isdisjoint(proposed):
             raise StateRepoError(
                 f"{MAIN_BRANCH} and {proposal.branch} change the same files; wait until "
-                "a running generator has made the branch anew, then try again"
+                "a running generator has made the branch anew, then try again; if the branch has "
+                "commits by a person, the generator leaves it alone, so merge it with git"
             )
         odd = next((path for path in proposed if not _is_plain(head.tree, path)), None)
         if odd is not None:
@@ -151,6 +159,11 @@ def _publish(
             return Published(str(made), MAIN_BRANCH)
         repository.new.forget()
         REAL.sleep(_PAUSE_S * attempt)
+    if repository.always_current and repository.tip() == tip.id:
+        raise StateRepoError(
+            f"another program locks {MAIN_BRANCH} of {repository.address}, so nothing was changed; "
+            f"try again; if no program writes there, remove {MAIN}.lock in it"
+        )
     raise StateRepoError(
         f"{repository.address} got new commits during each of {_ATTEMPTS} attempts, so nothing was "
         "changed; try again"

@@ -1,8 +1,9 @@
 """Proposals in the state repo: branches ``demand/…`` that a person merges to approve the demands.
 
 The generator rebuilds a branch if newer commits on main make the branch outdated, and deletes the
-branch in the end. It does neither if somebody else has moved the branch. This module knows nothing
-of forges except GitLab's push options.
+branch in the end. If a person added commits to the branch, the generator neither rebuilds it nor
+deletes it after a merge. This module knows nothing of forges except GitLab's push options and the
+link that GitLab prints.
 """
 
 from __future__ import annotations
@@ -56,7 +57,10 @@ def branch_name(name: str, operation: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The newest commit of main, and the newest commit of each proposal's branch."""
+    """The newest commit of main, or empty if there is no main, and that of each proposal's branch.
+
+    ``branches`` maps the name of a branch to its newest commit.
+    """
 
     main: str
     branches: dict[str, str]
@@ -70,7 +74,10 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        """Return the commits of main and of the proposals' branches, or raise RemoteAway."""
+        """Return the newest commits of main and of the proposals' branches.
+
+        Raises Unavailable if git cannot read from the remote now.
+        """
         if self._remote is None:
             repo = Repository(self._repository.objects.path)
             names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
@@ -82,7 +89,7 @@ class ProposalBranches:
         return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
     def exists(self, branch: str) -> bool:
-        """Return whether ``branch`` exists, or raise RemoteAway.
+        """Return whether ``branch`` exists, or raise Unavailable.
 
         The branch's name need not begin with ``demand/``.
         """
@@ -104,7 +111,8 @@ class ProposalBranches:
 
         Raises:
             BranchMoved: the branch is not at ``expected``.
-            RemoteAway, PushDenied: the branch could not be pushed for another reason.
+            Unavailable, PushDenied: the branch could not be pushed for another reason.
+            GitError, OSError: the repository on this disk could not be written.
         """
         with self._repository.new.packed(commit):
             return self._move(branch, commit, expected, options)
@@ -114,7 +122,8 @@ class ProposalBranches:
 
         Raises:
             BranchMoved: the branch is at another commit.
-            RemoteAway, PushDenied: the deletion could not be pushed for another reason.
+            Unavailable, PushDenied: the deletion could not be pushed for another reason.
+            GitError, OSError: the repository on this disk could not be written.
         """
         self._move(branch, None, expected)
 
@@ -179,6 +188,8 @@ class ProposalBranches:
     ) -> bool:
         """Return whether a proposal merges into main cleanly, and changes exactly ``files``.
 
+        Return False if this repository lacks the proposal or its base.
+
         Args:
             tip: the current commit of main.
             commit: the proposal, on top of ``base``.
@@ -223,7 +234,10 @@ class PendingProposal:
 
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
-    """Yield the proposals that are not merged, sorted by branch, or raise RemoteAway."""
+    """Yield the proposals whose commits are not on main, sorted by branch.
+
+    Branches that cannot be read are logged and left out. Raises Unavailable if git cannot fetch.
+    """
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
     space = f"{repository.branches}{PREFIX}"

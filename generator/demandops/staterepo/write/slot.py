@@ -31,6 +31,13 @@ class Slot:
     """
 
     def __init__(self, root: Path) -> None:
+        """Take a slot below ``root``.
+
+        Raises:
+            StateRepoError: ``root`` cannot be made or has no free slot, or a journal is damaged or
+                cannot be written.
+            OSError: the slot's folder cannot be used.
+        """
         try:
             root.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
@@ -45,7 +52,7 @@ class Slot:
                 self.folder, self._lock = folder, lock
                 break
         else:
-            raise OSError(f"{_MAX_SLOTS} processes already use {root}; stop some of them")
+            raise StateRepoError(f"{_MAX_SLOTS} processes already use {root}; stop some of them")
         try:
             self.journal = Journal(self.folder / _JOURNAL)
             self._adopt_orphans(root)
@@ -77,8 +84,8 @@ class Slot:
 class FoundJournal:
     """A journal on this machine, and its demands that are not done.
 
-    ``damage`` is the error of reading the journal, or empty. ``set_aside`` is the file's new path
-    if the file was renamed.
+    If the journal is damaged, ``demands`` has only those that can be read. ``damage`` is the error
+    of reading the journal, or empty. ``set_aside`` is the file's new path if the file was renamed.
     """
 
     file: Path
@@ -91,6 +98,7 @@ def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[Fou
     """Yield the journals in a data folder that have demands or are damaged.
 
     If ``set_aside`` is true, each damaged journal is renamed, unless a running process uses it.
+    Raises StateRepoError if a journal cannot be read.
     """
     for file in sorted(root.glob(f"slot-*/{_JOURNAL}")):
         try:
