@@ -195,6 +195,8 @@ def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, chec
     (branch / EDGE / "extra.yaml").write_text("kind: Secret\n")
     (branch / EDGE / "README.md").write_text("Ours.\n")
     (branch / "ledger" / "notes.yaml").write_text("a: b\n")
+    (branch / "bootstrap").mkdir(exist_ok=True)
+    (branch / "bootstrap" / "extra.yaml").write_text("a: b\n")
     (branch / ".demandops").mkdir()
     (branch / ".demandops" / "report.yaml").write_text("all: well\n")
     code, out, errors = check()
@@ -203,12 +205,14 @@ def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, chec
     assert errors.splitlines() == [
         "error: .demandops/report.yaml: is written by the generator, which would undo the edit; "
         "revert the edit",
+        "error: bootstrap/extra.yaml: is in a generated folder, from which the generator removes "
+        "other files; delete it",
         f"error: {EDGE}/extra.yaml: is in a generated folder, from which the generator removes "
         "what no demand needs; delete it, and demand what you need with `demandops request`",
         f"error: {DETECTION}: {LOST}{stopped.format('od-edge-station00.yaml')}",
         f"error: {CLIENT}: {LOST}{stopped.format(Path(CLIENT).name)}",
-        "error: ledger/notes.yaml: is not the path of a claim, so the generator would remove the "
-        "file; do not add it",
+        "error: ledger/notes.yaml: is not the path of a claim, and people may add only claims and "
+        "waiting demands to ledger/; remove the file",
     ]
     assert "select:\n- connections:\n  - vehicle00/edge\ndeny: true\n" in out
     assert out.count("deny: true") == 2
