@@ -1,4 +1,4 @@
-"""Logs each problem of the state repo once."""
+"""Logs each problem of the state repo once, until it is mended."""
 
 from __future__ import annotations
 
