@@ -215,6 +215,8 @@ def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, chec
         "waiting demands to ledger/; remove the file",
     ]
     assert "select:\n- connections:\n  - vehicle00/edge\ndeny: true\n" in out
+    other_end = "mqtt-vehicle00-edge-target-3c0f22bda69b"
+    assert f"(this override also applies to {other_end})" in out
     assert out.count("deny: true") == 2
 
 

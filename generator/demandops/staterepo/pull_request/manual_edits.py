@@ -90,7 +90,8 @@ def faults_and_suggestions(
         if release is not None and before is not None and base.state is not None:
             effects, not_covered = _effects(before, after, release, base.state.config)
             if effects:
-                others = [one.name for one in releases.values() if _fits(release, one)]
+                whole = "deny" in effects
+                others = [one.name for one in releases.values() if _fits(release, one, whole=whole)]
                 text = _override_text(effects, release, who)
                 file = _unused_path(release.name, used)
                 suggestion = Suggestion(path, file, text, tuple(not_covered), tuple(sorted(others)))
@@ -174,8 +175,14 @@ def _override_text(effects: dict[str, Any], release: Release, owner: str) -> str
     return modeline(f"{OVERRIDES_ROOT}/NAME.yaml", "override") + text
 
 
-def _fits(release: Release, other: Release) -> bool:
-    """Return whether the override suggested for ``release`` also fits ``other``."""
+def _fits(release: Release, other: Release, *, whole: bool) -> bool:
+    """Return whether the override suggested for ``release`` also applies to ``other``.
+
+    ``whole`` says whether it selects both ends of a connection (:func:`_selector`).
+    """
+    if not isinstance(release, ServiceRelease) and not isinstance(other, ServiceRelease):
+        shared = set(release.connections) & set(other.connections)
+        return whole and release.name != other.name and bool(shared)
     if not (isinstance(release, ServiceRelease) and isinstance(other, ServiceRelease)):
         return False
     same = (release.key.service, release.node.id) == (other.key.service, other.node.id)
