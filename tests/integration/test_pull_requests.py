@@ -250,8 +250,8 @@ def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, che
     assert check() == (
         0,
         f"{branch}: all files are valid and every release renders\n"
-        "charts not rendered: helm is missing; install it and put it on PATH, or name it in "
-        "HELM_BIN\n"
+        "charts not rendered: helm is missing; install it and name it in HELM_BIN, "
+        "or put it on PATH and leave HELM_BIN unset\n"
         "\n"
         f"what merging would do, compared with {base}:\n"
         "\n"
@@ -505,8 +505,8 @@ def test_a_report_of_nothing_says_so(branch: Path, check: Run) -> None:
         0,
         "<!-- demandops check -->\n"
         "## DemandOps: valid, and every release renders\n"
-        "\ncharts not rendered: helm is missing; install it and put it on PATH, or name it in "
-        "HELM_BIN\n"
+        "\ncharts not rendered: helm is missing; install it and name it in HELM_BIN, "
+        "or put it on PATH and leave HELM_BIN unset\n"
         f"\nCompared with `{base}`.\n"
         "\nMerging changes no release and no demand.\n",
         "",

@@ -47,9 +47,9 @@ class Helm:
 
     @staticmethod
     def find(home: Path) -> Helm | None:
-        """Return the program ``helm`` that ``HELM_BIN`` names or ``PATH`` has, or None.
+        """Return the program that ``HELM_BIN`` names, or None if there is none.
 
-        ``home`` is helm's home folder.
+        If ``HELM_BIN`` is not set, return ``helm`` on ``PATH``. ``home`` is helm's home folder.
         """
         program = shutil.which(os.environ.get(HELM_BIN) or "helm")
         return Helm(program, home) if program else None

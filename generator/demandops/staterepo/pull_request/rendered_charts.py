@@ -30,7 +30,10 @@ from demandops.render.trial_render import trial_releases
 from demandops.staterepo.pull_request.helm import HELM_BIN, Helm, Report
 
 MISSING = "helm is missing"
-NO_HELM = f"charts not rendered: {MISSING}; install it and put it on PATH, or name it in {HELM_BIN}"
+NO_HELM = (
+    f"charts not rendered: {MISSING}; install it and name it in {HELM_BIN}, or put it on PATH and "
+    f"leave {HELM_BIN} unset"
+)
 
 
 @dataclass(frozen=True, slots=True)
