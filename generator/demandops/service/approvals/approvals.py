@@ -213,7 +213,7 @@ class Approvals:
         return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
-        """Return the newest commits of main and of the proposals' branches, as the remote says.
+        """Return the newest commits of main and of the proposals' branches, as they are now.
 
         The next check is planned first, in case the fetch fails.
 
