@@ -29,10 +29,11 @@ PullRequestState = Literal["open", "merged", "closed"]
 
 
 class ForgeError(DemandOpsError):
-    """Raised when a forge fails or refuses; ``status`` is the HTTP status of a refusal.
+    """Raised when a call of a forge fails, or cannot be made.
 
-    ``status`` is None if the forge gives no answer, or none that can be read. ``asks_to_wait`` says
-    whether the forge asks to call again later, mostly because it got too many calls. No message
+    ``status`` is the HTTP status with which the forge refused the call. It is None if the forge
+    gives no answer, or none that can be read. ``asks_to_wait`` says whether the forge asks to call
+    again later, mostly because it got too many calls. No message
     contains the token.
     """
 
@@ -69,7 +70,10 @@ class Forge(ABC):
 
     @abstractmethod
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the newest pull request for a branch, open or not; ``None`` if there is none."""
+        """Return the pull request from a branch to ``target``, open or not, or None.
+
+        If there are several, the forge decides which one it is.
+        """
 
     @abstractmethod
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401 - any JSON
@@ -79,7 +83,7 @@ class Forge(ABC):
         """
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
-        """Return the branch's pull request to ``target``; create it if there never was one.
+        """Return the pull request from a branch to ``target``; create it if there never was one.
 
         A branch gets only one pull request, so a closed one is returned as it is. An existing one
         keeps its title and body.
@@ -101,7 +105,7 @@ class Forge(ABC):
         self._call("PATCH", f"{self._pulls}/{request.number}", {"state": "closed"})
 
     def _call(self, method: str, path: str, body: Mapping[str, object] | None = None) -> Any:  # noqa: ANN401 - the caller knows the answer's form
-        """Send JSON to a path below the API's address and return the answer's JSON."""
+        """Send JSON, if any, to a path below the API's address; return the answer's JSON."""
         where = f"{method} {self._api}{path}"
         headers = {key: value.format(token=self._token) for key, value in self.HEADERS.items()}
         content = None
@@ -117,7 +121,8 @@ class Forge(ABC):
         except (ValueError, RecursionError):
             data = _NO_JSON
         if not answer.is_success:
-            reason = _reason(data if isinstance(data, dict) else {"message": answer.reason})
+            known = data if isinstance(data, dict) else {"message": answer.reason}
+            reason = _reason(known, self._token)
             moved = "; redirects are not followed: check the API's address"
             remedy = moved if answer.is_redirect else ""
             text = f"{where}: {answer.status} {reason}{remedy}"
@@ -135,7 +140,8 @@ class Forge(ABC):
                 raise ValueError("the link is more than one line")
             return PullRequest(int(data["number"]), link, state)
         except (KeyError, TypeError, ValueError, OverflowError):
-            message = f"the answer is not a pull request; check that this is {self.NAME}'s API"
+            message = f"{self._api}: the answer is not a pull request; check that this is the "
+            message += f"address of {self.NAME}'s API"
             raise ForgeError(message) from None
 
 
@@ -151,7 +157,7 @@ class GitHub(Forge):
     EXISTS = 422
 
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the newest pull request for a branch; ``None`` if there is none."""
+        """Return the newest pull request from a branch to ``target``, open or not, or None."""
         query = {
             "head": f"{self._owner}:{branch}",
             "base": target,
@@ -175,10 +181,10 @@ class Gitea(Forge):
     EXISTS = 409
 
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the pull request for a branch; ``None`` if there is none.
+        """Return the pull request from a branch to ``target``, open or not, or None.
 
-        The result is ``None`` too if the token may not see the project, because Gitea answers both
-        with status 404.
+        The result is None too if the token may not see the project, because Gitea answers both with
+        status 404.
         """
         try:  # the branch ends the path, so its slash stays unquoted
             path = f"{self._pulls}/{quote(target, safe='')}/{quote(branch, safe='/')}"
@@ -199,7 +205,7 @@ def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
     while the generator runs.
 
     Raises:
-        ForgeError: if no file for the token is set, or the token cannot be read.
+        ForgeError: if there is no file with a token, or the file cannot be read or holds no token.
     """
     if proposals.forge not in ("github", "gitea") or proposals.url is None:
         return None
@@ -217,7 +223,8 @@ def _token(file: Path | None, forge: str) -> str:
     if file is None:
         raise ForgeError(
             f"proposals.forge is {forge}, but there is no token for it; set "
-            "DEMANDOPS_FORGE_TOKEN_FILE to a file that holds the token"
+            "DEMANDOPS_FORGE_TOKEN_FILE to a file that holds the token, then start the generator "
+            "again"
         )
     try:
         token = read_secret(file).decode("latin-1").strip()
@@ -228,9 +235,13 @@ def _token(file: Path | None, forge: str) -> str:
     return token
 
 
-def _reason(answer: Mapping[str, Any]) -> str:
-    """Return a forge's reason for a refusal: its ``message`` and the messages in ``errors``."""
+def _reason(answer: Mapping[str, Any], token: str) -> str:
+    """Return a forge's reason for a refusal: its ``message`` and the messages in ``errors``.
+
+    A server may repeat what it got, so the token is left out.
+    """
     details = answer.get("errors")
     texts = [answer.get("message"), *(details if isinstance(details, list) else ())]
     texts = [text.get("message") if isinstance(text, dict) else text for text in texts]
-    return quoted("; ".join(text for text in texts if isinstance(text, str) and text), 300)
+    reason = "; ".join(text for text in texts if isinstance(text, str) and text)
+    return quoted(reason.replace(token, "…"), 300)

@@ -35,7 +35,8 @@ spec:
     name: "demandops"
 """
 NO_HELM = (
-    "charts not rendered: helm is missing; install it and put it on PATH, or name it in HELM_BIN\n"
+    "charts not rendered: helm is missing; install it and name it in HELM_BIN, or put it on PATH "
+    "and leave HELM_BIN unset\n"
 )
 LINK: dict[str, object] = {"id": "a/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
 LINK |= {"topics": [{"source": "/a"}]}
@@ -69,8 +70,8 @@ def test_a_pipeline_may_require_helm(check: Check) -> None:
     code, out, errors = check("--require-helm")
     assert (code, out.splitlines()[:1]) == (1, [])
     assert errors == (
-        "error: charts not rendered: helm is missing; install it and put it on PATH, or name it in "
-        "HELM_BIN\n"
+        "error: charts not rendered: helm is missing; install it and name it in HELM_BIN, "
+        "or put it on PATH and leave HELM_BIN unset\n"
     )
 
 

@@ -255,6 +255,8 @@ def _connected(hook: PushWebhook) -> socket.socket:
          "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1"),
         ("nowhere.invalid:0", "'nowhere.invalid:0': host 'nowhere.invalid' cannot be resolved; "
          "write an address of this machine"),
+        ("192.0.2.1:0", "cannot listen on '192.0.2.1:0': Cannot assign requested address; "
+         "write an address of this machine"),
     ],
 )  # fmt: skip
 def test_an_address_that_will_not_do_is_told(address: str, message: str) -> None:

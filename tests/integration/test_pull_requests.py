@@ -197,6 +197,8 @@ def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, chec
     (branch / EDGE / "extra.yaml").write_text("kind: Secret\n")
     (branch / EDGE / "README.md").write_text("Ours.\n")
     (branch / "ledger" / "notes.yaml").write_text("a: b\n")
+    (branch / "bootstrap").mkdir(exist_ok=True)
+    (branch / "bootstrap" / "extra.yaml").write_text("a: b\n")
     (branch / ".demandops").mkdir()
     (branch / ".demandops" / "report.yaml").write_text("all: well\n")
     code, out, errors = check()
@@ -205,14 +207,18 @@ def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, chec
     assert errors.splitlines() == [
         "error: .demandops/report.yaml: is written by the generator, which would undo the edit; "
         "revert the edit",
+        "error: bootstrap/extra.yaml: is in a generated folder, from which the generator removes "
+        "other files; delete it",
         f"error: {EDGE}/extra.yaml: is in a generated folder, from which the generator removes "
         "what no demand needs; delete it, and demand what you need with `demandops request`",
         f"error: {DETECTION}: {LOST}{stopped.format('od-edge-station00.yaml')}",
         f"error: {CLIENT}: {LOST}{stopped.format(Path(CLIENT).name)}",
-        "error: ledger/notes.yaml: is not the path of a claim, so the generator would remove the "
-        "file; do not add it",
+        "error: ledger/notes.yaml: is not the path of a claim, and people may add only claims and "
+        "waiting demands to ledger/; remove the file",
     ]
     assert "select:\n- connections:\n  - vehicle00/edge\ndeny: true\n" in out
+    other_end = "mqtt-vehicle00-edge-target-3c0f22bda69b"
+    assert f"(this override also applies to {other_end})" in out
     assert out.count("deny: true") == 2
 
 
@@ -246,8 +252,8 @@ def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, che
     assert check() == (
         0,
         f"{branch}: all files are valid and every release renders\n"
-        "charts not rendered: helm is missing; install it and put it on PATH, or name it in "
-        "HELM_BIN\n"
+        "charts not rendered: helm is missing; install it and name it in HELM_BIN, "
+        "or put it on PATH and leave HELM_BIN unset\n"
         "\n"
         f"what merging would do, compared with {base}:\n"
         "\n"
@@ -501,8 +507,8 @@ def test_a_report_of_nothing_says_so(branch: Path, check: Run) -> None:
         0,
         "<!-- demandops check -->\n"
         "## DemandOps: valid, and every release renders\n"
-        "\ncharts not rendered: helm is missing; install it and put it on PATH, or name it in "
-        "HELM_BIN\n"
+        "\ncharts not rendered: helm is missing; install it and name it in HELM_BIN, "
+        "or put it on PATH and leave HELM_BIN unset\n"
         f"\nCompared with `{base}`.\n"
         "\nMerging changes no release and no demand.\n",
         "",

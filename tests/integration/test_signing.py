@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 from demandops.staterepo.git.signing import Signer, SigningFailed
+from demandops.staterepo.history import allowed_signers
 
 from tests.kit import rig
 from tests.kit.goals import connection, goal
@@ -342,11 +343,35 @@ class TestVerify:
         made = repo.create_commit_with_signature(text, signature.decode(), "gpgsig")
         repo.references["refs/heads/main"].set_target(made)
         (row,) = self.rows(demandops, state, since, 1)
-        assert row["signature"] == "has a signature of another commit"
+        assert row["signature"] == "has a signature that does not match its content"
         # git, unlike libgit2, would check the signed commit in place of the forged one
         git(state.path, "update-ref", f"refs/replace/{made}", str(signed.id))
         (row,) = self.rows(demandops, state, since, 1)
-        assert row["signature"] == "has a signature of another commit"
+        assert row["signature"] == "has a signature that does not match its content"
+
+    def test_a_missing_ssh_keygen_is_told(
+        self,
+        demandops: Run,
+        book: Run,
+        state: Any,
+        key: Path,
+        tmp_path: Path,
+        monkeypatch: pytest.MonkeyPatch,
+    ) -> None:
+        state.commit({SIGNERS: listed(key)})
+        book("a", "--signing-key", key)
+        monkeypatch.setattr(allowed_signers, "_good", {})
+        found = shutil.which("git")
+        assert found
+        (tmp_path / "bin").mkdir()
+        (tmp_path / "bin" / "git").symlink_to(found)
+        monkeypatch.setenv("PATH", str(tmp_path / "bin"))
+        ran = demandops("verify", "--state-repo", state.path)
+        assert (ran.code, ran.err) == (
+            1,
+            "error: ssh-keygen, which checks the signatures of commits, is missing; install it "
+            "(Debian: apt-get install openssh-client)\n",
+        )
 
     @pytest.mark.parametrize("separator", ["\u2028", "\u0085", "\x0b", "\x1c"])
     def test_a_signer_whose_name_has_an_odd_character(

@@ -370,8 +370,8 @@ def test_a_state_repo_that_never_stands_still_is_told(
     ran = upgraded("--gitops", "argocd")
     assert (ran.code, state.tip) == (1, before)
     assert ran.err == (
-        f"error: {state.path} got new commits during each of 10 attempts to render it; stop its "
-        "generators and try again\n"
+        f"error: {state.path} got new commits, or another process locked it, during each of 10 "
+        "attempts to render it; stop its generators and try again\n"
     )
 
 

@@ -207,6 +207,18 @@ class AccessDomain(CamelModel):
         without = {*NOT_BY_DEFAULT, *([_NETWORK_POLICY] if self.network == "namespace" else [])}
         return tuple(kind for name, kind in KINDS.items() if name not in without)
 
+    def how_to_allow(self, kind: str, file: str) -> str:
+        """Return, in words, how to allow a kind of objects; ``file`` has the access domain."""
+        if kind == _NETWORK_POLICY and self.network == "namespace":
+            return f"remove 'network: namespace' of the domain in {file}"
+        added = kind if kind in KINDS else f"{kind}, with its group and resource,"
+        if self.kinds is not None:
+            return f"add {added} to 'kinds' in {file}"
+        return (
+            f"list {added} in 'kinds' in {file} together with all kinds that the domain's charts "
+            "have, because a list replaces the default kinds (docs/policy.md)"
+        )
+
     @property
     def allowed_resources(self) -> dict[str, list[str]]:
         """The resources of :attr:`allowed_kinds`, by API group."""

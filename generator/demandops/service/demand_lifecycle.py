@@ -11,8 +11,9 @@
 
 A method that changes a state holds one lock while it writes to the journal, changes the state and
 wakes the worker. So two threads cannot commit and withdraw a demand at the same time. Any thread
-may submit or withdraw a demand. A separate thread journals the demands that arrive, even while the
-worker publishes other demands. The worker's thread makes all other changes of state.
+may submit or withdraw a demand. A thread of its own journals the demands that arrive, even while
+the worker publishes other demands. Whoever takes or withdraws demands, or closes the queue, also
+journals what has arrived. The worker's thread makes all other changes of state.
 """
 
 from __future__ import annotations
@@ -99,7 +100,10 @@ class Demands:
 
     @property
     def proposed(self) -> list[Ticket]:
-        """The demands that are on a proposal's branch, including withdrawn ones."""
+        """The demands of all proposals, including withdrawn ones.
+
+        A new demand may not be on the proposal's branch yet.
+        """
         with self._changed:
             return [ticket for ticket in self._tickets.values() if ticket.proposal is not None]
 
@@ -137,7 +141,7 @@ class Demands:
             self._changed.notify()
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until a demand arrives, :meth:`wake` or :meth:`close` is called, or time runs out.
+        """Wait until a demand is queued, :meth:`wake` or :meth:`close` is called, or time runs out.
 
         Returns:
             False if no demand is queued and no further demand is accepted; otherwise True.
@@ -149,8 +153,9 @@ class Demands:
     def new_demands(self, timeout: float) -> list[Ticket]:
         """Return the demands that arrived since the last call of this method or of :meth:`take`.
 
-        If there are none, wait for one. The list is empty if the wait ended after ``timeout``
-        seconds, by a withdrawal or by :meth:`wake`.
+        Demands that were refused are left out. If there are none, wait for one. The list is empty
+        if the wait ended after ``timeout`` seconds, by a withdrawal, by :meth:`wake` or by
+        :meth:`close`.
 
         Raises:
             Unsound: if a failed write left the journal in an unknown state.
@@ -180,8 +185,9 @@ class Demands:
             batch += [self._queue.popleft() for _ in range(room)]
 
     def put_back(self, batch: list[Ticket]) -> None:
-        """Move all demands of a batch back to the front of the queue.
+        """Move the demands of a batch back to the front of the queue, and empty the batch.
 
+        A withdrawn demand does not go back; :meth:`answer_withdrawn` answers it.
         The next batch then takes turns between these demands and the demands that other requesters
         sent meanwhile.
         """
@@ -192,7 +198,10 @@ class Demands:
     # ---- changes of state ----
 
     def arrive(self, ticket: Ticket) -> None:
-        """Add a demand without blocking; the thread of :meth:`journal_arrivals` journals it."""
+        """Add a demand; the thread of :meth:`journal_arrivals` journals it.
+
+        This blocks only if no more demands are accepted. The demand is then refused.
+        """
         ticket.state = "arrived"
         self._arrived.append(ticket)
         self._arrival.set()
@@ -267,8 +276,9 @@ class Demands:
         who = requester_of(ticket.goal)
         limit = self._requester_limit
         if limit is not None and self._of_requester[who] >= limit:
+            whose = f"of {quoted(who)}" if who else "without a requester"
             return QueueFull(
-                f"{limit} demands of {quoted(who)} have no answer yet; send the demand again "
+                f"{limit} demands {whose} have no answer yet; send the demand again "
                 "later, or raise the node's parameter requester_queue_limit"
             )
         return None
@@ -282,7 +292,9 @@ class Demands:
             return _change(ticket, "committed")
 
     def propose(self, ticket: Ticket, record: ProposalRecord) -> bool:
-        """Mark a demand as proposed and journal its proposal; return False if it was withdrawn.
+        """Mark a demand as proposed and journal its proposal.
+
+        Return False if the demand was withdrawn or answered.
 
         A proposed demand can still be withdrawn.
         """
@@ -311,7 +323,8 @@ class Demands:
     def withdraw(self, operation: str) -> bool:
         """Withdraw a demand; return whether the demand is withdrawn now.
 
-        A demand that is unknown, committed or answered cannot be withdrawn.
+        A demand that is unknown, committed or answered cannot be withdrawn. Neither can a demand
+        while the journal cannot be written.
         """
         self._take_in()
         with self._changed:
@@ -327,7 +340,7 @@ class Demands:
         return True
 
     def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
-        """Withdraw demands that await approval, and journal the withdrawal."""
+        """Withdraw those of the demands that await approval, and journal the withdrawal."""
         with self._changed:
             for ticket in tickets:
                 if ticket.state == "proposed":
@@ -441,7 +454,7 @@ def _may_become(ticket: Ticket, state: State) -> bool:
 
 
 def _change(ticket: Ticket, state: State) -> bool:
-    """Change a demand's state, or return False if ``state`` may not follow the current state."""
+    """Change a demand's state if ``state`` may follow; return whether it has this state now."""
     if _may_become(ticket, state):
         ticket.state = state
     return ticket.state == state

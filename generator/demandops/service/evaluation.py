@@ -44,7 +44,7 @@ class Evaluator:
 
         Returns:
             The demand's receipt or its error. If the demand needs approval, its decision, without
-            a commit.
+            a commit. A receipt is true only once the commit batch is published.
 
         Raises:
             Unavailable, PushDenied, Unsound: if the state repo cannot be written now.
@@ -100,18 +100,21 @@ class Evaluator:
             return internal(error)
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of demands that an earlier attempt pushed but did not answer.
+        """Return the results of demands that are recorded on main but have no answer yet.
 
         The demands got no answer because the connection or the process ended after the remote
         accepted the push, or because an fsync failed. In a repository on this disk, this method
         writes and fsyncs the commits of the demands and all later commits once more.
 
         Args:
-            tip: the commit whose history records pushed demands.
-            batch: demands, of which some may be pushed already.
+            tip: the commit whose history records demands.
+            batch: demands, of which some may be recorded already.
 
         Returns:
-            The pushed demands of ``batch``, oldest first, each with its result.
+            The recorded demands of ``batch``, oldest first, each with its result.
+
+        Raises:
+            Unavailable, Unsound: if their commits cannot be written once more.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())

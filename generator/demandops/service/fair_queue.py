@@ -93,11 +93,7 @@ class FairQueue:
                 queued.has_left = True
 
     def popleft(self) -> Ticket:
-        """Remove and return the next demand.
-
-        Raises:
-            KeyError: the queue is empty.
-        """
+        """Remove and return the next demand; the queue must not be empty."""
         while True:
             requester = next(iter(self._lanes))
             lane = self._lanes.pop(requester)
@@ -144,7 +140,7 @@ def _next_in(lane: deque[_Queued]) -> _Queued | None:
 
 
 def requester_of(goal: Any) -> str:  # noqa: ANN401 - plain data
-    """Return the first requester of a goal, even of an invalid one; empty if there is none."""
+    """Return the first requester of a goal, even of an invalid one; empty if it names none."""
     fields = goal if isinstance(goal, dict) else {}
     own = fields.get("requesters")
     names = own if isinstance(own, list) else _requesters(fields)

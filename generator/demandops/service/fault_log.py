@@ -1,4 +1,4 @@
-"""Logs each problem of the state repo once."""
+"""Logs each problem of the state repo once, until it is mended."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class FaultLog:
         current = list(dict.fromkeys(problems))
         for problem in current:
             if problem not in self._logged:
-                log.error("%s (its last valid version stays in effect)", problem)
+                log.error("%s (its last valid version, if any, stays in effect)", problem)
         for file in sorted({old.file for old in self._logged} - {new.file for new in current}):
             log.info("%s is valid again", file or "the state repo")
         self._logged = frozenset(current)

@@ -60,18 +60,21 @@ class Generator:
             state_repo: a folder with a bare repository, or a URL that git clones.
             data: the folder for journal and clone; by default :func:`settings.data_home`.
             queue_limit: how many demands may be queued.
-            requester_limit: how many demands of one requester may be queued. With None there is no
-                limit, and all demands keep their order; this is for a single client.
+            requester_limit: how many demands of one requester may have no answer, apart from those
+                that await approval. With None there is no limit, and all demands keep their order;
+                this is for a single client.
             start_offline: whether to start from the last fetch if the remote cannot be reached.
-            with_targets: whether receipts list the releases that a demand needs.
-            fetch_interval: seconds between two fetches while no demand arrives. 0 means no fetches
-                at an interval; a repository on this disk is still checked every minute.
+            with_targets: whether receipts list the releases that a demand needs or removes.
+            fetch_interval: seconds between two fetches while no demand arrives; a repository on
+                this disk is checked at least every second. 0 means no fetches at an interval; a
+                repository on this disk is then checked every minute.
             signing_key: an SSH key that signs the commits (:mod:`demandops.staterepo.git.signing`).
             progress: called with (files read, files in all) while the ledger is loaded.
             runtime: provides the time and the threads.
 
         Raises:
-            StateRepoError, InvalidInput: if the state repo or the key cannot be used.
+            StateRepoError, InvalidInput: if the state repo, the key or the journal cannot be used.
+            Unsound: if a disk failed.
         """
         signer = Signer(signing_key) if signing_key else None
         try:
@@ -126,7 +129,8 @@ class Generator:
         Any thread may call this method, which may take seconds.
 
         Raises:
-            InvalidInput, StateRepoError: if there is no such commit, or it is not valid.
+            InvalidInput, StateRepoError: if there is no such commit, or it has files that are not
+                valid and that no generator has quarantined.
         """
         objects = self._repository.reopened()
         tip, now = self.snapshot.commit, self._runtime.now()
@@ -173,21 +177,27 @@ class Generator:
         """Queue a demand and return its ticket at once.
 
         Args:
-            goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`).
+            goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`,
+                :mod:`demandops.demand.demand_goal`).
             operation: an id that no other demand ever had; generated if left out.
             listener: called with each stage and its text, in the worker thread.
 
         Returns:
             A ticket whose future returns the :class:`Receipt` or raises the demand's error:
-            ``Refused`` with every fault, ``Withdrawn``, ``InvalidInput`` or ``StateRepoError``. If
-            the demand is not accepted at all, the future raises ``ShuttingDown`` or ``QueueFull``.
+            ``Refused`` with every fault, ``Withdrawn``, ``TurnedDown``, ``InvalidInput`` or
+            ``StateRepoError``. If the demand is not accepted at all, the future raises
+            ``ShuttingDown``, ``QueueFull``, ``Refused`` or ``StateRepoError``, and the listener is
+            not called. If the generator ends before the demand is published or approved, the future
+            raises ``ShuttingDown`` or ``Unsound``, and the next start resumes the demand.
 
         Raises:
-            ValueError: for an operation id that a commit trailer cannot carry.
+            ValueError: for an operation id with other characters than letters, digits, ``-``, ``_``
+                and ``.``, or with more than 100.
         """
         operation = operation or self._runtime.fresh_id()
         if not _OPERATION.fullmatch(operation):
-            message = f"{operation!r} is not an operation id; use letters, digits and dashes"
+            message = f"{operation!r} is not an operation id; use at most 100 letters, digits, "
+            message += "dashes, dots and underscores"
             raise ValueError(message)
         ticket = Ticket(operation, goal, self._runtime.now(), listener)
         try:
@@ -196,8 +206,8 @@ class Generator:
         except (TypeError, ValueError, RecursionError):
             is_deep = True
         if is_deep:
-            message = "is not plain data; give text, numbers, lists and mappings, nested at most "
-            message = f"the goal {message}{strict_yaml.MAX_DEPTH} deep"
+            message = f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} "
+            message += "deep; give only text, numbers, true, false, null, lists and mappings"
             ticket.refuse(Refused([fault("", message)]))
             return ticket
         ticket.base = str(self.snapshot.commit)
@@ -207,12 +217,15 @@ class Generator:
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``other`` is ``commit`` or one of its ancestors.
 
-        Any thread may call this.
+        Return False if either commit is unknown here. Any thread may call this.
         """
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether two commits have equal content at ``path``; any thread may call this."""
+        """Return whether ``path`` exists in two commits with equal content.
+
+        Return False if either commit is unknown here. Any thread may call this.
+        """
         return self._repository.unchanged(commit, other, path)
 
     def changes_since(self, since: str) -> tuple[str, list[str] | None]:
@@ -224,7 +237,11 @@ class Generator:
         return commit, self._repository.changed_paths(since, commit)
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand; return False if it is unknown, committed or answered."""
+        """Withdraw a demand; return whether the demand is withdrawn now.
+
+        A demand that is unknown, committed or answered cannot be withdrawn. Neither can a demand
+        while the journal cannot be written.
+        """
         return self._demands.withdraw(operation)
 
     def on_publish(self, listener: Callable[[Config], None]) -> None:
@@ -239,11 +256,13 @@ class Generator:
 
         Args:
             timeout: seconds for the queued demands. After that, unpublished demands stay in the
-                journal for the next start, and their futures raise ``ShuttingDown``.
+                journal for the next start, and their futures raise ``ShuttingDown``. So do the
+                demands that await approval. Only the timeout of the first call counts.
 
         Returns:
-            A future that returns whether everything was published. The future is done once the
-            threads have ended, at the latest :data:`_GRACE_S` after the timeout.
+            A future that returns whether everything was published, apart from demands that await
+            approval. The future is done once the threads have ended, at the latest
+            :data:`_GRACE_S` after the timeout; if they have not ended by then, it returns False.
         """
         with self._stop_lock:
             if self._finished is not None:
@@ -271,7 +290,7 @@ class Generator:
         return not any(thread.is_alive() for thread in self._threads)
 
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
-        """Stop, wait for the threads to end, and return whether everything was published."""
+        """Stop, wait for the threads to end, and return the result of :meth:`stop`."""
         return self.stop(timeout).result()
 
 

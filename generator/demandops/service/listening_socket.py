@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import ipaddress
 import re
 import socket
@@ -11,6 +12,10 @@ from demandops.errors import InvalidInput
 from demandops.quoting import quoted
 
 _PORT = re.compile(r"[0-9]{1,5}")
+_REMEDIES = {
+    errno.EADDRNOTAVAIL: "write an address of this machine",
+    errno.EACCES: "choose a port above 1023",
+}
 
 
 def bound(address: str, option: str) -> socket.socket:
@@ -35,8 +40,9 @@ def bound(address: str, option: str) -> socket.socket:
         made.listen()
     except OSError as error:
         made.close()
+        remedy = _REMEDIES.get(error.errno or 0, "choose another port")
         raise InvalidInput.at(
-            option, f"cannot listen on '{address}': {error.strerror}; choose another port"
+            option, f"cannot listen on '{address}': {error.strerror}; {remedy}"
         ) from None
     return made
 

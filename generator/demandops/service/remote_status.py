@@ -17,7 +17,7 @@ class RemoteStatus:
 
     ``unreachable`` is the reason why the remote cannot be read or written now; it is empty if the
     remote can be reached. ``push_denied`` is the reason why the remote rejected the last push; it
-    is empty if the remote accepted that push.
+    is empty if the remote accepted that push, or if there was none.
     """
 
     unreachable: str = ""

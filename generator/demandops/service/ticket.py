@@ -29,11 +29,12 @@ Stage = Literal[
 
 ``waiting``: no node has room for the demand, so it will be booked later.
 
-``committed``: the demand has a commit. ``pushed``: this commit is published.
+``committed``: the demand has a commit. ``pushed``: the commit in the receipt is published.
 
 ``proposed``: the demand awaits a person's approval.
 
-``refused``: the answer to the demand is an error.
+``refused``: the answer to the demand is an error. Not reported if the demand was not accepted, was
+taken back by its client, or stays in the journal.
 """
 Listener = Callable[[Stage, str], None]
 
@@ -45,10 +46,13 @@ State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done
 class Receipt:
     """The outcome of a demand whose commit is published and durable.
 
-    ``commit`` is the tip if the demand changed nothing. ``lease_s`` is the lease in seconds, None
-    without one. ``targets`` are the releases that the demand needs or removes, if the generator was
-    asked for them. ``changes`` are the changed claims; empty if an earlier run published them.
-    ``placed`` says which nodes the generator chose, and why.
+    If the demand changed nothing, ``commit`` is the newest commit on which it was decided.
+    ``lease_s`` is the lease in seconds, None without one. ``targets`` are the releases that the
+    demand needs or removes, if the generator was asked for them. ``changes`` are the changed
+    claims. ``placed`` says which nodes the generator chose, and why.
+
+    If an earlier attempt or run published the demand, only the first four fields are known, and the
+    others are empty.
     """
 
     operation: str
@@ -79,7 +83,7 @@ class Ticket:
     Returns false if the demand is refused without being journaled.
     """
     base: str = ""
-    """The tip that was known when the demand arrived."""
+    """A tip that does not include the demand; only later commits may record the demand."""
     maybe_published: bool = False
     """Whether the remote may have accepted a push of the demand although no answer arrived."""
     has_released: bool = False
@@ -111,7 +115,7 @@ class Ticket:
     def notify(self, stage: Stage, text: str) -> None:
         """Report a stage to the listener, but only once, even if the demand is evaluated again.
 
-        The stage ``proposed`` is reported again whenever its text changes.
+        The stage ``proposed`` is reported once for each text.
         """
         key = text if stage == "proposed" else stage
         if key in self.notified:

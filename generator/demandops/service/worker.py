@@ -96,7 +96,10 @@ class Worker:
         self._demands.wake()
 
     def end_soon(self) -> None:
-        """Publish only demands that are evaluated already; the others stay in the journal."""
+        """End a running transfer, and begin no further attempt to publish.
+
+        Demands that are not published then stay in the journal.
+        """
         self._ends_soon.set()
         self._repository.abort()
         self._demands.wake()
@@ -172,7 +175,10 @@ class Worker:
             log.warning("%s", error)
 
     def _seconds_until_due(self) -> float:
-        """Return the seconds until a lease, override, scale-down, proposal or fetch is due."""
+        """Return the seconds until a lease, override, scale-down, proposal or fetch is due.
+
+        During a rest, return the seconds until its end.
+        """
         if self._rest:
             return self._rest.seconds_left()
         state, tip = self.snapshot.state, str(self.snapshot.commit)
@@ -272,7 +278,7 @@ class Worker:
             self._demands.put_back(batch)
             backoff.published()
             return None
-        log.info("the state repo got new commits; evaluating %d demands again", len(results))
+        log.info("another writer was first; evaluating %d demands again", len(results))
         for ticket in part:
             ticket.mark_maybe_published(str(commits.start.commit))
         self._must_fetch = True
@@ -294,7 +300,7 @@ class Worker:
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, to release its claims.
 
-        Return no ticket while a demand is queued, because the queued demand may renew a lease.
+        Return no ticket during a rest, or while a demand is queued, which may renew a lease.
         """
         if self._rest or self._demands.has_queued:
             return []
@@ -305,8 +311,8 @@ class Worker:
     ) -> bool:
         """Publish a commit batch and answer its demands, or return false and answer none.
 
-        The result is false if another writer published first. If the remote denies the push, each
-        demand in ``results`` gets :class:`PushDenied` as its answer, except the first
+        The result is false if another writer was first or locks main. If the remote denies the
+        push, each demand in ``results`` gets :class:`PushDenied` as its answer, except the first
         ``independent`` demands and withdrawn demands.
 
         Args:

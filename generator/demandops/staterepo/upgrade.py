@@ -50,9 +50,11 @@ _FOLDER_DEPTH = 3
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    """The GitOps controller to change to, and the URL from which it fetches the state repo.
+    """The GitOps controller to change to; None keeps the current one.
 
-    None keeps the current value.
+    ``url`` is the URL from which the controller fetches the state repo. It is only for a controller
+    that has no section in ``demandops.yaml`` yet. If it is None, such a controller gets the URL of
+    the current controller.
     """
 
     gitops: str | None = None
@@ -98,6 +100,7 @@ def plan(
     Raises:
         InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
         StateRepoError: the state repo cannot be read.
+        Unsound: the disk failed.
     """
     with reader.opened(address) as repo:
         return _plan(repo.repository, request, now, progress).upgrade
@@ -112,17 +115,21 @@ def upgrade(
 ) -> Upgrade:
     """Render everything again, publish all changed files in one commit, and return the result.
 
+    If no file changes, there is no commit.
+
     Args:
         address: a folder with a bare repository, or a URL that git clones.
-        request: the GitOps controller and the URL to change to, if any.
+        request: the GitOps controller to change to, if any, and the URL for a controller that has
+            no section in ``demandops.yaml`` yet.
         now: the time of the commit.
         progress: called with (files read, all files) while the ledger is read.
         signer: signs the commit, if given.
 
     Raises:
         InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
-        StateRepoError: the state repo cannot be read or written, or got other commits during each
-            attempt.
+        StateRepoError: the state repo cannot be read or written, or another process wrote to it
+            or locked it during each attempt.
+        Unsound: the disk failed.
     """
     with reader.opened(address) as repo:
         repository = repo.repository
@@ -141,8 +148,8 @@ def upgrade(
             REAL.sleep(_PAUSE_S * attempt * REAL.uniform(0.5, 1.0))
             repository.refresh()
     raise StateRepoError(
-        f"{repository.address} got new commits during each of {_ATTEMPTS} attempts to render it; "
-        "stop its generators and try again"
+        f"{repository.address} got new commits, or another process locked it, during each of "
+        f"{_ATTEMPTS} attempts to render it; stop its generators and try again"
     )
 
 
@@ -181,7 +188,10 @@ def _plan(
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    """Return the ledger files that change if this program writes them, as path → new text."""
+    """Return the claim files and markers that change if this program writes them.
+
+    The result maps each path to the new text.
+    """
     written = {}
     for path, text in files.items():
         new = text
@@ -196,7 +206,7 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
 
 
 def _refuse_held(state: State) -> None:
-    """Raise InvalidInput if an override with ``hold`` keeps the file of a release unchanged.
+    """Raise InvalidInput if an override with ``hold`` keeps the file of a service unchanged.
 
     The file would stay rendered for the old controller.
     """
@@ -216,7 +226,7 @@ def _refuse_held(state: State) -> None:
 
 
 def _root(text: str, config: Config, request: UpgradeRequest) -> str:
-    """Return the text of ``demandops.yaml`` with only the requested changes."""
+    """Return the text of ``demandops.yaml`` with this render version and the requested changes."""
     repository = config.repo_settings
     gitops = request.gitops or repository.gitops
     try:

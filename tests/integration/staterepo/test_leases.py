@@ -182,7 +182,7 @@ def test_a_lease_that_another_generator_renewed_does_not_expire(
             lambda: held(first, "d")[0].lease == held(second, "d")[0].lease,
             "the first generator has seen the renewal",
         )
-    assert "the state repo got new commits" in caplog.text
+    assert "another writer was first" in caplog.text
     assert expiries(bare) == []
     assert rig.claims(bare, "edge/d")
     rig.assert_sound(bare)
@@ -226,7 +226,7 @@ def test_a_hand_in_counts_once_though_the_remote_moved(
             person.change({"README.md": f"Version {number}.\n"}, "Ours")
             (answer,) = rig.book(generator, put(f"d{number}", None))
             assert answer.outcome == "booked"
-        assert caplog.text.count("the state repo got new commits") == 2
+        assert caplog.text.count("another writer was first") == 2
         with pytest.raises(Refused) as refused:
             rig.book(generator, put("d2", None))
         assert [found.code for found in refused.value.faults] == ["quota", "quota"]

@@ -379,7 +379,7 @@ def test_a_goal_that_is_nested_deeper_than_a_journal_line_can_be_is_refused(bare
         deep = [deep]
     with rig.running(bare) as generator:
         ticket = generator.submit({"id": deep})
-        assert "nested at most 100 deep" in str(ticket.future.exception(rig.PATIENCE_S))
+        assert "nested more than 100 deep" in str(ticket.future.exception(rig.PATIENCE_S))
         assert rig.book(generator, goal(1))[0].outcome == "booked"
 
 

@@ -15,7 +15,7 @@ from demandops.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
 from demandops.service.approvals.forge_worker import ForgeWorker
 
 from tests.kit.config import configuration
-from tests.kit.http import Answer, serving
+from tests.kit.http import Answer, Call, serving
 from tests.kit.turns import Turns
 from tests.unit.forge.replaying import TOKEN, Replay, replaying
 
@@ -85,6 +85,19 @@ def test_a_refusal_is_told_in_the_forges_words_without_the_token(kind: str, toke
         open_one(made)
     assert error.value.status == 401
     assert str(error.value).endswith(": 401 'Bad credentials'")
+    assert TOKEN not in str(error.value)
+
+
+def test_a_refusal_that_repeats_the_token_is_told_without_it(kind: str, token: Path) -> None:
+    def echo(call: Call) -> Answer:
+        return Answer.json({"message": f"bad header: {call.headers['Authorization']}"}, 400)
+
+    with serving(echo) as there:
+        project = {"forge": kind, "url": "https://git.example.org/its/state", "api": there.url}
+        made = forge_for(Proposals.model_validate(project), token)
+        assert made is not None
+        with pytest.raises(ForgeError, match="400 'bad header: ") as error:
+            made.find(BRANCH, "main")
     assert TOKEN not in str(error.value)
 
 
@@ -246,5 +259,6 @@ def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> No
 )
 def test_an_answer_with_an_odd_number_or_link_is_no_pull_request(number: str, link: str) -> None:
     answer = f'{{"number": {number}, "html_url": "{link}", "merged": false, "state": "open"}}'
-    with pytest.raises(ForgeError, match="is not a pull request; check that this is Gitea's API"):
+    message = "https://x: the answer is not a pull request; check that this is the address of Gitea"
+    with pytest.raises(ForgeError, match=message):
         Gitea("https://x", "token", "owner", "name")._read(json.loads(answer))

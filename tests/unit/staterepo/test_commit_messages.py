@@ -7,6 +7,8 @@ from typing import Any
 
 import pygit2
 import pytest
+from demandops.decision import Decision
+from demandops.demand.demand_request import Decommission
 from demandops.errors import fault
 from demandops.identifiers import id_problem
 from demandops.render.changes.changeset import ReleaseChange
@@ -14,6 +16,7 @@ from demandops.staterepo.history import commit_log, commit_message
 
 from tests.kit import goals
 from tests.kit.repo import git, write_tree
+from tests.unit.plan.test_waiting import put, release, waiting_repo
 
 CONNECTION = goals.connection(
     "station00/edge", ends=("station00", "edge"), topics=[goals.STATION_CLOUD[0]], broker=""
@@ -45,6 +48,27 @@ def test_a_join_says_what_starts_for_whom_and_what_is_missing(desk: Any) -> None
         "Request-Id: intersection\n"
         "Render-Version: 2\n"
     )
+
+
+def test_a_demand_that_waits_has_no_releases_that_run() -> None:
+    repo, texts = waiting_repo(), list[str]()
+    for number in range(4):
+        taken = repo.take(put(f"d{number}", 4))
+    gone = Decommission("solo", kinds=frozenset({"requester"}))
+    for goal in (put("d4", 4, requesters=["solo"]), gone, release("d3")):
+        assert isinstance(taken, Decision)
+        texts.append(commit_message.of_decision(taken, "op", repo.now))
+        taken = repo.take(goal)
+    assert isinstance(taken, Decision)
+    texts.append(commit_message.of_decision(taken, "op", repo.now))
+    assert [text.partition("\n")[0] for text in texts] == [
+        "Let d3 wait",
+        "Let d4 wait",
+        "Decommission solo",
+        "Release d3",
+    ]
+    assert all("\n\nDesired state: unchanged.\n\n" in text for text in texts)
+    assert "'solo' was decommissioned on 2026-01-31 12:00:00 UTC; its demands waited" in texts[2]
 
 
 def test_a_further_requester_changes_nothing_that_runs(desk: Any) -> None:

@@ -95,3 +95,12 @@ def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
     assert commit_log.release_path(history.repo, gone, "q") is None
     assert commit_log.release_path(history.repo, gone, "*") is None
     assert commit_log.stopped_release_names(history.repo, gone) == {"r"}
+
+
+def test_a_removed_chart_is_no_stopped_release(tmp_path: Path) -> None:
+    repo = pygit2.init_repository(str(tmp_path / "r.git"), bare=True, initial_head="main")
+    who = pygit2.Signature("a", "a@example.org", 1_770_000_000, 0)
+    charts = write_tree(repo, None, {"clusters/c/d/_charts/detection-0.1.0.yaml": "a", "x": "x"})
+    first = repo.create_commit(None, who, who, "a\n", charts, [])
+    gone = repo.create_commit(None, who, who, "b\n", write_tree(repo, None, {"x": "x"}), [first])
+    assert commit_log.stopped_release_names(repo, gone) == set()

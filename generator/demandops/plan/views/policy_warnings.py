@@ -15,7 +15,7 @@ from itertools import groupby
 
 from demandops.charts import chart_files
 from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.config.policy import KINDS, AccessDomain, matches
+from demandops.config.policy import AccessDomain, matches
 from demandops.connections.connection import Connection
 from demandops.demand.permission import PEERS, needed_access
 from demandops.errors import Fault, fault
@@ -207,26 +207,13 @@ def _refused(
 ) -> Iterator[Fault]:
     for domain in domains:
         if kind not in {allowed.kind for allowed in domain.allowed_kinds}:
-            remedy = _how_to_allow(kind, domain, config.file_of(DOMAINS_FILE, domain.name))
+            remedy = domain.how_to_allow(kind, config.file_of(DOMAINS_FILE, domain.name))
             message = (
                 f"{kind} is not among the kinds of access domain '{domain.name}', so the cluster "
                 f"refuses such an object if the chart renders one; {remedy}, or remove the object "
                 "from the chart"
             )
             yield fault("", message, line=line).within(path)
-
-
-def _how_to_allow(kind: str, domain: AccessDomain, file: str) -> str:
-    """Return, in words, how an access domain comes to allow a kind."""
-    if kind == "NetworkPolicy" and domain.network == "namespace":
-        return f"remove 'network: namespace' of the domain in {file}"
-    added = kind if kind in KINDS else f"{kind}, with its group and resource,"
-    if domain.kinds is not None:
-        return f"add {added} to 'kinds' in {file}"
-    return (
-        f"list {added} in 'kinds' in {file} together with all kinds that the domain's charts have, "
-        "because a list replaces the default kinds (docs/policy.md)"
-    )
 
 
 def _dependencies(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:

@@ -1,8 +1,9 @@
 """The proposals that await approval, and the answers to their demands.
 
 This code runs in the worker thread. A proposal is booked once main has its claims, whether by a
-merge commit, a squash or a rebase. Until then the worker rebuilds the branch on each new main, so
-that the branch has the files that the generator would render on that main.
+merge commit, a squash or a rebase. Until then the worker rebuilds the branch if a new main makes
+it outdated, so that the branch has the files that the generator would render on that main. A branch
+to which a person has committed stays unchanged.
 :meth:`Proposal.verdict` decides what happens to the demands of a proposal, and this module carries
 that verdict out.
 """
@@ -116,7 +117,7 @@ class Approvals:
         the merge.
 
         Raises:
-            RemoteAway, PushDenied: if the branch could not be deleted.
+            RemoteAway, PushDenied, BranchMoved: if the branch could not be deleted.
         """
         for ticket in batch if self._proposals else ():
             request = _release_request(ticket, state)
@@ -147,9 +148,9 @@ class Approvals:
     def add(self, ticket: Ticket, decision: Decision) -> None:
         """Add a demand to the proposal that has the demand's key, or to a new proposal.
 
-        A put replaces the earlier demands of its proposal. The demand gets an error as its answer
-        if other requesters own the proposal, if a requester has too many proposals, or if the
-        demand was withdrawn.
+        A put with other content replaces the earlier demands of its proposal. The demand gets an
+        error as its answer if other requesters own the proposal, if a requester has too many
+        proposals, or if the demand was withdrawn.
         """
         request, key = decision.request, key_of(decision.request)
         proposal = self._proposals.get(key)
@@ -187,7 +188,10 @@ class Approvals:
         return next(full, "")
 
     def withdraw_replaced(self, request: DemandRequest) -> None:
-        """Withdraw the demand's open proposal if ``request`` is a put that needs no approval."""
+        """Withdraw the open proposal of a demand that ``request``, if it is a put, replaces.
+
+        The caller has found that ``request`` needs no approval.
+        """
         proposal = self._proposals.get(key_of(request))
         if proposal is not None and isinstance(request, Put):
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
@@ -209,7 +213,7 @@ class Approvals:
         return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
-        """Fetch and return the newest commits of main and of the proposals' branches.
+        """Return the newest commits of main and of the proposals' branches, as they are now.
 
         The next check is planned first, in case the fetch fails.
 
@@ -221,6 +225,8 @@ class Approvals:
 
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
         """Answer the demands that are decided or withdrawn, and update the other proposals.
+
+        If a demand is queued, a long check stops early, and the next check does the rest.
 
         Args:
             snapshot: the state of main, at the commit ``heads.main`` or a later one.

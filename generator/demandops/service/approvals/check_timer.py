@@ -46,7 +46,7 @@ class CheckTimer:
         self._next, self._checked_at = self._began + self._interval, None
 
     def ended(self, tip: str) -> None:
-        """Record that all proposals were checked with main at ``tip``."""
+        """Record that a check with main at ``tip`` has ended."""
         now = self._runtime.monotonic()
         self._checked_at = tip
         self._rest_until = now + _PAUSE_FACTOR * (now - self._began)

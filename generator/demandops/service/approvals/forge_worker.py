@@ -65,11 +65,11 @@ class ForgeWorker:
             self._enqueue(task)
 
     def was_queried(self, branch: str) -> bool:
-        """Return whether the forge was queried about a branch, even if it did not answer."""
+        """Return whether the forge was queried about a branch, or cannot be queried now."""
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:
-        """Return the pull request of a branch, or None if there is none or it is not known yet."""
+        """Return the pull request of a branch as of the last query; None if none is known."""
         return self._pull_requests.get(branch)
 
     def forget(self, branch: str, *, close: bool) -> None:

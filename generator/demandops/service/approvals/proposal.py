@@ -1,7 +1,7 @@
 """A proposal: demands that wait together on one branch for a person's approval.
 
-The functions here have no effects: they decide the verdict on a proposal, recognize the requests
-that release a proposal, and write the texts that describe it.
+Nothing here writes to the state repo or the journal. This module decides the verdict on a proposal,
+recognizes the requests that release a proposal, and composes the texts that describe it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ class Verdict:
     ``booked``: main has the claims of these demands. ``failed``: these demands were withdrawn or
     turned down, or can no longer be booked; each has its error. ``free``: these demands no longer
     need approval. ``unapproved``: these demands still need approval. Booked and unapproved demands
-    have the decision that they would get on the current main.
+    have the decision that they would get on the current main; a booked demand that would be refused
+    there has the error.
     """
 
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
@@ -71,7 +72,7 @@ class Proposal:
         return self.record.branch
 
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
-        """Return whether nothing has changed since the last check.
+        """Return whether main, this proposal's branch and its demands are as at the last check.
 
         ``tip`` is the newest commit of main. ``branches`` maps the name of each branch to its
         newest commit.
@@ -94,7 +95,10 @@ class Proposal:
         A demand counts as booked if a commit of main names its operation id in a trailer. A squash
         merge may lose this trailer, so two more kinds of demands count as booked: a demand that
         would change no file of main; and, if a person edited the branch before the merge, a demand
-        that would change only claims in ``added``.
+        that would change only claims in ``added``, unless the proposal's demands differ.
+
+        If no demand is booked, and the branch is gone or the pull request was closed, the demands
+        that still need approval are turned down.
 
         Args:
             state: the state of main.
@@ -162,7 +166,8 @@ def _changes_only(claims: Container[ClaimKey], decision: Decision) -> bool:
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
     """Return whether a request releases all demands in ``pending``.
 
-    Only a request with a requester of one of these demands can release them.
+    It does if it has the key of one of these demands and a requester of one of them, and names all
+    their subjects or is a :class:`Release`.
     """
     requesters = {name for each in pending for name in each.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):

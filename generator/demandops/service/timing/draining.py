@@ -48,7 +48,7 @@ class Draining:
             self._warn(node, decision.warnings)
 
     def _warn(self, node: str, stays: Iterable[str]) -> None:
-        """Log which applications stay on a drained node and why; log each text only once."""
+        """Log which applications stay on a drained node and why, except texts of the last try."""
         texts = frozenset(stays)
         for text in sorted(texts - self._logged.get(node, frozenset())):
             log.warning("'%s' is drained: %s", node, text)
@@ -59,7 +59,10 @@ class Draining:
         return bool(self._due(world, self._runtime.now()))
 
     def _due(self, world: World, now: datetime) -> list[str]:
-        """Return the drained nodes with applications, except nodes that were tried just now."""
+        """Return the drained nodes with applications.
+
+        A node is left out for a minute after a try, unless the configuration has changed.
+        """
         found = []
         for node in world.config.drained_nodes:
             config, at = self._tried.get(node, (None, now))

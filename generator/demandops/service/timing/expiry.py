@@ -1,8 +1,9 @@
-"""Which leases, overrides and kept replicas have ended, and when to check again.
+"""Ends leases, overrides and kept replicas, and says when to check again.
 
 A person may set the clock. A clock that is set back only delays the end of a lease. A clock that
 jumps forward would end leases that were renewed in time, so after a jump every lease gets its full
-term again. The sleep of a machine looks like a jump and has the same effect.
+term again. The sleep of a machine looks like a jump and has the same effect. Overrides and kept
+replicas get no more time after a jump.
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ class LeaseExpiry:
         return now, [claim for claim in ended if claim.demand not in granted]
 
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
-        """Return the seconds until the next check: at least one, at most ``longest``.
+        """Return the seconds until the next check: at least one, but never above ``longest``.
 
         Without the minimum, the worker would never wait while the ledger keeps a lease that has
         ended. The ledger keeps such a lease if the release of the claim failed, or if the lease
@@ -134,7 +135,10 @@ class OverrideExpiry:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
     def postpone(self, now: datetime) -> None:
-        """Delay the end of every override, because the commits could not be published."""
+        """For a minute, report no end as due, because a publication failed.
+
+        :meth:`end_due` commits the ends even so.
+        """
         self._not_before = now + _RETRY
 
     def is_due(self, world: World, now: datetime) -> bool:
@@ -142,7 +146,7 @@ class OverrideExpiry:
         return any(time <= now for time in self._due_times(world))
 
     def seconds_until_due(self, world: World, now: datetime, longest: float) -> float:
-        """Return the seconds until the next check: at least one, at most ``longest``."""
+        """Return the seconds until the next check: at least one, but never above ``longest``."""
         times = self._due_times(world)
         return _seconds_until(min(times), now, longest) if times else longest
 
@@ -175,7 +179,10 @@ class ScaleDown:
                     log.error("cannot scale down: %s; trying again later", problem)
 
     def postpone(self, now: datetime) -> None:
-        """Delay every scale-down, because the commits could not be published."""
+        """For a minute, report no scale-down as due, because a publication failed.
+
+        :meth:`end_due` commits the scale-downs even so.
+        """
         self._not_before = now + _RETRY
 
     def is_due(self, ledger: Ledger, now: datetime) -> bool:
@@ -184,7 +191,7 @@ class ScaleDown:
         return self._not_before <= now and any(retried)
 
     def seconds_until_due(self, ledger: Ledger, now: datetime, longest: float) -> float:
-        """Return the seconds until the next check: at least one, at most ``longest``."""
+        """Return the seconds until the next check: at least one, but never above ``longest``."""
         end = ledger.kept.next_end()
         return longest if end is None else _seconds_until(max(end, self._not_before), now, longest)
 

@@ -35,7 +35,10 @@ class OwnWork:
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
-        """Delay the ends of overrides and the scale-downs, because a publication failed."""
+        """For a minute, report no end of an override and no scale-down as due.
+
+        The caller has failed to publish them. :meth:`commit_due` commits them even so.
+        """
         self._override_expiry.postpone(self._runtime.now())
         self._scale_down.postpone(self._runtime.now())
 
@@ -50,7 +53,10 @@ class OwnWork:
         )
 
     def seconds_until_due(self, state: State, longest: float) -> float:
-        """Return the seconds until the next check: at least one, at most ``longest``."""
+        """Return the seconds until the next check of overrides and replicas.
+
+        It is at least one, but never above ``longest``.
+        """
         now = self._runtime.now()
         seconds = self._override_expiry.seconds_until_due(state, now, longest)
         return self._scale_down.seconds_until_due(state.ledger, now, seconds)

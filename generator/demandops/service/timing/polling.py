@@ -37,12 +37,12 @@ class PollTimer:
     """
 
     def __init__(self, interval: float, runtime: Runtime, *, local: bool = False) -> None:
-        """Start the timer; the first fetch is due at once.
+        """Start the timer; unless ``interval`` is 0, the first fetch is due at once.
 
         Args:
             interval: seconds between two fetches; with 0, only :meth:`request` makes a fetch due.
             runtime: provides the time.
-            local: whether the repository is on this disk.
+            local: whether the repository is on this disk; the interval is then at most a second.
         """
         self._interval = min(interval, _LOCAL_S) if local else interval
         self._runtime = runtime
@@ -52,7 +52,10 @@ class PollTimer:
         self._requested = runtime.event()
 
     def request(self) -> None:
-        """Make a fetch due now; several requests before the fetch starts cause one fetch."""
+        """Make a fetch due now, or half a second after the last one, if that is later.
+
+        Several requests before the fetch starts cause one fetch.
+        """
         self._requested.set()
 
     def seconds_until_due(self) -> float | None:

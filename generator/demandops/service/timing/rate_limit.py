@@ -28,7 +28,8 @@ class RateLimit:
     ) -> Iterator[Fault]:
         """Count a demand, and yield a fault for each quota that a requester exceeds with it.
 
-        Requests that add no claims are not limited.
+        Requests that add no claims are not limited. A demand counts even if it is
+        refused afterwards.
         """
         if not request.adds_claims:
             return

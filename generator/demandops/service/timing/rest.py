@@ -8,7 +8,7 @@ FIRST_S, LONGEST_S = 1.0, 60.0
 
 
 class Rest:
-    """A pause after an error; it doubles with each further error until a success."""
+    """A pause after an error; each further error doubles it, up to a minute, until a success."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
@@ -24,7 +24,7 @@ class Rest:
         return self._next == FIRST_S
 
     def seconds_left(self) -> float:
-        """Return the seconds until the end of the pause."""
+        """Return the seconds until the end of the pause; negative after the end."""
         return self._until - self._runtime.monotonic()
 
     def begin(self) -> None:

@@ -26,8 +26,9 @@ class WaitingTurns:
         self._tried: State | None = None
 
     def book_due(self, commits: CommitBatch) -> None:
-        """Commit each waiting demand that fits, in the order of :func:`in_turn`.
+        """Commit each waiting demand that fits and needs no approval, in its turn.
 
+        The turns are those of :func:`in_turn`.
         Do nothing if all waiting demands were already tried on this state.
         """
         if not self.is_due(commits.head.state):

@@ -7,6 +7,7 @@ all commits with the same list.
 
 from __future__ import annotations
 
+import shutil
 import tempfile
 from collections.abc import Iterable
 from pathlib import Path
@@ -15,12 +16,14 @@ from typing import NamedTuple
 import git
 from pygit2 import Commit, Oid, Repository
 
+from demandops.errors import StateRepoError
 from demandops.staterepo.git import tree as trees
 
 ALLOWED_SIGNERS = "policy/allowed-signers"
 
 _SSH = "-----BEGIN SSH SIGNATURE-----"
-_CONFIG = ("-c", "gpg.ssh.program=ssh-keygen", "-c", "gpg.minTrustLevel=undefined")
+_SSH_KEYGEN = "ssh-keygen"
+_CONFIG = ("-c", f"gpg.ssh.program={_SSH_KEYGEN}", "-c", "gpg.minTrustLevel=undefined")
 _MOST_KNOWN = 100_000
 
 
@@ -44,7 +47,7 @@ def are_listed(repo: Repository, commit: Oid) -> bool:
 
 
 def signature_of(commit: Commit) -> str:
-    """Return the signature of a commit, or an empty text."""
+    """Return the signature of a commit, or an empty text if there is none."""
     return (commit.gpg_signature[0] or b"").decode("utf-8", "replace")
 
 
@@ -59,7 +62,8 @@ def faults(repo: Repository, commits: Iterable[Commit]) -> dict[str, str]:
 def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
     """Check the signatures of commits, and return a map from commit to result.
 
-    A commit is checked only if its parent lists the allowed keys.
+    A commit is checked, and in the map, only if its first parent lists the allowed keys. Raises
+    StateRepoError if a signature cannot be checked, because ssh-keygen is missing.
     """
     signatures, found = dict[str, str](), dict[str, Check]()
     lists: dict[str, list[str]] = {}
@@ -73,6 +77,11 @@ def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
             lists.setdefault(allowed, []).append(id)
     if len(_good) > _MOST_KNOWN:
         _good.clear()
+    if any(signatures.values()) and shutil.which(_SSH_KEYGEN) is None:
+        raise StateRepoError(
+            f"{_SSH_KEYGEN}, which checks the signatures of commits, is missing; install it "
+            "(Debian: apt-get install openssh-client)"
+        )
     for allowed, ids in lists.items():
         states = _check_with_git(repo, allowed, ids)
         for id in ids:
@@ -92,7 +101,7 @@ def _fault(signature: str, state: str) -> str:
     if not signature:
         return f"is not signed, but {ALLOWED_SIGNERS} requires a signature"
     if state == "B":
-        return "has a signature of another commit"
+        return "has a signature that does not match its content"
     if state != "G" or not signature.lstrip().startswith(_SSH):
         return f"is signed, but not by a key that {ALLOWED_SIGNERS} lists"
     return ""

@@ -2,7 +2,7 @@
 
 A follow commit is made by the generator, and renders what people committed. Its trailers name
 people's commits, and its author names these people. A commit is by a person if no generator on any
-machine made it (:mod:`.commit_log`).
+machine made it, or if it is of a proposal (:mod:`.commit_log`).
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ class Person(NamedTuple):
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
-    """Return people's commits since ``known`` that change files which the generator reads."""
+    """Return people's commits since ``known`` that change files of the state repo, newest first.
+
+    Files that the generator neither reads nor writes do not count.
+    """
     commits = commit_log.person_commits(repo, to, known)
     return [commit for commit in commits if _touches(commit, _ROOTS)]
 
@@ -55,8 +58,8 @@ def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple
 
     The function gets the file's path and searches people's commits after ``known`` up to ``to``. It
     returns id and author of the last commit that changed the file. If no commit did so, it takes
-    the last commit that changed any file which the generator reads. If there is no such commit
-    either, it returns None.
+    the last commit that changed any file which the generator reads or writes. If there is no such
+    commit either, it returns None.
     """
 
     @cache  # the commits are read only when needed: most problems are already in the report
@@ -78,7 +81,7 @@ def _touches(commit: Commit, paths: Iterable[str]) -> bool:
 
 
 def author_of(commit: Commit) -> Person:
-    """Return the author of a commit, without the characters that Git refuses in an author."""
+    """Return the author of a commit as :func:`commit_message.signature` writes an author."""
     plain = commit_message.signature(*commit_log.author_of(commit), commit_log.time_of(commit))
     return Person(plain.name, plain.email)
 
@@ -112,7 +115,7 @@ def operator(folder: str | None = None) -> Person:
     """Return the person who runs this program.
 
     Name and address come from git's environment variables, else from git's configuration, else from
-    the login.
+    the login. ``folder`` is a repository whose configuration counts too.
     """
     try:
         login = getpass.getuser()

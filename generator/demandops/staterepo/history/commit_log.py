@@ -50,8 +50,8 @@ class LogEntry:
     """Whether the generator is the committer, so that generated files should match the ledger.
 
     False for a commit of a proposal, because a person may merge the proposal onto other changes.
-    Anybody can commit under the generator's name, so :func:`is_by_generator` also checks the
-    signature, if a signature is required.
+    False also without the trailer ``Render-Version``. Anybody can commit under the generator's
+    name, so :func:`is_by_generator` also checks the signature, if a signature is required.
     """
     authored: datetime | None = None
     """The author's time; for a demand's commit, the time when the demand was received."""
@@ -62,7 +62,7 @@ class LogEntry:
 
 
 def time_of(commit: Commit) -> datetime:
-    """Return the committer's time, but at most the last second of the year 9999."""
+    """Return the committer's time, but none before 1970 or after the year 9999."""
     return _time(commit.commit_time)
 
 
@@ -83,8 +83,8 @@ def _text(raw: bytes) -> str:
 def entry_of(commit: Commit) -> LogEntry:
     """Return the log entry of a commit.
 
-    If a person made the commit, the entry has no trailers and no reason, unless the commit merges
-    a proposal.
+    If a person made the commit, the entry has no trailers and no reason, unless the message keeps
+    the trailers of a proposal.
     """
     text = message_format.parse(_text(commit.raw_message))
     committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
@@ -103,7 +103,10 @@ def entry_of(commit: Commit) -> LogEntry:
 
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
-    """Return whether the generator made a commit, and signed it if a signature is required."""
+    """Return whether the generator made a commit, and signed it if a signature is required.
+
+    A commit of a proposal counts as a person's (:attr:`LogEntry.by_generator`).
+    """
     return entry_of(commit).by_generator and not allowed_signers.faults(repo, [commit])
 
 
@@ -131,7 +134,10 @@ def commits(
 def person_commits(
     repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[Commit]:
-    """Yield the commits of :func:`commits` that people made."""
+    """Yield the commits of :func:`commits` that are not by the generator.
+
+    These are people's commits, and the commits of proposals (:func:`is_by_generator`).
+    """
     return (
         commit
         for commit, entry in _with_checked_signatures(repo, tip, after)
@@ -188,6 +194,7 @@ class RecordedOutcome:
 def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, RecordedOutcome]:
     """Return a map from operation id to outcome, for every demand that a later commit records.
 
+    The demands of the newest commit come first.
     Later commits are those up to ``tip`` that ``base`` does not include. If ``base`` is not in the
     history of ``tip``, for example because the remote was made anew, the whole history is read. A
     commit by a person records a demand only if it keeps the trailers of a merged proposal.
@@ -229,7 +236,8 @@ class PathHistory:
 
     ``started`` is the commit that added the path. ``newest`` lists the commits that changed the
     path afterwards, newest first. ``more`` counts the older changes, which are not listed.
-    ``stopped`` is the commit that removed the path, or None if the path exists.
+    ``stopped`` is the commit that removed the path, or None if the path exists. If the path never
+    existed, ``started`` and ``stopped`` are None.
     """
 
     started: LogEntry | None
@@ -269,7 +277,8 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
     """Return the path of the file of the release ``name``.
 
-    If the release was stopped, return its last path. If it never existed, return None.
+    If the release was stopped, return its last path. If it never existed, or ``name`` cannot be
+    the name of a release, return None.
     """
     if not _NAME.fullmatch(name):
         return None
@@ -279,13 +288,17 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that were stopped at any time in the history."""
+    """Return the names of all releases that were stopped or moved at any time in the history.
+
+    Some of them may run again.
+    """
     removed = _removed(repo, tip, "*.yaml")
-    return {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
+    names = {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
+    return {name for name in names if _NAME.fullmatch(name)}  # a chart's file has a version
 
 
 def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[str]:
-    """Return the paths of the release files that commits removed, the last removal first."""
+    """Return the paths of the files below domains that commits removed, the last removal first."""
     options = ("--diff-filter=D", "--no-renames", *more, "--format=", "--name-only")
     return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
 

@@ -37,6 +37,7 @@ _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
 _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
+_UNCHANGED = "Desired state: unchanged."
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
 
 
@@ -46,7 +47,8 @@ _CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
     """Return an author or committer as Git records it: name, address and time.
 
-    Characters that Git refuses are left out.
+    Characters that Git refuses are left out or replaced. Long texts are cut. An empty name becomes
+    "unnamed", and an empty address that of the generator.
     """
     address = one_line(_UNFIT.sub("", email), _MAX_AUTHOR).strip(_CRUD) or GENERATOR_EMAIL
     plain = one_line(name.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
@@ -62,7 +64,8 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
     """Return the author of the commit of a demand, a rollback or a decommission.
 
     The author of a demand is its requesters. The author of a rollback or a decommission is the
-    person who ran the command. ``received`` is the author's time.
+    person who ran the command; a decommission that names no person is by the generator.
+    ``received`` is the author's time.
     """
     request = decision.request
     if isinstance(request, Restoration):
@@ -80,14 +83,18 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 def of_decision(
     decision: Decision, operation: str, received: datetime, more: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of a demand's commit; ``more`` are further trailers."""
+    """Return the message of the commit of a decision.
+
+    The decision is on a demand, an ended lease, a drained node, a rollback or a decommission.
+    ``more`` are further trailers.
+    """
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
     title, why = _title_and_why(decision, received)
     paragraphs = [
         [one_line(title, _MAX_SUBJECT)],
         [f"Why: {why}"],
-        _desired_state(decision.releases),
+        _desired_state(decision.releases) if decision.releases or claims else [_UNCHANGED],
         _list("The request lists what the requester does not hold:", decision.changes.not_held),
         _list("Warnings:", decision.warnings),
     ]
@@ -165,9 +172,9 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
     if isinstance(request, Decommission):
         by = f" by {request.by}" if request.by else ""
         reason = f" ({request.reason})" if request.reason else ""
+        held = f"it held a part of {what_of_whom}" if changes else "its demands waited for room"
         return f"Decommission {request.id}", (
-            f"'{request.id}' was decommissioned{by} on {time}{reason}; it held a part of "
-            f"{what_of_whom}."
+            f"'{request.id}' was decommissioned{by} on {time}{reason}; {held}."
         )
     if isinstance(request, Wait):
         who, reasons = ", ".join(request.requesters()), "; ".join(request.reasons)
@@ -222,8 +229,8 @@ def of_follow(
 
     Args:
         releases: the releases that the commit changes.
-        cause: the newest commit by people that is rendered.
-        since: the commit that was in effect before people's changes.
+        cause: the newest commit whose changes are rendered.
+        since: the commit whose state was in effect before these changes.
         problems: the faults of invalid files.
         more: further trailers.
         reports: whether the commit changes the problem report.
@@ -269,7 +276,7 @@ def of_override_end(
     paragraphs = [
         [f"End override {override.name}"],
         [why],
-        _desired_state(releases) if releases else ["Desired state: unchanged."],
+        _desired_state(releases) if releases else [_UNCHANGED],
     ]
     trailers = [
         ("Operation", "expire-override"),
@@ -290,7 +297,7 @@ def of_scale_down(
     paragraphs = [
         [one_line(f"Scale down {names}", _MAX_SUBJECT)],
         ["Why: downAfter has passed since a demand last needed the replicas."],
-        _desired_state(change.releases) if change.releases else ["Desired state: unchanged."],
+        _desired_state(change.releases) if change.releases else [_UNCHANGED],
     ]
     trailers = [
         ("Operation", "scale-down"),

@@ -32,7 +32,7 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
 
     Args:
         text: a date, a time of day, a date with a time of day, or a duration before ``now``
-            (``2h``, ``1h30m``, ``2d``). A time of day without a date means its last occurrence
+            (``2h``, ``1h30m``, ``2d ago``). A time of day without a date means its last occurrence
             before ``now``.
         now: the current time, with a time zone.
         end: if true, a date means the end of its day, and a time without seconds means the end of
@@ -70,7 +70,7 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     """Return the commit that a revision or a time names, or raise StateRepoError.
 
     A text is first looked up as the name of a branch or tag, then as a time, then as any other
-    revision.
+    revision, in which ``HEAD`` and ``main`` mean ``tip``.
     """
     named = _found(repo.lookup_reference_dwim, text)
     if named is not None:

@@ -43,7 +43,7 @@ class Base:
     valid: bool
     """Whether all files of the commit are valid.
 
-    If a file is not valid, ``state`` has its last valid version.
+    If a file is not valid, ``state`` has its last valid version, if there ever was one.
     """
     target: str = ""
     """The merge target as git names it, such as ``origin/main``; empty if there is none."""
@@ -61,7 +61,11 @@ class Base:
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
-    """Return the state repo's files as path → text, and a fault for each symbolic link."""
+    """Return the state repo's files as path → text, and a fault for each symbolic link.
+
+    Raises:
+        StateRepoError: the folder is not a checked-out state repo, or a file cannot be read.
+    """
     if not (folder / "demandops.yaml").is_file():
         if (folder / "HEAD").is_file():
             raise StateRepoError(
@@ -95,11 +99,13 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
 
     Args:
         folder: the checkout.
-        revision: the merge target, by default ``origin/main``, else ``main``.
+        revision: the merge target; by default ``origin/main``, else ``main``. If there is neither,
+            the edit is compared with HEAD.
 
     Raises:
-        StateRepoError: there is no such commit, or it has no ancestor in common with HEAD, or Git
-            cannot open the checkout, or the checkout lacks files.
+        StateRepoError: there is no such commit, or it has no ancestor in common with HEAD; or Git
+            cannot open the checkout; or the checkout lacks files or commits; or ``revision`` is
+            given, but the folder is not a Git checkout.
     """
     try:
         repo = Repository(str(folder))
@@ -155,7 +161,7 @@ def _started_from(repo: Repository, target: str) -> Commit:
 
 
 def author_of(folder: Path) -> str:
-    """Return the name of the author of the checked-out commit, or an empty text."""
+    """Return the name of the author of the checked-out commit, or an empty text if none is."""
     try:
         repo = Repository(str(folder))
         return str(repo.head.peel(Commit).author.name)

@@ -31,7 +31,7 @@ _PLACE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Helm's output for a chart: API group and kind of each rendered object, or faults."""
+    """Helm's output for a chart: API group and kind of each rendered object; faults; warnings."""
 
     kinds: tuple[tuple[str, str], ...] = ()
     faults: tuple[Fault, ...] = ()
@@ -47,9 +47,9 @@ class Helm:
 
     @staticmethod
     def find(home: Path) -> Helm | None:
-        """Return the program ``helm`` that ``HELM_BIN`` names or ``PATH`` has, or None.
+        """Return the program that ``HELM_BIN`` names, or None if there is none.
 
-        ``home`` is helm's home folder.
+        If ``HELM_BIN`` is not set, return ``helm`` on ``PATH``. ``home`` is helm's home folder.
         """
         program = shutil.which(os.environ.get(HELM_BIN) or "helm")
         return Helm(program, home) if program else None
@@ -104,7 +104,7 @@ def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:
 def parsed_lint(out: str, chart: str) -> Report:
     """Return the faults and warnings in the output of ``helm lint``.
 
-    The path of each fault begins with ``chart``, the name of the chart's folder.
+    A fault whose template helm does not name is located at ``chart``, the chart's folder.
     """
     found: dict[str, list[Fault]] = {"ERROR": [], "WARNING": []}
     for entry in re.split(r"\n(?=\[|\n)", out):
@@ -115,7 +115,10 @@ def parsed_lint(out: str, chart: str) -> Report:
 
 
 def parsed_error(err: str, chart: str) -> Fault:
-    """Return helm's error message as a fault, located at the template and line that helm names."""
+    """Return helm's error message as a fault, located at the last template and line in it.
+
+    If helm names no template, the fault is located at ``chart``.
+    """
     text = err.partition("Error: ")[2] or err
     return _fault(text.partition("\n\nUse --debug")[0].strip(), chart)
 

@@ -73,7 +73,12 @@ def faults_and_suggestions(
     """Return a fault for each edited path, and the suggested overrides.
 
     An override is suggested where it has the effect of the edit, or of a part of the edit.
-    ``owner`` is the person who is named as the owner of the overrides.
+
+    Args:
+        files: path → text of the edited checkout.
+        base: the commit that the edit started from.
+        paths: the paths of the generated files that were edited.
+        owner: the person to name as the owner of the overrides; if empty, it is "unknown".
     """
     releases = {path_of(release): release for release in base.releases().values()}
     used = {path for path in files if path.startswith(f"{OVERRIDES_ROOT}/")}
@@ -85,7 +90,8 @@ def faults_and_suggestions(
         if release is not None and before is not None and base.state is not None:
             effects, not_covered = _effects(before, after, release, base.state.config)
             if effects:
-                others = [one.name for one in releases.values() if _fits(release, one)]
+                whole = "deny" in effects
+                others = [one.name for one in releases.values() if _fits(release, one, whole=whole)]
                 text = _override_text(effects, release, who)
                 file = _unused_path(release.name, used)
                 suggestion = Suggestion(path, file, text, tuple(not_covered), tuple(sorted(others)))
@@ -116,8 +122,15 @@ def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | Non
         return f"{_LOST}, and merge {suggestion.file} as shown{unchanged}"
     if path.startswith(f"{NOTES_ROOT}/"):
         return "is written by the generator, which would undo the edit; revert the edit"
-    if path.startswith(f"{claim_file.LEDGER_ROOT}/") and added:
-        return "is not the path of a claim, so the generator would remove the file; do not add it"
+    if path.startswith(f"{claim_file.LEDGER_ROOT}/"):
+        if added:
+            return (
+                "is not the path of a claim, and people may add only claims and waiting demands to "
+                "ledger/; remove the file"
+            )
+        return "is written only by the generator; revert the edit"
+    if path.startswith(f"{BOOTSTRAP_ROOT}/") and added:
+        return "is in a generated folder, from which the generator removes other files; delete it"
     if added:
         return (
             "is in a generated folder, from which the generator removes what no demand needs; "
@@ -127,7 +140,7 @@ def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | Non
 
 
 def _source_of(path: str) -> str:
-    """Return the files to edit instead of a generated file that is not a release."""
+    """Return what to edit instead of a generated file, if no override can replace the edit."""
     if path.startswith(f"{BOOTSTRAP_ROOT}/"):
         return "demandops.yaml, inventory/ or policy/"
     if "/_charts/" in path:
@@ -162,8 +175,14 @@ def _override_text(effects: dict[str, Any], release: Release, owner: str) -> str
     return modeline(f"{OVERRIDES_ROOT}/NAME.yaml", "override") + text
 
 
-def _fits(release: Release, other: Release) -> bool:
-    """Return whether the override suggested for ``release`` also fits ``other``."""
+def _fits(release: Release, other: Release, *, whole: bool) -> bool:
+    """Return whether the override suggested for ``release`` also applies to ``other``.
+
+    ``whole`` says whether it selects both ends of a connection (:func:`_selector`).
+    """
+    if not isinstance(release, ServiceRelease) and not isinstance(other, ServiceRelease):
+        shared = set(release.connections) & set(other.connections)
+        return whole and release.name != other.name and bool(shared)
     if not (isinstance(release, ServiceRelease) and isinstance(other, ServiceRelease)):
         return False
     same = (release.key.service, release.node.id) == (other.key.service, other.node.id)
@@ -273,7 +292,7 @@ def _client_effects(
 ) -> tuple[dict[str, Any], list[str]]:
     """Return what :func:`_effects` returns for an edit of a communication client's file.
 
-    The file has plain manifests, in which an override can change only the images.
+    The file has plain manifests. Of the edited fields, only images become effects.
     """
     images, not_covered = dict[str, dict[str, str]](), list[str]()
     by_reference = {image.reference(): (name, image) for name, image in config.images.items()}

@@ -54,8 +54,11 @@ class CheckResult:
 
     ``base`` is the commit that the checkout is compared with, if any. If ``base_valid`` is False,
     that commit has files that are not valid, and their last valid versions are compared instead.
-    ``preview`` and ``bookkeeping`` show what the merge changes. Both are None if a file of the
-    checkout is not valid. ``bookkeeping`` is also None if the bookkeeping of ``base`` is not known.
+    ``preview`` and ``bookkeeping`` show what the merge changes. Both are None if the configuration
+    is not valid or the desired state cannot be rendered. Claims that are not valid are left out of
+    both. ``bookkeeping`` is also None if the bookkeeping of ``base`` is not known, and empty if
+    there is no ``base``.
+
     ``target`` is the name of the merge target, and ``newer`` counts the commits that it has and the
     checkout lacks. ``warnings`` point out likely mistakes and what a person has to do after the
     merge.
@@ -85,14 +88,15 @@ def check(
     Args:
         folder: a checked-out state repo, or its files without Git.
         base: the merge target; by default ``origin/main``, else ``main``. The edit is compared
-            with the common ancestor of HEAD and the merge target.
+            with the common ancestor of HEAD and the merge target. If there is no merge target, the
+            edit is compared with HEAD.
         now: the time of the check, by default the current time. Overrides that ended before this
             time do not apply.
         require_helm: whether a missing helm is a fault.
 
     Raises:
-        StateRepoError: the folder is not a state repo, or ``base`` is not a commit that has an
-            ancestor in common with HEAD.
+        StateRepoError: the folder is not a state repo; or Git cannot open it; or it lacks files or
+            commits; or ``base`` is not a commit that has an ancestor in common with HEAD.
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
@@ -167,7 +171,10 @@ def _helm_is_missing(charts: RenderedCharts) -> Iterator[Fault]:
 
 
 def _newly_missing(start: Base | None, state: State) -> Iterator[Fault]:
-    """Yield a warning for each topic that an application lacks only after the merge."""
+    """Yield a warning for each topic that an application lacks only after the merge.
+
+    If the state before the merge is not known, yield one for each topic that is lacking.
+    """
     old = start.state if start else None
     known = {(one.application, one.reason) for one in missing_inputs(old)} if old else set()
     for one in missing_inputs(state):
@@ -239,7 +246,10 @@ class _Edit:
         return config
 
     def merged_state(self, config: Config, ledger: Ledger) -> State:
-        """Return the state that the generator reaches after the edit is merged."""
+        """Return the state that the generator reaches after the edit is merged.
+
+        Raises InvalidInput if the configuration cannot be rendered.
+        """
         root = f"{ended_override_file.MARKERS_ROOT}/"
         markers = {path: text for path, text in self.files.items() if path.startswith(root)}
         ended = ended_override_file.read(markers)
@@ -260,7 +270,8 @@ class _Edit:
     def refused_claims(self, state: State) -> Iterator[Fault]:
         """Yield the reasons why the generator would refuse claims.
 
-        Only claims that the edit adds or changes are checked.
+        Only claims that the edit adds or changes are checked. If the state before the edit is not
+        known, none is checked.
         """
         old = self.start.state if self.start else None
         if old is not None:

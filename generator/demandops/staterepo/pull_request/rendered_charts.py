@@ -2,7 +2,8 @@
 
 The charts of each application are also rendered for an example demand. The kinds of the rendered
 objects are compared with those that the access domain allows. If an edit does not change a chart,
-the chart is rendered only for the examples, and for the releases whose values the edit changes.
+the chart is rendered only for the examples, and for the releases whose files the edit changes.
+Charts in a registry are not rendered.
 """
 
 from __future__ import annotations
@@ -29,14 +30,20 @@ from demandops.render.trial_render import trial_releases
 from demandops.staterepo.pull_request.helm import HELM_BIN, Helm, Report
 
 MISSING = "helm is missing"
-NO_HELM = f"charts not rendered: {MISSING}; install it and put it on PATH, or name it in {HELM_BIN}"
+NO_HELM = (
+    f"charts not rendered: {MISSING}; install it and name it in {HELM_BIN}, or put it on PATH and "
+    f"leave {HELM_BIN} unset"
+)
 
 
 @dataclass(frozen=True, slots=True)
 class RenderedCharts:
     """Which charts helm rendered, for how many releases and examples, and the faults found.
 
-    ``not_rendered`` maps each chart that helm did not render to the reason.
+    ``rendered`` has each chart that helm tried to render, even if there were faults.
+    ``not_rendered`` maps each chart that helm could not get as a whole, or all charts if helm is
+    missing, to the reason. A chart that is not used, or whose lint or schema has a fault, is in
+    neither.
     """
 
     rendered: tuple[str, ...] = ()
@@ -89,7 +96,11 @@ def _concerned(
     changed: Collection[str] | None,
     wanted: Collection[str],
 ) -> bool:
-    """Return whether a release must be rendered, because an edit could affect its objects."""
+    """Return whether a release must be rendered, because an edit could affect its objects.
+
+    This is also true if the changed paths are unknown, and for charts in a registry, which are then
+    reported as not rendered.
+    """
     if changed is None or not release.chart.folder or path_of(release) in wanted:
         return True
     prefixes = tuple(f"{one}/" for one in chart_files.folders(release.chart.folder, config.files))
@@ -219,7 +230,7 @@ class _Run:
         )
 
     def _refused(self, report: Report, release: ServiceRelease) -> Iterator[Fault]:
-        """Yield a fault for each rendered kind that the release's access domain does not allow."""
+        """Yield a fault for each rendered object whose kind the access domain does not allow."""
         domain = release.domain
         allowed = {(one.group, one.kind) for one in domain.allowed_kinds}
         for group, kind in report.kinds:
@@ -227,7 +238,7 @@ class _Run:
                 file = self._state.config.file_of(DOMAINS_FILE, domain.name)
                 message = (
                     f"renders a {kind}, which is not among the kinds of access domain "
-                    f"'{domain.name}', so the domain's cluster would refuse the object; add the "
-                    f"kind to the domain's `kinds` in {file}, or leave the object out"
+                    f"'{domain.name}', so the domain's cluster would refuse the object; "
+                    f"{domain.how_to_allow(kind, file)}, or leave the object out"
                 )
                 yield fault("", message).within(str(release.chart.folder))
