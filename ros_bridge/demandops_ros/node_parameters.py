@@ -41,7 +41,8 @@ _DESCRIPTIONS = {
     "state_repo": "Folder or URL of the state repo.",
     "fetch_interval": "How often people's commits are fetched while no demand comes; 0 for no "
     "interval.",
-    "requester_queue_limit": "How many demands of one requester may be queued; more are rejected.",
+    "requester_queue_limit": "How many demands of one requester may be without an answer; more "
+    "are rejected.",
     "log_level": "Lowest level of messages in the log.",
 }
 

@@ -91,7 +91,7 @@ class TestOverride:
         options = ("--node", "cloud", "--hold", "-m", "why", "--expires", "2h", "--dry-run")
         ran = demandops("override", "create", "calm", *options, *where)
         assert (ran.code, joined.tip) == (0, before)
-        assert "warning: overrides/calm.yaml matches nothing that is demanded now\n" in ran.err
+        assert "calm.yaml has no effect on anything that is demanded now\n" in ran.err
         assert "    hold: true\n" in ran.out
 
     def test_who_is_unknown_to_git_is_told_how_to_change_that(

@@ -240,7 +240,8 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
             known = getattr(repository, repository.gitops)
             text = strict_yaml.set_key(text, gitops, {"url": request.url or known.url})
         elif request.url not in (None, section.url):
-            message = f"is set to {section.url} already; change it in this file, or leave out --url"
+            what = f"is set to {section.url} already; change" if section.url else "is missing; add"
+            message = f"{what} it in this file, or leave out --url"
             raise InvalidInput([fault(f"{gitops}.url", message)])
     except InvalidInput as error:
         raise InvalidInput(strict_yaml.faults_in(error, ROOT_FILE)) from None

@@ -292,7 +292,7 @@ def warn_of_idle(entry: Entry) -> None:
     """Warn about an override that has no effect now."""
     override = entry.override
     if entry.state == "matches nothing":
-        errors.print(f"warning: {override.path} matches nothing that is demanded now")
+        errors.print(f"warning: {override.path} has no effect on anything that is demanded now")
     elif entry.state in ("held back", "expired"):
         errors.print(f"warning: {override.path} is {entry.state}, so it changes nothing now")
 

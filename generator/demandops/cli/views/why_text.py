@@ -56,7 +56,7 @@ def _state(answer: Json) -> str:
         return "is used" if runs else "is not used"
     if kind == "override":
         nothing = answer["state"] == "matches nothing"
-        return "matches nothing" if nothing else f"is {answer['state']}"
+        return "has no effect now" if nothing else f"is {answer['state']}"
     return "runs" if runs else "does not run"
 
 

@@ -89,7 +89,7 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
     path = path_of(planned) if planned else None
     path = path or reader.release_path(name, commit_state.commit)
     if path is None:
-        raise StateRepoError(f"nothing called {quoted(name)} runs or ever ran")
+        raise StateRepoError(f"up to this commit, nothing called {quoted(name)} ran")
     history = reader.history(path, commit_state.commit, MOST_CHANGES)
     last = next(iter(history.newest), None) or history.started
     if history.stopped and not release:
