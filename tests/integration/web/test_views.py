@@ -11,11 +11,13 @@ from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.health.release_health import Health
 from demandops.cluster.orphans import Orphan
 from demandops.cluster.release_status import ReleaseStatus
+from demandops.errors import StateRepoError
 from demandops.ledger.waiting import WaitingDemand
 from demandops.plan.release import ServiceRelease
 from demandops.web.follower import Follower
 from demandops.web.situation import CommitState, Situation
 from demandops.web.views import fleet_map
+from demandops.web.views.demand_view import explained_demand
 from demandops.web.views.filtered_table import Filter
 from demandops.web.views.lists import rows_of
 from demandops.web.views.remedy import remedy_of
@@ -152,6 +154,12 @@ def test_a_filter_finds_words_fields_and_exact_values(look: Look) -> None:
     assert found("node=edg") == []
 
 
+def test_overrides_that_a_filter_hides_are_not_denied(look: Look) -> None:
+    assert "No overrides: everything runs as it is demanded." in look("/overrides").text
+    page = look("/overrides", q="nothing-like-this")
+    assert "No override matches the filter." in page.text and "No overrides" not in page.text
+
+
 def test_links_carry_the_filter_and_the_shown_commit(look: Look, state: GitRepo) -> None:
     page = look("/services", q="vehicle00", at=state.tip)
     kept = f"at={state.tip}"
@@ -236,3 +244,5 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     assert cause.why == "waits for room on a node"
     rows = [row for row in rows_of(now, "demands") if Filter("demand=later").matches(row)]
     assert [row.cells["health"].parts[0].text for row in rows] == ["waits for room"]
+    with pytest.raises(StateRepoError, match="'later' holds nothing, because it waits for room"):
+        explained_demand(now, follower.reader(), "later")

@@ -53,11 +53,16 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand
     """
     claims = now.commit_state.claims_of_demands.get(id)
     if not claims:
-        raise StateRepoError(f"demand {quoted(id)} holds nothing")
+        why = ", because it waits for room on a node" if _waits(now, id) else ""
+        raise StateRepoError(f"demand {quoted(id)} holds nothing{why}")
     releases = now.commit_state.releases_of_demands.get(id, [])
     return ExplainedDemand(
         id, claims, requesters_of(claims), releases, _consequence(now, reader, id)
     )
+
+
+def _waits(now: Situation, id: str) -> bool:
+    return any(one.demand == id for one in now.commit_state.state.ledger.waiting.values())
 
 
 def _consequence(now: Situation, reader: Reader, id: str) -> Consequence:
