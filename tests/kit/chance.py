@@ -1,4 +1,4 @@
-"""Settings of Hypothesis: the same examples every time, so that no build fails by chance.
+"""Settings of Hypothesis: by default the same examples every time, so no build fails by chance.
 
 ``DEMANDOPS_EXAMPLES=20`` tries twenty times as many examples, and different ones each time.
 """

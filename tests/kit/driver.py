@@ -7,8 +7,8 @@ as one line of JSON with these fields, among others:
   demand.
 - ``opening``: a demand, or nothing. The lanes start while the worker is busy with this demand, so
   that the first demands of the lanes become one batch.
-- ``die_at``: ``<point>`` or ``<point>:<n>``. The process gets SIGKILL when it reaches the point for
-  the first or the n-th time.
+- ``die_at``: ``<point>`` or ``<point>:<n>``; empty for no kill. The process gets SIGKILL when it
+  reaches the point for the first or the n-th time.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
 }
 """For each point: the functions at whose calls to kill the process, and when to kill it.
 
-The process is killed after the call (true) or before the call (false).
+The process is killed after the call (true) or before the call (false). :func:`arm` has one further
+point, ``withdrawn``.
 """
 
 

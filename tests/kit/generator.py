@@ -47,7 +47,10 @@ def book(generator: Generator, *goals: Goal) -> list[Receipt]:
 
 
 class Gate:
-    """A listener that blocks the worker at a stage of a demand until a test sets ``open``."""
+    """A listener that blocks the worker at a stage of a demand until a test sets ``open``.
+
+    After ``PATIENCE_S``, it blocks no longer.
+    """
 
     def __init__(self, stage: str = "admitted") -> None:
         self._stage = stage

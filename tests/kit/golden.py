@@ -1,9 +1,9 @@
 """The golden cases: requests played in memory on a state repo, and the files that they must render.
 
 The requests are ``tests/golden/<case>/requests/*.yaml``, in order. ``expected/<step>/`` has the
-files that a step writes, as real files that a reviewer and `kubectl` can read. In each such folder,
-the file ``DELETED`` lists the paths that the step deletes. The first step, ``0-start``, is what
-`init` renders. The files in a case's ``state-repo/`` replace or extend the skeleton's files.
+files that a step writes, as real files that a reviewer and `kubectl` can read. If a step deletes
+files, the file ``DELETED`` in its folder lists their paths. The first step, ``0-start``, is what
+`init` renders. The YAML files in a case's ``state-repo/`` replace or extend the skeleton's files.
 
 The folder of a step has these files:
 

@@ -39,7 +39,7 @@ class Answer:
 
 @dataclass
 class Server:
-    """A running server: its URL, the calls so far, and the function that answers further calls."""
+    """A running server: its URL, the calls so far, and the function that answers the next calls."""
 
     answer: Callable[[Call], Answer] = lambda call: Answer()
     url: str = ""

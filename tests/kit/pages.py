@@ -78,8 +78,8 @@ def blocks(markdown: str) -> Iterator[Block]:
 def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
     """Write the files of a page and run its commands.
 
-    Raise an AssertionError if a command's output differs from what the page shows. If the page
-    shows no output for the command, only a failure of the command raises the error.
+    Raise an AssertionError if a command's output differs from what the page shows; the exit code
+    does not count then. If the page shows no output, raise the error only if the command fails.
     """
     state = folder / ".state"
     state.write_text(f"cd {folder}\n")

@@ -145,10 +145,9 @@ class Drivers:
 def listen_to_all(
     drivers: Drivers, runs: list[Run], on_ready: Callable[[], object] = lambda: None
 ) -> list[Told]:
-    """Return the events of all runs once all have ended; kill the runs if the test is interrupted.
+    """Return the events of all runs once all have ended; if that fails, kill the runs.
 
-    Args:
-        on_ready: called once, when all generators have started.
+    ``on_ready`` is called once, when all generators have started.
     """
     waited_for = threading.Barrier(len(runs), on_ready)
     with ThreadPoolExecutor(len(runs)) as pool:

@@ -1,7 +1,8 @@
 """State repos in Git for tests: a bare repository, a person with a clone, and the history.
 
 Commits and files are read with git and pygit2, not with the generator's own code, so that tests do
-not depend on that code.
+not depend on that code. Only :func:`books` and :func:`differing` read with it, and
+:func:`write_tree` writes with it.
 """
 
 from __future__ import annotations
@@ -149,7 +150,7 @@ class Person:
         return git(self.folder, *args)
 
     def fetch(self) -> None:
-        """Fetch the branches into the clone and check out main; make the clone if there is none."""
+        """Fetch, and reset the clone's checked-out branch to main; clone if there is no clone."""
         if not self.folder.exists():
             git(self.folder.parent, "clone", "--quiet", str(self.bare), str(self.folder))
             return
@@ -327,7 +328,7 @@ def claims(repo: Path, needle: str = "") -> list[str]:
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
-    """Return the commits that `demandops verify` rejects: their summaries and differing files.
+    """Return the differing files of each commit that `demandops verify` rejects, by its summary.
 
     Only commits after ``since`` are verified, by default all after the first one.
     """

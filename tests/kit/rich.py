@@ -324,7 +324,10 @@ def rich() -> dict[str, str]:
 
 
 def rich_with_api() -> dict[str, str]:
-    """Return the files of :func:`rich` for Argo CD, with ``proposals.api``, without ``labels``."""
+    """Return the files of :func:`rich` with another ``demandops.yaml``.
+
+    It is for Argo CD, has ``proposals.api``, and lacks most optional fields.
+    """
     return rich() | {"demandops.yaml": _PROPOSALS_BY_API}
 
 

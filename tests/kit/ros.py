@@ -87,7 +87,7 @@ class Served:
     domain: int
 
     def demandops(self, *args: str) -> str:
-        """Run a command on the state repo in this process; return its output."""
+        """Run a command on the state repo in this process; it must succeed. Return its output."""
         with redirect_stdout(io.StringIO()) as printed:
             assert run([*args, "--state-repo", self.state_repo]) == 0
         return printed.getvalue()
@@ -97,9 +97,10 @@ class Served:
         return data
 
     def wait_for(self, text: str, seconds: float = DEADLINE_S) -> None:
-        """Wait until the log contains ``text``; fail with :meth:`last_words` if it is late.
+        """Wait until the log contains ``text``.
 
-        The time in which the process waits for a processor does not count. On a busy machine, a
+        If the text is late, or if the process ends without it, fail with :meth:`last_words`. The
+        time in which the process waits for a processor does not count. On a busy machine, a
         start of two seconds once waited half a minute for a processor.
         """
         began = time.monotonic()
@@ -131,7 +132,7 @@ class Served:
         return "\n".join([*lines, self.log.read_text()])
 
     def _scheduled(self, thread: int) -> tuple[float, float]:
-        """Return how many seconds a thread ran, and how many it waited for a processor."""
+        """Return the seconds that a thread ran and waited for a processor; zeros if it ended."""
         try:
             path = Path(f"/proc/{self.process.pid}/task/{thread}/schedstat")
             ran, waited, _ = map(int, path.read_text().split())

@@ -69,7 +69,10 @@ class Turns(Clock):
             thread.throw()
 
     def _next(self) -> greenlet:
-        """Return a random thread that can go on; if none can, one whose timeout is next."""
+        """Return a random thread that can go on.
+
+        If none can, move the clock to the next timeout, and return a thread whose timeout it is.
+        """
         free = [one for one, (is_over, _) in self._waiting.items() if is_over()]
         if not free:
             end = min(end for _, end in self._waiting.values())

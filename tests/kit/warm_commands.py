@@ -26,7 +26,7 @@ from typing import IO, Any
 
 
 class WarmCommand:
-    """A forked command, with the interface of `subprocess.Popen`."""
+    """A forked command, with the members of `subprocess.Popen` that tests use."""
 
     def __init__(self, told: IO[str]) -> None:
         """Read the command's process id from ``told``, which later gives its exit code."""

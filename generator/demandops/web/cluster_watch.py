@@ -1,4 +1,4 @@
-"""Watches the releases on their clusters, and records each change of a release's health."""
+"""Watches the releases on their clusters, and records the changes of their health."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _KEPT = 2_000
 class ClusterWatch:
     """Watches the health of releases on clusters.
 
-    One thread calls all methods. Any thread may read :attr:`changes`.
+    Only one thread at a time may use a watch, but any thread may read :attr:`changes`.
     """
 
     def __init__(
@@ -51,7 +51,10 @@ class ClusterWatch:
 
     @property
     def changes(self) -> tuple[HealthChange, ...]:
-        """The changes of health since the start, oldest first; any thread may read them."""
+        """The newest changes of health since the start, at most 2,000, oldest first.
+
+        The first health that a cluster reports of a release is no change.
+        """
         return tuple(self._changes.copy())
 
     def statuses(
@@ -71,9 +74,13 @@ class ClusterWatch:
     def old_bootstraps(
         self, domains: Collection[ClusterDomain], read: Callable[[str], str | None]
     ) -> tuple[OldBootstrap, ...]:
-        """Return the clusters that have not applied the current version of their bootstrap file.
+        """Return the watched clusters that lack the current version of their bootstrap file.
 
-        ``read`` returns the text of a file of the state repo.
+        Access domains that cannot be read are left out.
+
+        Args:
+            domains: the access domains on each cluster.
+            read: returns the text of a file of the state repo, or None if the file is missing.
         """
         self._watch(domains)
         return tuple(old_bootstraps(domains, self._caches, read))
@@ -85,7 +92,10 @@ class ClusterWatch:
         commit: str,
         repository: StateRepository,
     ) -> tuple[Orphan, ...]:
-        """Return the orphans on the clusters: objects whose release is gone at ``commit``."""
+        """Return the orphans on the watched clusters: objects whose release is gone.
+
+        Access domains that cannot be read, or that have not applied ``commit``, are left out.
+        """
         self._watch(domains)
         return tuple(orphans(domains, targets, commit, self._caches, repository))
 

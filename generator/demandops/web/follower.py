@@ -33,10 +33,10 @@ from demandops.web.situation import Commit, CommitState, HealthChange, Situation
 log = logging.getLogger("demandops")
 
 MOST_COMMITS = 5_000
-"""How many of the newest commits the page keeps; it leaves older commits out."""
+"""How many of the newest commits the time line and the rates show."""
 
 _LOOK_S = 0.2
-"""The pause in seconds between checks of a local repository; each check reads one file."""
+"""The pause in seconds between checks of a local repository, which cost little."""
 _PAUSE_FACTOR = 4
 """After a new situation, the follower pauses this many times as long as the computation took.
 
@@ -90,17 +90,22 @@ class Follower:
 
     @property
     def health_changes(self) -> tuple[HealthChange, ...]:
-        """The changes of health since the follower started, oldest first."""
+        """The newest changes of health since the follower started, oldest first."""
         return self._watch.changes
 
     def reader(self) -> Reader:
-        """Return a reader of the state repo for the calling thread."""
+        """Return a reader of the state repo for the calling thread.
+
+        Raises:
+            StateRepoError: if the state repo cannot be read.
+        """
         return self._reader.for_another_thread()
 
     def at(self, revision: str) -> Situation:
         """Return the situation at a revision, which is a commit or a time.
 
-        If ``revision`` is empty, return the newest situation.
+        If ``revision`` is empty, return the newest situation. The situation at an earlier commit
+        has neither health nor proposals.
 
         Raises:
             InvalidInput, StateRepoError: if there is no such commit, or its state cannot be read.
@@ -122,9 +127,13 @@ class Follower:
         return Situation(commit_state, newest.now, is_newest=False)
 
     def last_change(self, commit_state: CommitState, path: str) -> LogEntry | None:
-        """Return the newest commit that changed a file or folder; None if no commit did.
+        """Return the newest commit that changed a file or folder.
 
-        Only the commit of ``commit_state`` and its ancestors count.
+        Only the commit of ``commit_state`` and its ancestors count. Return None if none of them
+        changed it, or if ``path`` is empty.
+
+        Raises:
+            StateRepoError: if the state repo cannot be read.
         """
         if path not in commit_state.last_changes:
             found = self.reader().log(commit_state.commit, path) if path else iter(())
@@ -134,8 +143,8 @@ class Follower:
     def not_rendered(self, commit_state: CommitState) -> frozenset[str]:
         """Return the paths of the generated files that are out of date at a commit.
 
-        A generator has yet to write or remove these files. The set is empty if the state repo
-        cannot be read.
+        A generator must still write or remove these files after that commit. The set is also
+        empty if the state of the commit cannot be read or rendered.
         """
         if commit_state.not_rendered is None:
             try:
@@ -180,7 +189,7 @@ class Follower:
             found = self._situation_at(commit_state)
         except DemandOpsError as error:
             found = replace(known, unread=one_line(str(error).replace("\n", "; ")))
-        except Exception as error:  # a fault here must not stop the ROS node in the same process
+        except Exception as error:  # the page must show that it does not follow any more
             if not known.unread:
                 log.exception("the page cannot follow the state repo")
             found = replace(known, unread=f"a fault of the program: {one_line(repr(error))}")
@@ -219,7 +228,7 @@ class Follower:
             with suppress(DemandOpsError):
                 new = list(islice(self._reader.log(f"{known}..{tip}"), MOST_COMMITS))
         before = self.history
-        if new is None:  # the first time, or after the history was rewritten
+        if new is None:  # the first time, or ``tip`` does not follow the known commit
             new, before = list(islice(self._reader.log(tip), MOST_COMMITS)), ()
         added = tuple(Commit(entry, self._reader.changed_roots(entry.commit)) for entry in new)
         self.history = (added + before)[:MOST_COMMITS]

@@ -1,4 +1,4 @@
-"""The web server of the page. It runs in its own thread and binds its own address."""
+"""The web server of the page, which has its own thread and its own address."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ class WebServer:
         Args:
             address: ``host:port``; port 0 picks a free port.
             option: the option that gave the address, for messages.
-            follower: provides what the page shows. It is closed together with the server, and also
-                if the server cannot start.
+            follower: provides what the page shows. :meth:`close` closes it, and so does an address
+                on which the server cannot listen.
 
         Raises:
             InvalidInput: if the server cannot listen on the address.

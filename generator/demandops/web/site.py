@@ -1,7 +1,8 @@
 """The site: it renders views as pages, sends events, and sets headers that keep other sites out.
 
 No request changes anything, and no page loads anything from another host. Templates escape the HTML
-and the invisible characters in every value that they print.
+in every value that they print. They also escape invisible characters, except in the fields of the
+form, which send their values back.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ _DOCS_HEADERS = _HEADERS | {
         "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     )
 }
-"""HTTP headers that allow inline scripts and styles, as the documentation's pages contain.
+"""HTTP headers that allow the inline scripts and styles of the documentation.
 
 This is safe, because the documentation contains no data of a state repo.
 """
@@ -64,9 +65,9 @@ _HEARTBEAT_S = 15.0
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
 _EARLIER_AT_ONCE = 4
-"""How many views of earlier commits may be rendered at the same time.
+"""How many views with a chosen commit or time may be rendered at the same time.
 
-Such a view may take seconds. The limit keeps these views from delaying views of the newest commit.
+Such a view may take seconds. The limit keeps these views from delaying the others.
 """
 
 
@@ -136,7 +137,7 @@ class Site:
             return self._page(asked, template, {**data, "version": version})
         except DemandOpsError as error:
             return self._message(request, "Nothing to show", str(error), 404)
-        except Exception:  # a fault here must not stop the ROS node in the same process
+        except Exception:  # the visitor must learn where to look
             log.exception("view %s of the page does not work", request.url.path)
             text = "a fault of the program; see its log"
             return self._message(request, "This view does not work", text, 500)
@@ -161,7 +162,7 @@ class Site:
         return HTMLResponse(page.render(shown), status)
 
     async def _nothing_here(self, request: Request, error: Exception) -> Response:
-        return self._message(request, "Nothing here", "there is no such view", 404)
+        return self._message(request, "Nothing here", "there is no such view or file", 404)
 
     async def _health(self, request: Request) -> Response:
         unread = self._follower.newest.unread
@@ -169,7 +170,7 @@ class Site:
 
 
 class _Events:
-    """Tells browsers by server-sent events that the page's data has changed."""
+    """Tells browsers by server-sent events which version the page's data has now."""
 
     def __init__(self, follower: Follower) -> None:
         self._follower, self._listeners = follower, 0
@@ -202,7 +203,7 @@ class _Events:
 
 
 class _ClosedHeaders:
-    """Middleware that adds headers to every answer, so that other sites cannot use the page."""
+    """Middleware that adds headers to the answers, so that other sites cannot use the page."""
 
     def __init__(self, application: ASGIApp) -> None:
         self._application = application
@@ -234,6 +235,6 @@ def _when(at: datetime) -> str:
 
 
 def _clock(at: datetime, now: datetime) -> str:
-    """Return a time as text in UTC; leave out the date if it is the date of ``now``."""
+    """Return a time as text in UTC: with seconds on the day of ``now``, else with the date."""
     at, today = at.astimezone(timezone.utc), now.astimezone(timezone.utc).date()
     return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")

@@ -1,7 +1,8 @@
 """What the page shows: the state at a commit, the health of releases and the open proposals.
 
-A commit state is the state at one commit, with everything that the page derives from it. A
-situation is a commit state with the reports of the clusters and the open proposals.
+A commit state is the state at one commit, with everything that the page derives from it. The newest
+situation is a commit state with the reports of the clusters and the open proposals. The situation
+at an earlier commit has only the commit state.
 """
 
 from __future__ import annotations
@@ -57,8 +58,8 @@ class ReusableRows:
     """The rows of a list, kept for the next time that the page shows the list.
 
     ``rows`` maps the id of each entry to a pair: the entry's values, and the row made from the
-    values. ``statuses`` has the status of each release when the rows were made. If the rows were
-    made for an earlier commit, ``statuses`` is None.
+    values. ``statuses`` has the status of each release when the rows were made. If the rows are
+    taken over from an earlier commit, ``statuses`` is None.
     """
 
     statuses: object
@@ -82,9 +83,12 @@ class CommitState:
         self._entries: list[Entry] | None = None
         self._planned: dict[ReleaseKey, Planned | None] | None = None
         self.last_changes: dict[str, LogEntry | None] = {}
-        """For each path that was looked up, the newest commit that changed this path, or None."""
+        """The newest commit, up to this one, that changed each path that was looked up.
+
+        The value is None if no commit changed the path.
+        """
         self.not_rendered: frozenset[str] | None = None
-        """The files that a generator has yet to write or remove; None until they are looked up."""
+        """The files that a generator must still write or remove; None until they are looked up."""
 
     @property
     def commit(self) -> str:
@@ -108,6 +112,8 @@ class CommitState:
 
     def take_over(self, before: CommitState) -> None:
         """Take the releases and rows of an earlier commit state; plan anew what may differ.
+
+        Call this before any other method, because computed attributes are kept.
 
         Do nothing if the configuration or the overrides differ, because then everything may differ.
         """
@@ -169,7 +175,10 @@ class CommitState:
 
     @property
     def planned(self) -> dict[ReleaseKey, Planned | None]:
-        """The planned releases by key; the value is None if an override denies the release."""
+        """The planned releases by key; the value is None if nothing runs at the key.
+
+        An override denies the release then, or the client of a connection carries no topic.
+        """
         if self._planned is None:
             self._planned = {key: self._plan(key) for key in all_keys(self.state)}
         return self._planned
@@ -212,7 +221,10 @@ class CommitState:
 
     @cached_property
     def releases_of_demands(self) -> dict[str, list[str]]:
-        """A map from each demand's id to the names of the releases that the demand needs."""
+        """A map from a demand's id to the names of the releases that the demand needs.
+
+        Demands that need no release are left out.
+        """
         found: dict[str, list[str]] = {}
         for name, claims in self.claims_of_releases.items():
             for demand in dict.fromkeys(claim.demand for claim in claims):
@@ -260,11 +272,11 @@ def _services_with_other_replicas(old: Ledger, new: Ledger) -> Iterator[ServiceK
 class Situation:
     """The state at a commit, with the health of releases and the open proposals.
 
-    ``statuses`` maps names of releases to their status; it is empty for an earlier commit.
-    ``watched`` names the clusters that the page watches. ``old_bootstraps`` lists the clusters
-    without the current bootstrap file. ``orphans`` lists the objects that clusters still have,
-    although they belong to no release. ``unread`` is the reason why a newer state cannot be read,
-    or empty.
+    ``statuses`` maps names of releases to their status. ``watched`` names the clusters that the
+    page watches. ``old_bootstraps`` lists the watched clusters without the current bootstrap file.
+    ``orphans`` lists the objects that watched clusters still have, although they belong to no
+    release. ``unread`` is the reason why a newer state cannot be read or shown, or empty. For an
+    earlier commit, all these are empty.
     """
 
     commit_state: CommitState
@@ -278,8 +290,14 @@ class Situation:
     orphans: tuple[Orphan, ...] = ()
 
     def status(self, release: str) -> ReleaseStatus:
-        """Return the status of a release; unknown if no cluster reports it."""
+        """Return the status of a release; its state is ``unknown`` if no cluster reports it."""
         return self.statuses.get(release, _UNKNOWN)
+
+    @property
+    def unwatched(self) -> list[str]:
+        """The clusters with releases that the page does not watch, sorted."""
+        used = {target.domain.cluster for _, target in self.commit_state.targets}
+        return sorted(used - self.watched)
 
 
 @dataclass(frozen=True, slots=True)
@@ -287,8 +305,9 @@ class HealthChange:
     """A change of a release's health.
 
     ``before`` and ``after`` are words for a health (:mod:`~demandops.web.views.health_word`).
-    ``lasted_s`` says for how many seconds a release that became healthy had been unhealthy. It is
-    None if the release did not become healthy, or if the time is not known.
+    ``lasted_s`` says for how many seconds a release that became healthy was not healthy, counted
+    from when the page first saw it so. It is None if the release did not become healthy, or if the
+    page never saw it so.
     """
 
     time: datetime

@@ -56,11 +56,11 @@ class ViewRequest:
         self.filter = Filter(self.get("q"))
 
     def get(self, name: str) -> str:
-        """Return the value of a parameter; empty if the request does not give it."""
+        """Return the value of a parameter, at most 500 characters; empty if it is not given."""
         return self.params.get(name, "").strip()[:500]
 
     def page(self) -> int:
-        """Return the number of the requested page of a list; 1 if the request gives none."""
+        """Return the number of the requested page of a list; 1 if the request gives no number."""
         text = self.get("page")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
 

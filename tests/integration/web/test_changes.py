@@ -84,7 +84,7 @@ def test_an_invalid_file_names_who_wrote_it(
     page = look("/")
     (cause,) = causes(follower.newest, follower)
     assert cause.kind == "invalid"
-    assert cause.remedy.who == "Petra Platform <petra@example.org>, who last changed it"
+    assert cause.remedy.who == "Petra Platform <petra@example.org>, whose commit made it invalid"
     assert cause.remedy.command.startswith("git show ")
     assert "registry/images.yaml" in look("/overrides").text
     assert "its last valid version stays in effect" in page.text
@@ -112,7 +112,7 @@ def test_a_proposal_names_the_branch_to_merge(
     proposed = Proposed(booked, goals.goal([goals.application("edge/new", who=["v"])], []))
     branch = proposed.branch
     wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
-    assert f"git merge origin/{branch}" in look("/").text
+    assert f"git merge origin/{branch} && git push" in look("/").text
     assert f"git push origin --delete {branch}" in look("/overrides").text
 
 

@@ -73,5 +73,5 @@ def test_a_branch_is_no_command_and_hides_nothing(
     (merge,) = [text for text in page.texts("code") if text.startswith("git merge")]
     assert shlex.split(merge) == ["git", "merge", shown, "&&", "git", "push"]
     (merge,) = [text for text in look("/").texts("code") if text.startswith("git merge")]
-    assert shlex.split(merge) == ["git", "merge", shown]
+    assert shlex.split(merge) == ["git", "merge", shown, "&&", "git", "push"]
     assert HIDDEN not in page.text + look("/").text

@@ -11,12 +11,16 @@ from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.health.release_health import Health
 from demandops.cluster.orphans import Orphan
 from demandops.cluster.release_status import ReleaseStatus
+from demandops.errors import StateRepoError
 from demandops.ledger.waiting import WaitingDemand
+from demandops.plan.release import ServiceRelease
 from demandops.web.follower import Follower
 from demandops.web.situation import CommitState, Situation
 from demandops.web.views import fleet_map
+from demandops.web.views.demand_view import explained_demand
 from demandops.web.views.filtered_table import Filter
 from demandops.web.views.lists import rows_of
+from demandops.web.views.remedy import remedy_of
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes
@@ -88,6 +92,38 @@ def test_releases_with_one_reason_are_one_cause(follower: Follower) -> None:
     (cause,) = causes(now, follower)
     assert cause.kind == "waiting" and len(cause.releases) == len(names)
     assert cause.remedy.who == "the operator of cluster c-its"
+    assert cause.why == "cannot be seen, because cluster c-its cannot be read"
+
+
+def test_a_failing_release_without_images_in_the_registry_names_its_maintainer(
+    follower: Follower,
+) -> None:
+    health = Health("reconciled", "ImagePullBackOff", "HelmRelease perception/x", failing=True)
+    commit_state = follower.newest.commit_state
+    release = commit_state.releases[DETECTION]
+    assert isinstance(release, ServiceRelease)
+    bare = replace(release, service=release.service.model_copy(update={"images": ()}))
+    config = commit_state.config
+    found = remedy_of("failing", bare, config, health.object, health.reason, lambda path: None)
+    assert found.who == "the maintainer of appdefs/object-detection-fusion"
+
+
+def test_not_everything_is_ready_while_a_cluster_is_not_watched(
+    shown: Shown, follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    watched = with_health(follower)
+    monkeypatch.setattr(follower, "_newest", watched)
+    assert shown.look("/").texts("h1") == ["Everything is ready"]
+    assert shown.look("/", q="vehicle00").texts("h1") == ["Everything that matches is ready"]
+    monkeypatch.setattr(follower, "_newest", replace(watched, watched=frozenset({"other"})))
+    page = shown.look("/")
+    assert page.texts("h1") == ["Nothing in the state repo keeps an application from being ready"]
+    assert "Whether pods run on c-its is unknown" in page.text
+
+
+def test_an_unknown_release_is_told_with_the_commit_that_was_searched(look: Look) -> None:
+    page = look("/release", status=404, name="od-nowhere")
+    assert "there was no release 'od-nowhere'" in page.text
 
 
 def test_a_cluster_with_an_old_bootstrap_file_is_a_cause(follower: Follower) -> None:
@@ -116,6 +152,12 @@ def test_a_filter_finds_words_fields_and_exact_values(look: Look) -> None:
     assert found("requester=vehicle01") == ["od-edge-station00", fusion]
     assert found("release:od-edge") == ["od-edge-station00", DETECTION]
     assert found("node=edg") == []
+
+
+def test_overrides_that_a_filter_hides_are_not_denied(look: Look) -> None:
+    assert "No overrides: everything runs as it is demanded." in look("/overrides").text
+    page = look("/overrides", q="nothing-like-this")
+    assert "No override matches the filter." in page.text and "No overrides" not in page.text
 
 
 def test_links_carry_the_filter_and_the_shown_commit(look: Look, state: GitRepo) -> None:
@@ -202,3 +244,5 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     assert cause.why == "waits for room on a node"
     rows = [row for row in rows_of(now, "demands") if Filter("demand=later").matches(row)]
     assert [row.cells["health"].parts[0].text for row in rows] == ["waits for room"]
+    with pytest.raises(StateRepoError, match="'later' holds nothing, because it waits for room"):
+        explained_demand(now, follower.reader(), "later")

@@ -78,10 +78,7 @@ def how_to_release(claim: Claim) -> str:
 
 
 def is_released_by_demand_id(claim: Claim) -> bool:
-    """Return whether people release a claim by its demand id.
-
-    If not, they remove an override, or send the request of the claim again as a shutdown.
-    """
+    """Return whether :func:`how_to_release` tells people to release a claim by its demand id."""
     is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
     return claim.keeping_override is None and not is_of_a_request
 

@@ -83,7 +83,7 @@ function follow() {
     if (data !== version) {
       show(location.href, false)
         .then(() => { version = data; })
-        .catch(() => say("not current: the server does not answer"));
+        .catch(() => say("not current: the server sends no page"));
     }
     if (!live.textContent.startsWith("updated")) say("live");
   });
@@ -107,7 +107,7 @@ if (field) {
       else address.searchParams.delete("q");
       address.searchParams.delete("page");
       history.replaceState(null, "", address);
-      show(address, true).catch(() => say("not current: the server does not answer"));
+      show(address, true).catch(() => say("not current: the server sends no page"));
     }, 150);
   });
   document.addEventListener("keydown", (event) => {

@@ -22,9 +22,9 @@ class Consequence:
     """What would change if a demand were released, and how to release it.
 
     ``how`` says in words how to release the demand. ``file`` is the text of a file for ``demandops
-    request`` that releases the demand; it is empty if no file can. ``approval`` names the rules
-    that require a person's approval. ``refused`` is the reason why the generator would refuse to
-    release the demand, or empty.
+    request`` that releases the demand by its id; it is empty if ``how`` names another way.
+    ``approval`` says because of what a person must approve the release. ``refused`` is the reason
+    why the generator would refuse the release, or empty.
     """
 
     releases: tuple[ReleaseChange, ...]
@@ -49,15 +49,20 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand
     """Return a demand with its claims, and what would change if it were released.
 
     Raises:
-        StateRepoError: if the demand holds nothing.
+        StateRepoError: if the demand holds nothing, or the state repo cannot be read.
     """
     claims = now.commit_state.claims_of_demands.get(id)
     if not claims:
-        raise StateRepoError(f"demand {quoted(id)} holds nothing")
+        why = ", because it waits for room on a node" if _waits(now, id) else ""
+        raise StateRepoError(f"demand {quoted(id)} holds nothing{why}")
     releases = now.commit_state.releases_of_demands.get(id, [])
     return ExplainedDemand(
         id, claims, requesters_of(claims), releases, _consequence(now, reader, id)
     )
+
+
+def _waits(now: Situation, id: str) -> bool:
+    return any(one.demand == id for one in now.commit_state.state.ledger.waiting.values())
 
 
 def _consequence(now: Situation, reader: Reader, id: str) -> Consequence:

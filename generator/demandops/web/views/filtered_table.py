@@ -59,7 +59,7 @@ class Cell:
 
     @property
     def rank(self) -> tuple[bool, float, str]:
-        """The key by which rows are sorted; empty cells come last."""
+        """The key by which rows are sorted; in ascending order, empty cells come last."""
         order = self.order
         if order is None:
             order = self.time.timestamp() if self.time else self.parts[0].text if self.parts else ""
@@ -128,7 +128,8 @@ class Filter:
     """A search text for rows: a row matches if it contains all words of the text.
 
     The word ``node:edge`` matches if the field ``node`` contains ``edge``; ``node=edge`` matches if
-    a text of the field is exactly ``edge``. Quotes join words.
+    a text of the field is exactly ``edge``. If the row has no such field, the word is searched in
+    all texts. Quotes join words. Upper and lower case are the same.
     """
 
     def __init__(self, text: str) -> None:
@@ -157,7 +158,7 @@ def _has(row: Row, word: str) -> bool:
 
 
 def exactly(key: str, value: str) -> str:
-    """Return the filter text that selects rows with exactly this value in the field ``key``."""
+    """Return the filter text for rows that have exactly this value in the field ``key``."""
     return shlex.quote(f"{key}={value}")
 
 

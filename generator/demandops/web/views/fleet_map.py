@@ -34,7 +34,7 @@ _MOST_LINES = 300
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The connections between two nodes, drawn as one line."""
+    """The connections from one node to another, drawn as one line."""
 
     path: str
     tone: str
@@ -96,8 +96,8 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
         now: the situation to draw.
         wanted: the filter; services, connections and nodes that match are lit.
         layout: ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
-            position, and ``cluster`` otherwise. If no node has a position, the layout is always
-            ``cluster``.
+            position, and ``cluster`` otherwise. If no node that is drawn has a position, nodes are
+            always drawn by cluster.
     """
     config = now.commit_state.config
     nodes = list(config.nodes.values())
@@ -232,7 +232,7 @@ def _short(text: str, most: int) -> str:
 
 
 def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> list[Line]:
-    """Return a line for each connected pair of nodes; highlighted lines come last, on top."""
+    """Return a line for each source and target that are drawn; lit lines come last, on top."""
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows_of(now, "connections"):
         ends = row.hidden["node"]

@@ -26,8 +26,9 @@ Values: TypeAlias = "tuple[Any, ...]"
 class ListKind:
     """One of the lists: its name in addresses, its title, its columns and its entries.
 
-    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the values. For
-    an entry whose values have not changed, ``row`` is not called again.
+    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the world and
+    the values. For an entry whose values have not changed, ``row`` is called again only if the
+    configuration or the overrides have changed.
     """
 
     name: str

@@ -124,8 +124,8 @@ def by_place(
 ) -> tuple[dict[str, NodeCard], float]:
     """Return the placed cards by node id, and the height of the map.
 
-    A node that has a position is placed there, with north at the top. The nodes without a position
-    follow in rows below.
+    At least one node must have a position. A node is placed at its position, with north at the top,
+    or below it if another card is there. The nodes without a position follow in rows below.
     """
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]

@@ -28,10 +28,11 @@ _MOST_LISTED = 3
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Something that keeps applications from being ready.
+    """Something that keeps applications from being ready, or that needs attention.
 
-    ``told`` is the original text: a cluster's message, a fault in a file, or a person's reason.
-    ``releases`` names the releases that cannot run because of the cause.
+    ``told`` has details, such as a cluster's message, a fault in a file, or a person's reason.
+    ``releases`` names the releases that an override denies, or that are not healthy. It is empty
+    for a cause that is not found by release, such as a claim that an override suspends.
     """
 
     kind: Kind
@@ -63,7 +64,10 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """Whether an application is ready: one word for its state, and the causes if it is not."""
+    """Whether an application is ready: one word for its state, and the causes if it is not.
+
+    ``word`` is a word for a health, or the kind of the first cause.
+    """
 
     application: str
     word: str
@@ -86,7 +90,7 @@ def causes(
         now: the situation.
         wanted: the filter.
         last_change: returns the newest commit that changed a file or folder.
-        pending: the generated files that a generator has yet to write or remove.
+        pending: the generated files that a generator must still write or remove.
     """
     found = [
         *_unread(now),
@@ -107,7 +111,10 @@ def causes(
 
 
 def applications(now: Situation, found: Iterable[Cause], wanted: Filter) -> list[Ready]:
-    """Return the applications that match a filter; those that are not ready come first."""
+    """Return the applications that match the filter ``wanted``.
+
+    Those that a cause in ``found`` concerns come first.
+    """
     by_application: dict[str, list[Cause]] = {}
     for cause in found:
         for application in cause.applications:
@@ -144,7 +151,8 @@ def _unread(now: Situation) -> Iterator[Cause]:
             Part("The state repo"),
             "cannot be read, so this page may be out of date",
             Remedy(
-                "the operator of the Git server", "make the server reachable; the page tries again"
+                "the operator of the Git server or of this page",
+                "mend what the text above names; the page tries again",
             ),
             told=now.unread,
         )
@@ -153,8 +161,11 @@ def _unread(now: Situation) -> Iterator[Cause]:
 def _invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
     for problem in now.commit_state.problems:
         change = last_change(problem.file)
-        author = problem.author if isinstance(problem, Problem) else ""
-        author = author or (change.author if change else "")
+        who = (
+            f"{change.author}, who last changed it" if change else "the person who last changed it"
+        )
+        if isinstance(problem, Problem) and problem.author:
+            who = f"{problem.author}, whose commit made it invalid"
         field = f", {problem.field}" if problem.field else ""
         since = problem.since if isinstance(problem, Problem) else ""
         yield Cause(
@@ -162,7 +173,7 @@ def _invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
             Part(f"{problem.file or 'The configuration'}{field}"),
             "is not valid, so its last valid version stays in effect",
             Remedy(
-                f"{author}, who last changed it" if author else "the person who last changed it",
+                who,
                 "correct the file by pull request",
                 shlex.join(["git", "show", since[:10]]) if since else "demandops check .",
             ),
@@ -231,7 +242,7 @@ def _proposed(proposal: PendingProposal) -> Cause:
         Remedy(
             "a person who may merge to main",
             "merge the branch to approve the demand, or delete the branch to refuse it",
-            shlex.join(["git", "merge", f"origin/{proposal.branch}"]),
+            shlex.join(["git", "merge", f"origin/{proposal.branch}"]) + " && git push",
         ),
         since=proposal.since,
         requesters=proposal.requesters,
@@ -328,7 +339,7 @@ def _since(statuses: Iterable[ReleaseStatus]) -> datetime | None:
 def _why(kind: Kind, object: str, several: bool) -> str:
     verbs = ("fail", "have", "are") if several else ("fails", "has", "is")
     if object.startswith("cluster "):
-        return "cannot be seen: the cluster does not answer"
+        return f"cannot be seen, because {object} cannot be read"
     if kind == "failing":
         return verbs[0]
     if kind == "waiting":
@@ -339,7 +350,7 @@ def _why(kind: Kind, object: str, several: bool) -> str:
 def _affected(commit_state: CommitState, names: list[str]) -> dict[str, tuple[str, ...]]:
     """Return the applications, requesters and demands that need the releases ``names``.
 
-    The applications that need a connection are those of the demands that hold the connection.
+    A connection is needed by the applications of the demands that hold it.
     """
     applications: dict[str, None] = {}
     claims = [claim for name in names for claim in commit_state.claims_of_releases[name]]

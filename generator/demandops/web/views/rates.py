@@ -1,4 +1,9 @@
-"""Plots of rates and latencies: how many demands arrive, and how long commits and releases take."""
+"""Plots of rates and latencies.
+
+The rates are those of demands that are booked or released, and of people's commits. The latencies
+are the time from the receipt of a demand to its commit, and the time until a release is healthy
+again.
+"""
 
 from __future__ import annotations
 
@@ -18,7 +23,7 @@ _BINS = 48
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One bar of a plot; the label states its time and value."""
+    """One bar of a plot; the label says when its bin of time begins, and its value."""
 
     x: float
     y: float
@@ -29,7 +34,10 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A plot: its bars, the highest value of the axis as text, and the values as a table."""
+    """A plot: its bars, the highest value of the axis as text, and the values as a table.
+
+    Bins of time whose value is 0 have neither a bar nor a line in the table.
+    """
 
     title: str
     unit: str
@@ -59,7 +67,8 @@ def plots(
 ) -> list[Plot]:
     """Return the plots of a span of time that ends at ``now``.
 
-    ``span`` is a key of ``SPANS``. Any other value means the time since the oldest commit.
+    ``span`` is a key of ``SPANS``. ``all``, and any text that is no key, means the time since the
+    oldest of ``commits``; without commits, the last hour.
     """
     seconds = SPANS.get(span, 0)
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
@@ -118,7 +127,7 @@ class _PlotMaker:
         """Return a plot of the median of the samples in each bin of time."""
         bins = self._bins(samples)
         every = sorted(value for one in bins for value in one)
-        summary = "nothing was seen yet"
+        summary = "no values in this span of time"
         if every:
             late = every[math.ceil(0.95 * len(every)) - 1]
             summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, {len(every)} values"

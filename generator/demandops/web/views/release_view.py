@@ -36,9 +36,9 @@ class DiffLine:
 class Explained:
     """A release that runs, that an override denies, or that ran before.
 
-    ``release`` is None if the release does not run. ``difference`` is the diff of the newest change
-    of the release's file. The page proposes an override that stops the release. ``stop_with_it``
-    names the other releases that such an override would stop.
+    ``release`` is None if the release does not run; then ``claims`` is empty. ``difference`` is the
+    diff of the newest change of the release's file. The page proposes an override that stops the
+    release. ``stop_with_it`` names the other releases that such an override would stop.
     """
 
     name: str
@@ -72,7 +72,7 @@ class Explained:
 
     @property
     def requesters(self) -> list[str]:
-        """The requesters that need the release."""
+        """The requesters of the claims that need the release."""
         return sorted({who for claim in self.claims for who in claim.requesters})
 
 
@@ -80,7 +80,7 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
     """Return why a release runs, and the release's history.
 
     Raises:
-        StateRepoError: if there is no such release and never was.
+        StateRepoError: if the situation's commit has no such release, and no earlier one had.
     """
     commit_state = now.commit_state
     release = commit_state.releases.get(name)
@@ -89,7 +89,9 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
     path = path_of(planned) if planned else None
     path = path or reader.release_path(name, commit_state.commit)
     if path is None:
-        raise StateRepoError(f"up to this commit, nothing called {quoted(name)} ran")
+        raise StateRepoError(
+            f"up to commit {commit_state.commit[:10]}, there was no release {quoted(name)}"
+        )
     history = reader.history(path, commit_state.commit, MOST_CHANGES)
     last = next(iter(history.newest), None) or history.started
     if history.stopped and not release:

@@ -1,4 +1,4 @@
-"""Who can fix a release that is not ready, as far as the files and the cluster show."""
+"""Who can probably fix a release that is not ready, judged by the files and the cluster."""
 
 from __future__ import annotations
 
@@ -52,17 +52,18 @@ def remedy_of(
     reason: str,
     last_change: LastChange,
 ) -> Remedy:
-    """Return who can fix a release, and how, as far as its configuration and its cluster show.
+    """Return who can probably fix a release, and how.
 
-    ``object`` and ``reason`` are the Kubernetes object that is not ready, and the reason that the
-    cluster reports.
+    ``object`` names what is not ready: an object, such as ``Deployment perception/od-edge``, or a
+    cluster that cannot be read. ``reason`` says why.
     """
     cluster, (word, _, name) = release.node.cluster, object.partition(" ")
     namespace, _, short = name.partition("/")
     describe = ["kubectl", "-n", namespace, "describe", word.lower(), short]
     command = shlex.join(describe) if short else ""
     if word == "cluster":
-        return Remedy(f"the operator of cluster {cluster}", "make its API reachable from here")
+        how = "make its API reachable from here, and let this page read it (docs/status.md)"
+        return Remedy(f"the operator of cluster {cluster}", how)
     if kind == "waiting" or word in ("Kustomization", "GitRepository", "Application"):
         who = f"the operator of the GitOps controller of cluster {cluster}"
         if kind != "failing":
@@ -87,8 +88,9 @@ def remedy_of(
             "make room on the node, or name another node in the demand",
             command,
         )
-    if _IMAGE.search(reason):
-        return _of_images(release, config, command, last_change)
+    images = [name for name in release.images if name in config.images]
+    if images and _IMAGE.search(reason):
+        return _of_images(release, images, config, command, last_change)
     how = "look at the log of the container" if _CRASH.search(reason) else ""
     if not isinstance(release, ServiceRelease):
         return Remedy(f"the maintainer of the {release.type.word} client", how, command)
@@ -97,8 +99,9 @@ def remedy_of(
     return Remedy(f"the maintainer of {where}{by}", how, command)
 
 
-def _of_images(release: Release, config: Config, command: str, last_change: LastChange) -> Remedy:
-    names = [name for name in release.images if name in config.images]
+def _of_images(
+    release: Release, names: list[str], config: Config, command: str, last_change: LastChange
+) -> Remedy:
     images = [_image(release, name, config).reference() for name in names]
     files = dict.fromkeys(config.file_of(IMAGES_FILE, name) for name in names)
     by = _changed_by(files, last_change)
@@ -110,7 +113,7 @@ def _of_images(release: Release, config: Config, command: str, last_change: Last
 
 
 def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
-    """Return a text that names who last changed each path; empty if no person changed any."""
+    """Return a text that names the people who last changed each path; empty if no person did."""
     changes = filter(None, map(last_change, paths))
     people = dict.fromkeys(one.author for one in changes if one.author != GENERATOR_NAME)
     return f" (last changed by {', '.join(people)})" if people else ""

@@ -64,7 +64,10 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """Events of one lane that are close together; ``commit`` is the commit of the newest event."""
+    """Events of one lane that are close together.
+
+    ``commit`` is the commit of the newest event; empty for a change of health.
+    """
 
     lane: str
     x: float
