@@ -35,8 +35,9 @@ StageListener = Callable[[str, str], None]
 """Called with each stage and its text, in the client's thread."""
 
 _RENEW_AFTER = 1 / 3
-"""The fraction of a lease after which to renew it; two more attempts fit before the lease ends."""
+"""The fraction of a lease after which to renew it."""
 _RETRY_S = 5.0
+"""After this many seconds a failed renewal is tried again, or sooner if the lease is short."""
 _PROBABLY_RELEASED = (
     "the demand holds nothing; an earlier attempt to release it got no response, and has probably "
     "released it"

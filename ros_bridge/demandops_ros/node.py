@@ -36,8 +36,8 @@ from demandops_ros.diagnostics import Diagnostics
 _DEFAULT_DEPTH = 10
 """How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost."""
 _SHALLOW = (
-    f"more than {_DEFAULT_DEPTH} goals are open: a client with ROS 2's default queue of "
-    f"{_DEFAULT_DEPTH} may miss results; give the client a deeper queue (docs/demand.md)"
+    f"more than {_DEFAULT_DEPTH} goals of all clients are open: a client with ROS 2's default "
+    f"queue of {_DEFAULT_DEPTH} may miss results; give the client a deeper queue (docs/demand.md)"
 )
 _MOST_READERS = 4
 """How many calls of the bookkeeping service may wait for their answers.

@@ -58,7 +58,7 @@ class Formed:
 
 @dataclass(frozen=True)
 class Outcome:
-    """All observations of a run; times are seconds since 1970."""
+    """The settings and all observations of a run; times are seconds since 1970."""
 
     settings: Settings
     routes: tuple[Way, ...]

@@ -102,7 +102,7 @@ class Disk:
                 self._append(change)
 
     def _append(self, change: _Change) -> None:
-        """Add a change; join it to the last one if both are unsafe writes to the same file."""
+        """Add a change; join it to the last one if both are to one file and no part is safe yet."""
         if self.changes and change.parts and not change.safe:
             last = self.changes[-1]
             parts = [*last.parts, *change.parts]

@@ -357,11 +357,14 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
 
 
 def same_faults(wanted: Iterable[ExpectedFault], found: Iterable[Fault]) -> bool:
-    """Return whether the faults found are exactly the expected ones."""
-    wanted, found = list(wanted), list(found)
-    return len(wanted) == len(found) and all(
-        any(one.fits(fault) for fault in found) for one in wanted
-    ) and all(any(one.fits(fault) for one in wanted) for fault in found)  # fmt: skip
+    """Return whether the faults found are the expected ones, each once, in any order."""
+    wanted, left = list(wanted), list(found)
+    for fault in found:
+        fitting = next((one for one in wanted if one.fits(fault)), None)
+        if fitting is not None:
+            wanted.remove(fitting)
+            left.remove(fault)
+    return not wanted and not left
 
 
 def _of_connections(world: World, what: str) -> dict[str, list[str]]:

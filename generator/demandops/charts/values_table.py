@@ -18,7 +18,10 @@ _HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------
 
 
 def descriptions(text: str) -> dict[str, str]:
-    """Return a map from the path of a value, like ``image.tag``, to the value's description."""
+    """Return the description of each value in the text of a ``values.yaml`` that has one.
+
+    The keys are paths like ``image.tag``. A description is the comment ``# --`` before a value.
+    """
     found: dict[str, str] = {}
     path: list[tuple[int, str]] = []
     said: list[str] = []

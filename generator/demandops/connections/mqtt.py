@@ -72,7 +72,10 @@ class Mqtt(ConnectionType):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield a fault if the clients' image lacks the package of the route's messages."""
+        """Yield a fault if ``mqtt.messages`` of the clients does not list the route's package.
+
+        There is none if the list is empty, the message type is unknown or the route is primitive.
+        """
         package = message_type(route, sender, config).partition("/")[0]
         carried = config.clients.mqtt.messages
         if package and carried and package not in carried and not route.primitive:
@@ -155,7 +158,7 @@ class MqttEnd(End):
         return [*End.facts(self), f"broker {self.broker.node}"]
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Yield the configuration's entries that affect every end, and the broker's entry."""
+        """Yield the entries of :meth:`End.shaping_entries`, and the broker's entry."""
         yield from End.shaping_entries(self, config)
         broker = self.broker
         yield (

@@ -212,7 +212,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return one == two
 
     def moved_to_nodes_of(self, first: Application) -> Application:
-        """Return the application with its services on the nodes of ``first``.
+        """Return the application with the nodes of ``first``: its own and those of its services.
 
         ``first`` is the application in the first claim on the same subject.
         """

@@ -138,9 +138,10 @@ class Claim:
     def without_node(self, node: str) -> Claim | None:
         """Return what is left of the claim without a node; ``None`` if nothing is left.
 
-        An application loses its inputs from the node and its deliveries to it. A connection loses
-        its broker. Nothing is left of an application that runs on the node, has a service there or
-        has no other inputs, or of a connection from or to the node.
+        The claim must need the node. An application loses its inputs from the node and its
+        deliveries to it. A connection loses its broker, which runs on the node. Nothing is left of
+        an application that runs on the node, has a service there or has no other inputs, or of a
+        connection from or to the node.
         """
         held = self.held.without_node(node)
         if held is None:

@@ -69,7 +69,13 @@ class FairQueue:
             self._barriers.append(queued)
 
     def put_back(self, tickets: Sequence[Ticket]) -> None:
-        """Put demands back at the front of the queue, in the order in which they left it."""
+        """Put demands back, each before the other demands of its requester.
+
+        Their requesters take their turns first, each with one demand, as always.
+
+        Args:
+            tickets: in the order in which they left the queue.
+        """
         first = min((one.number for one in self._queued.values()), default=1) - len(tickets)
         again = {
             ticket: _Queued(number, ticket, subjects_of(ticket.goal))

@@ -217,7 +217,8 @@ class Generator:
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``other`` is ``commit`` or one of its ancestors.
 
-        Return False if either commit is unknown here. Any thread may call this.
+        Return False if two different commits are given and either is unknown here. Any thread may
+        call this.
         """
         return self._repository.includes(commit, other)
 

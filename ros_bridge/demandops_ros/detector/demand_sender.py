@@ -27,7 +27,10 @@ Log = Callable[[str, str], None]
 
 
 class DemandSender:
-    """Sends goals until exactly the demands of the current events are booked."""
+    """Keeps the demands of the current events booked: sends, retries and renews them.
+
+    Of booked demands, only those of the detector itself are released.
+    """
 
     def __init__(
         self, action_name: str, demand_action_name: str, timeout_s: float, log: Log

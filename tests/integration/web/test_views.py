@@ -130,7 +130,7 @@ def test_a_cluster_with_an_old_bootstrap_file_is_a_cause(follower: Follower) -> 
     old = OldBootstrap("c-its", "bootstrap/c-its.yaml", ("perception",), "git show …")
     (cause,) = causes(replace(follower.newest, old_bootstraps=(old,)), follower)
     assert cause.what.text == "bootstrap/c-its.yaml"
-    assert cause.why == "is not applied to cluster 'c-its', or only in an older version"
+    assert cause.why == "is not applied to cluster 'c-its' in the current version"
     assert cause.remedy.command == old.command
 
 

@@ -77,7 +77,9 @@ def test_a_rollback_past_newer_claims_is_refused_and_lists_them() -> None:
         f"would drop the claim of {who} on {newer.subject}, booked "
         f"{newer.booked:%Y-%m-%d %H:%M:%S} UTC (request '{newer.request}')"
     )
-    assert told.value.faults[1].message == "newer claims are undone only with --drop-newer"
+    assert told.value.faults[1].message == (
+        "claims that were booked or changed since are undone only with --drop-newer"
+    )
 
 
 def test_a_claim_changed_since_counts_as_newer() -> None:

@@ -116,7 +116,7 @@ def _documents(file: str) -> Iterator[tuple[str, object]]:
 
 
 def _resources(access_file: Path | None, name: str, namespace: str) -> list[tuple[str, object]]:
-    """Return the reference's resources in a cluster as one document, with a name for messages."""
+    """Return one pair: a name for messages, and a List of the reference's resources."""
     clusters = clusters_file.read(access_file).clusters if access_file else {}
     reachable = clusters.get(name)
     if reachable is None or not reachable.kubeconfig:

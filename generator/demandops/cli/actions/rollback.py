@@ -45,7 +45,7 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 @click.option(
     "--drop-newer",
     is_flag=True,
-    help="Also drop claims that were booked after REV or TIME. Without this option, such claims "
+    help="Also undo claims that were booked or changed after REV or TIME. Without it, such claims "
     "prevent the rollback.",
 )
 @dry_run_option
@@ -65,7 +65,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     """Restore the claims of an earlier commit, by a new commit.
 
     Claims that were released after the earlier commit are booked again, with the current
-    configuration. Claims that were booked after the earlier commit prevent the rollback, unless
+    configuration. Claims that were booked or changed after it prevent the rollback, unless
     you give --drop-newer. The lease of a restored claim starts again with its full term. REV is a
     commit. TIME selects the newest commit at or before this time. At a terminal, the command first
     shows the consequences and asks.

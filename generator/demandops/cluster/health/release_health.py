@@ -91,7 +91,7 @@ class History(Protocol):
         ...
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether two commits have the same content under ``path``."""
+        """Return whether ``path`` exists in two commits with equal content."""
         ...
 
 

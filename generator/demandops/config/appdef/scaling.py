@@ -60,8 +60,9 @@ class Scaling(CamelModel):
 
     ``divides_work`` says that no two replicas publish the same data.
 
-    Additional replicas start without delay. Additional replicas stop ``down_after`` after the last
-    demand that needed them has ended (:mod:`demandops.ledger.kept_replicas`).
+    With ``per`` or ``sizes``, additional replicas start without delay. They stop once fewer
+    replicas have been needed for ``down_after``, or at once without it
+    (:mod:`demandops.ledger.kept_replicas`). No number is above ``max``, except one in ``sizes``.
     """
 
     min: Count = 1

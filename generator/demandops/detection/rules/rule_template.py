@@ -75,7 +75,10 @@ def names(text: str) -> set[str]:
 
 
 def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
-    """Return a fault for each single brace, and for each name in braces that ``known`` lacks."""
+    """Return a fault for each name in braces that ``known`` lacks, and for each stray brace.
+
+    A brace is stray if it is neither doubled nor part of a pair around a name.
+    """
     found = []
     for path, text in texts(template, field):
         for token in _TOKEN.finditer(text):

@@ -47,9 +47,11 @@ class Restoration(DemandRequest):
 def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger with the claims of the earlier commit, and the changes.
 
+    A restored claim gets its whole lease from ``now``.
+
     Raises:
-        Refused: if the restoration undoes newer claims and ``drop_newer`` is not set. Claims that
-            overrides keep do not count.
+        Refused: if the restoration drops or changes a claim of the present ledger, and
+            ``drop_newer`` is not set. Claims that overrides keep, and renewals, do not count.
     """
     changes = _changes(ledger, request)
     if not request.drop_newer:
@@ -109,7 +111,7 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
         yield fault("", message, code="newer").within(path_of(claim.key))
     more = len(changes) - _SHOWN
     others = f"{more} more claims would change; " if more > 0 else ""
-    message = f"{others}newer claims are undone only with --drop-newer"
+    message = f"{others}claims that were booked or changed since are undone only with --drop-newer"
     yield fault("", message, code="newer")
 
 

@@ -51,7 +51,7 @@ Positions = Mapping[str, Position]
 
 
 def requirement_of(service: Service) -> Requirement:
-    """Return what ``place`` in a service's definition requires of the node for the service."""
+    """Return what a service's definition requires of a node in ``place``; without it, nothing."""
     place = service.place or Place()
     return Requirement(
         place.role,

@@ -39,7 +39,7 @@ def render(release: ServiceRelease, values: Mapping[str, Any], engine: Engine) -
 
 
 def chart_object(name: str, chart: ChartSource) -> str:
-    """Return the name of the Flux object that fetches this version of a chart."""
+    """Return the name of the OCIRepository or HelmChart that fetches this version of a chart."""
     return f"{name}-{chart.version}".lower()
 
 

@@ -41,7 +41,7 @@ def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
 
 
 def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return a map from each cluster to the access domains that have nodes in the cluster."""
+    """Return the access domains that have nodes in a cluster, for each cluster that has any."""
     domains: dict[str, list[AccessDomain]] = {}
     for cluster, domain in domains_in_use(config):
         domains.setdefault(cluster, []).append(domain)

@@ -161,9 +161,9 @@ class Approvals:
             return
         if proposal is None and (full := self._requester_over_limit(request)):
             message = (
-                f"{quoted(full)} already has {PROPOSAL_LIMIT} proposals that await approval; "
-                "release some of the demands in these proposals, or ask a person to approve or "
-                "reject some of the proposals"
+                f"requester {quoted(full)} already has {PROPOSAL_LIMIT} proposals that await "
+                "approval; release some of the demands in these proposals, or ask a person to "
+                "approve or reject some of the proposals"
             )
             self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
             return

@@ -1,4 +1,8 @@
-"""Moves placed applications off drained nodes, and retries those that did not fit elsewhere."""
+"""Moves placed applications and services off drained nodes.
+
+While any of them cannot move, another attempt is made each minute, and at each change of the
+configuration.
+"""
 
 from __future__ import annotations
 

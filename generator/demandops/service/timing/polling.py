@@ -42,7 +42,7 @@ class PollTimer:
         Args:
             interval: seconds between two fetches; with 0, only :meth:`request` makes a fetch due.
             runtime: provides the time.
-            local: whether the repository is on this disk; the interval is then at most a second.
+            local: whether the repository is on this disk; then the interval is at most a second.
         """
         self._interval = min(interval, _LOCAL_S) if local else interval
         self._runtime = runtime

@@ -35,7 +35,7 @@ log = logging.getLogger("demandops")
 
 
 class LocalRepository(StateRepository):
-    """A bare repository on this disk, written in place and fsynced."""
+    """A repository on this disk, written in place and fsynced; nobody may have main checked out."""
 
     always_current = True
 

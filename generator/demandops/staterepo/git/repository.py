@@ -130,7 +130,11 @@ def access_error(error: Exception, address: str) -> Exception:
 
 
 class StateRepository(ABC):
-    """A state repo: Git objects to read and write, and a tip that only moves forward."""
+    """A state repo: Git objects to read and write, and a tip.
+
+    :meth:`publish` only moves the tip forward. :meth:`refresh` may move it back, if somebody has
+    rewritten main.
+    """
 
     objects: Repository
     new: NewObjects

@@ -26,9 +26,9 @@ class SlowGit:
         self._what, self._told = what, 0
 
     def lasts(self, seconds: float) -> None:
-        """Report that git has run for ``seconds``.
+        """Take note that git has run for ``seconds``; it may be called as often as one likes.
 
-        The listener is called at most once a second, and not before :data:`AFTER_S` seconds.
+        It calls the listener once for each full second, from :data:`AFTER_S` on.
         """
         if int(seconds) > self._told and int(seconds) >= AFTER_S:
             self._told = int(seconds)

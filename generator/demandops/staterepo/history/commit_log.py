@@ -71,7 +71,7 @@ def _time(seconds: int) -> datetime:
 
 
 def author_of(commit: Commit) -> tuple[str, str]:
-    """Return name and address of the author."""
+    """Return a commit's author as (name, e-mail address)."""
     return _text(commit.author.raw_name), _text(commit.author.raw_email)
 
 

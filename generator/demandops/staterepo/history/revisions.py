@@ -1,7 +1,8 @@
 """Points in history as people write them: a revision that Git knows, or a time.
 
 A time means the newest commit along the first parents that was committed at or before this time.
-A time without a zone is UTC, like all times that the program prints.
+A date means the end of its day, and a time without seconds the end of its minute. A time without a
+zone is UTC, like all times that the program prints.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ class Problem:
     since: str = ""
     author: str = ""
     line: int | None = None
-    """The line of the field in the current file; the report does not store it."""
+    """The line of the field in the file; None unless ``Reader.problems`` has found the line."""
 
     def __str__(self) -> str:
         places = (place_text(self.file, self.line), self.field)

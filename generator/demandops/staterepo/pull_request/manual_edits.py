@@ -140,7 +140,7 @@ def _message(path: str, added: bool, deleted: bool, suggestion: Suggestion | Non
 
 
 def _source_of(path: str) -> str:
-    """Return what to edit instead of a generated file, if no override can replace the edit."""
+    """Return, in words, what to edit instead of a generated file that no override can change."""
     if path.startswith(f"{BOOTSTRAP_ROOT}/"):
         return "demandops.yaml, inventory/ or policy/"
     if "/_charts/" in path:

@@ -78,7 +78,7 @@ class JournalEntry:
     proposal: ProposalRecord | None = None
 
     def record(self) -> dict[str, Any]:
-        """Return the entry as a mapping of its fields.
+        """Return the entry as plain data for JSON; without ``proposal`` if there is none.
 
         The goal is not copied, because it may be deeply nested.
         """

@@ -254,7 +254,7 @@ def _unapplied(old: OldBootstrap) -> Cause:
     return Cause(
         "decision",
         Part(old.file),
-        f"is not applied to cluster '{old.cluster}', or only in an older version",
+        f"is not applied to cluster '{old.cluster}' in the current version",
         Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
         told=f"access domains: {', '.join(old.domains)}",
     )
