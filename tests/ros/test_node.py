@@ -241,12 +241,7 @@ def test_a_hundred_goals_at_once_are_all_answered_and_none_is_lost(
     booked = {f"c{number}" for number in range(2000, 2120)}
     assert shared.bookkeeping()["connections"].keys() >= booked
     assert git(shared.state_repo, "rev-list", "--count", f"{before}..main") == "120"
-    assert (
-        shared.log.read_text().count(
-            "more than 10 goals of all clients are open: a client with ROS 2's"
-        )
-        == 1
-    )
+    assert shared.log.read_text().count("more than 10 goals of all clients are open") == 1
 
 
 def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(

@@ -111,7 +111,7 @@ def test_a_requester_may_have_only_so_many_proposals(
     monkeypatch.setattr(approvals, "PROPOSAL_LIMIT", 1)
     with rig.running(bare) as generator:
         branch = Proposed(generator, of("vehicle00", "first")).branch
-        with pytest.raises(Refused, match=r"^'vehicle00' already has 1 proposals"):
+        with pytest.raises(Refused, match=r"^requester 'vehicle00' already has 1 proposals"):
             rig.receipt(generator.submit(of("vehicle00", "second")))
         other = Proposed(generator, of("vehicle01", "third"))
         assert sorted([branch, other.branch]) == branches(bare)
