@@ -47,8 +47,8 @@ def after_restart(
 ) -> Iterator[str]:
     """Book another demand in a fresh process, and yield each problem of the state repo.
 
-    Do nothing if an earlier call found the same state of the disk sound, and the process with the
-    fault has left no child that still runs.
+    Do nothing if both hold: an earlier call found no problem in the same state of the disk, and no
+    child of the process with the fault still runs.
 
     Args:
         rig: the state repo.

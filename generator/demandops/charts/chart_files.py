@@ -112,8 +112,8 @@ def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
                 else "that folder is not in appdefs/"
             )
             message = (
-                f"{quoted(one.repository)}: {wrong}; correct the path, which must start at the "
-                "chart's folder and stay in appdefs/"
+                f"{quoted(one.repository)}: {wrong}; correct the path, which is relative to "
+                "the chart's folder and must not lead out of appdefs/"
             )
             yield fault(f"{place}.repository", message).within(f"{folder}/Chart.yaml")
             continue

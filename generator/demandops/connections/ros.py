@@ -148,9 +148,10 @@ class RosEnd(End):
     def configuration(self) -> dict[str, Any]:
         """Return the configuration of one end's router.
 
-        A topic passes only from the end that reads it to the end that writes it. ``routes`` is for
-        the topics that come from the source, as most topics do. A reverse topic needs an entry in
-        ``topic-routes``, and a new entry there restarts the router.
+        Each topic passes in one direction only: the router at one end subscribes to it, and the
+        router at the other end publishes it. The key ``routes`` is for topics that come from the
+        source, as most do. A topic in the reverse direction needs an entry under ``topic-routes``,
+        and a new entry there restarts the router.
         """
         inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
         topics, tuned, reverse = [], [], []

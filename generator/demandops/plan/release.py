@@ -135,8 +135,8 @@ class ServiceRelease:
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
         """Yield (file, entry, what the entry decides) for entries that shape the release.
 
-        They are those of the service's definition, version, kept replicas and chart. An empty
-        ``entry`` stands for the whole file.
+        These entries define the service, choose its version, keep replicas that are to stop later
+        (``downAfter``), and name its chart. An empty ``entry`` stands for the whole file.
         """
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"

@@ -1,8 +1,8 @@
 """A rollback as a goal: plain data that passes through queue and journal like a demand.
 
 Only the command line makes this goal; actions and request files cannot contain it. The goal is
-evaluated on the newest tip, so a rollback works while others write. A claim that others book before
-this evaluation counts as newer than the commit to roll back to.
+evaluated on the newest tip, so a rollback works while others write. What others book until then
+counts as newer than the commit to roll back to.
 """
 
 from __future__ import annotations

@@ -33,10 +33,10 @@ class Bridge(Node):
         self._readers: dict[str, Any] = {}
         self._writers: dict[str, Any] = {}
         self._arrivals = session.declare_subscriber("**", self._take)
-        self.create_timer(_LOOK_S, self._find)
+        self.create_timer(_LOOK_S, self._subscribe_new)
 
-    def _find(self) -> None:
-        """Subscribe to the topics of the ROS graph that the configuration allows to be sent."""
+    def _subscribe_new(self) -> None:
+        """Subscribe to the new topics in the ROS graph that the configuration allows to be sent."""
         for topic, (kind, *_) in self.get_topic_names_and_types():
             if topic not in self._readers and self._given.search(topic):
                 self._readers[topic] = self.create_subscription(

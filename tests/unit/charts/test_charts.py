@@ -133,15 +133,16 @@ METADATA = f"appdefs/{APPDEF.name}/charts/object-detection/Chart.yaml"
             "file://../ros-service",
             "dependencies[0].repository: 'file://../ros-service': "
             "'appdefs/object-detection-fusion/charts/ros-service/Chart.yaml' does not exist; "
-            "correct the path, which must start at the chart's folder and stay in appdefs/",
+            "correct the path, which is relative to the chart's folder and must not lead out of "
+            "appdefs/",
         ),
         (
             METADATA,
             "file://../../../charts/ros-service",
             "file://../../../../other/ros-service",
             "dependencies[0].repository: 'file://../../../../other/ros-service': that folder is "
-            "not in appdefs/; correct the path, which must start at the chart's folder and stay in "
-            "appdefs/",
+            "not in appdefs/; correct the path, which is relative to the chart's folder and must not "
+            "lead out of appdefs/",
         ),
         (
             METADATA,

@@ -1,7 +1,7 @@
 """Refuses two overrides of equal priority that could change one release differently.
 
-Such a pair needs an order, and only different priorities give one. A pair is also refused if no
-release matches both overrides yet, because a later demand could add such a release.
+Such a pair needs an order, and only different priorities give one. It is refused even if no release
+matches both overrides yet, because a later demand could add a release that does.
 
 Two selectors cannot match the same release if they exclude each other in a field for which a
 release has only one value, like service or node. A shared service has many applications and

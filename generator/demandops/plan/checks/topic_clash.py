@@ -278,7 +278,7 @@ def _remedy(
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
-    """Return the field of the request because of which a service runs, or an empty text."""
+    """Return which field of the request makes a service run; empty if no field does."""
     for one in request.demanded:
         if not isinstance(one.held, Application):
             continue

@@ -1,4 +1,4 @@
-"""Checks the signatures of verified commits, and adds the results to the verdicts."""
+"""Checks the signatures of the commits that ``demandops verify`` judges; adds to its verdicts."""
 
 from __future__ import annotations
 

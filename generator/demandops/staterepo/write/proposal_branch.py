@@ -57,9 +57,10 @@ def branch_name(name: str, operation: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The newest commit of main, or empty if there is no main, and that of each proposal's branch.
+    """The newest commits of main and of the proposals' branches.
 
-    ``branches`` maps the name of a branch to its newest commit.
+    ``main`` is empty if there is no main. ``branches`` maps the name of a branch to its newest
+    commit.
     """
 
     main: str
