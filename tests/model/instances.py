@@ -124,7 +124,7 @@ class Instances(Places):
 
 
 def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Map each number of replicas above ``least`` to the time when fewer than this number remain."""
+    """Map each number of replicas above ``least`` to the time when fewer than that remain."""
     return {
         number: max(end for one, end in kept.items() if one >= number)
         for number in range(least + 1, max(kept, default=0) + 1)

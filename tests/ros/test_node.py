@@ -142,9 +142,9 @@ def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> 
 
 @pytest.mark.parametrize("end", ["", "thread.close(); node.destroy_node()"])
 def test_a_process_ends_with_0_while_its_executor_has_much_to_do(end: str) -> None:
-    """If the executor's thread were still in ROS, Python would abort at the end of the process.
+    """Python aborts if a thread is still in ROS when the process ends.
 
-    One of the two programs closes the thread; the other just ends.
+    ``end`` is the last statement of the program; without it, the program leaves its node running.
     """
     program = (
         "import rclpy, time; from demandops_ros.ros_process import ExecutorThread\n"

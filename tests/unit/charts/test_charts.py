@@ -141,8 +141,8 @@ METADATA = f"appdefs/{APPDEF.name}/charts/object-detection/Chart.yaml"
             "file://../../../charts/ros-service",
             "file://../../../../other/ros-service",
             "dependencies[0].repository: 'file://../../../../other/ros-service': that folder is "
-            "not in appdefs/; correct the path, which is relative to the chart's folder and must not "
-            "lead out of appdefs/",
+            "not in appdefs/; correct the path, which is relative to the chart's folder and must "
+            "not lead out of appdefs/",
         ),
         (
             METADATA,

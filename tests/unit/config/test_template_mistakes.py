@@ -266,7 +266,10 @@ def doubling(times: int) -> dict[str, object]:
 
 
 def doubling_in_list(times: int) -> dict[str, object]:
-    """Return such a schema whose definitions are the items of a list; ``%4f`` stands for ``O``."""
+    """Return a schema like that of ``doubling``, with its definitions as the items of a list.
+
+    The references write the ``O`` of ``allOf`` as ``%4f``.
+    """
     steps = [{"anyOf": [{"$ref": f"#/all%4ff/{i + 1}"}] * 2} for i in range(times)]
     return {"allOf": [*steps, {"type": "object"}]}
 

@@ -169,8 +169,9 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         return
     if parameter.merge in ("max", "min"):
         yield (
-            f"{place}: '{name}' has 'merge: {parameter.merge}', which compares numbers, "
-            "but a size is a word; use 'merge: union', so that the largest demanded size counts"
+            f"{place}: '{name}' has 'merge: {parameter.merge}', which is for numbers, "
+            "but sizes are words; use 'merge: union', which lists the demanded sizes, and the largest "
+            "of them counts"
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)

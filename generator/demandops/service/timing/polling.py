@@ -76,7 +76,7 @@ class PollTimer:
         return due
 
     def finished(self, *, reached: bool) -> None:
-        """Plan the next fetch, because a fetch or a push has ended; a push also finds new commits.
+        """Plan the next fetch after a fetch or a push, which both tell of others' new commits.
 
         ``reached`` says whether the remote could be reached. If it could not, the interval grows.
         """
