@@ -170,8 +170,8 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
     if parameter.merge in ("max", "min"):
         yield (
             f"{place}: '{name}' has 'merge: {parameter.merge}', which is for numbers, "
-            "but sizes are words; use 'merge: union', which lists the demanded sizes, and the largest "
-            "of them counts"
+            "but sizes are words; use 'merge: union', which lists the demanded sizes, and the "
+            "largest of them counts"
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)
