@@ -45,8 +45,9 @@ def descriptions(text: str) -> dict[str, str]:
 def table(text: str, root: str = "") -> str:
     """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``.
 
-    The table has each value with a description, and each single value that is in no described
-    mapping. Callers pass a ``root`` that exists, and values that are not null.
+    The table has each value with a description. A value without one is in the table if no keys are
+    below it and no mapping around it has a description. Callers pass a ``root`` that exists, and
+    values that are not null.
     """
     values: Any = strict_yaml.load(text)
     prefix = f"{root}." if root else ""

@@ -89,7 +89,7 @@ def print_json(data: object) -> None:
 
 
 def faults_of(error: DemandOpsError) -> list[Json]:
-    """Return an error's faults as JSON data; an error without faults is one itself."""
+    """Return an error's faults as JSON data; an error without faults becomes one fault."""
     faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
     return [asdict(each) for each in dict.fromkeys(faults)]
 

@@ -70,7 +70,7 @@ They log or fill the screen, so they do not show the progress of git operations.
 
 
 _OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
-"""Errors that a wrong path or missing permissions cause, such as of a file to write."""
+"""Errors about a file: its path is wrong, or permissions are missing."""
 
 
 class ExitCode(IntEnum):

@@ -126,9 +126,9 @@ def _from_context(field: str) -> Callable[[], str | None]:
 def _required(default: Callable[[], str | None]) -> Callable[..., str]:
     """Return a callback for ``--state-repo`` that returns the address of the state repo.
 
-    This is the given address or, without one, the result of ``default``. An address from the
-    environment is ignored in the cases that the module's docstring names. The callback raises
-    UsageError if there is no address, or where the module's docstring calls one an error.
+    This is the given address or, without one, the result of ``default``. The module's docstring
+    says when an address from the environment is ignored. The callback raises UsageError if there is
+    no address, or if the module's docstring calls the one from the environment an error.
     """
 
     def check(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
@@ -196,7 +196,7 @@ state_repo_option = _state_repo(readable_repo, "the checkout that you are in")
 writable_repo_option = _state_repo(_writable, "the remote of the checkout that you are in")
 """The option ``--state-repo`` of a command that writes.
 
-Only with ``--dry-run``, its default may be a checkout, namely one without a remote.
+If the checkout has no remote, the default with ``--dry-run`` is the checkout itself.
 """
 
 dry_run_option = click.option(

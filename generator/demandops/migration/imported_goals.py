@@ -76,10 +76,10 @@ def _last_request_only(name: str, shutdown: bool) -> str:
 
 
 def _unused(files: ReferenceFiles, joins: dict[str, list[Join]]) -> list[str]:
-    """Return a warning for each detection whose object list no application holds."""
+    """Return a warning for each detection whose object list no application reads."""
     topics = {topic for found in joins.values() for join in found for topic in join.topics}
     return [
-        f"{name} is not imported, because no application holds its object list"
+        f"{name} is not imported, because no application reads its object list"
         for name, spec in files.specs_of(ObjectDetection).items()
         if f"/{spec.source}_local_objectlist" not in topics
     ]

@@ -75,8 +75,8 @@ class _RosTopic(_Part):
 class _Ros2Mqtt(_Part):
     """The bridge at the source of a connection.
 
-    ``ros_topics`` lists the topics of the last request. Each topic that any request so far listed
-    has an extra field.
+    ``ros_topics`` lists the topics of the last request. Each topic of the last or an earlier
+    request is also the name of a field.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -87,8 +87,8 @@ class _Ros2Mqtt(_Part):
 class _Mqtt2Ros(_Part):
     """The bridge at the target of a connection.
 
-    ``mqtt_topics`` lists the topics of the last request. Each topic that any request so far listed
-    has an extra field.
+    ``mqtt_topics`` lists the topics of the last request. Each topic of the last or an earlier
+    request is also the name of a field.
     """
 
     model_config = ConfigDict(extra="allow")
@@ -191,7 +191,7 @@ class ReferenceFiles:
     books: dict[str, Counter[Hold]] = field(default_factory=dict)
     versions: dict[str, dict[int, Request]] = field(default_factory=dict)
     booked: set[str] = field(default_factory=set)
-    """The prefixes of the resources whose bookkeeping file was given, even an empty file."""
+    """The prefixes of the resources whose bookkeeping file was given; the file may be empty."""
 
     def specs_of(self, kind: type[SpecType]) -> dict[str, SpecType]:
         """Return a map from name to spec, for the resources with a spec of this class."""

@@ -17,7 +17,7 @@ from demandops.migration.reference_files import Hold, Request
 
 @dataclass(frozen=True, slots=True)
 class Join:
-    """Requesters that hold the same topics of a resource, each topic once.
+    """A join for a resource: each of ``requesters`` holds each of ``topics`` once.
 
     ``version`` is the version of the resource after the join, or 0 if it is not known. The joins of
     all resources are sorted by ``version``.
@@ -73,10 +73,9 @@ def _take(joins: list[tuple[int, Counter[Hold]]], shutdown: Request) -> None:
 
 
 def _each_once(version: int, holds: Counter[Hold]) -> Iterator[Join]:
-    """Yield joins with these holds, in which each requester holds each topic only once.
+    """Yield joins with these holds.
 
-    A hold that counts several times is split over several joins, because in the ledger a repeated
-    demand counts once.
+    A hold that counts twice is in two joins: in a single join or goal, it would count once.
     """
     for count in range(1, max(holds.values(), default=0) + 1):
         topics: dict[str, list[str]] = {}

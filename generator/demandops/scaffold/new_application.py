@@ -288,8 +288,8 @@ change the launch file and the template.
 def _requester(plan: ApplicationPlan, config: Config) -> str:
     """Return a requester for the example demand.
 
-    If possible, the rules of the node's access domain allow the requester the demand. If no rule
-    allows the demand, the first rule names the requester, and a person must extend the rules
+    If a rule of the node's access domain allows the application, the requester matches that rule.
+    If none does, the requester matches the first rule, and a person must extend the rules
     (:func:`closed_domain`).
     """
     domain = config.domain_of.get(plan.node)

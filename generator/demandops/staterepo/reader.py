@@ -257,7 +257,7 @@ class Reader:
         return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
-        """Return the path of a release's file; None if none was made up to ``revision``.
+        """Return the path of a release's file; None if there was no release up to ``revision``.
 
         If the release was stopped, return its last path.
         """

@@ -50,11 +50,11 @@ _FOLDER_DEPTH = 3
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    """The GitOps controller to change to; None keeps the current one.
+    """What an upgrade changes, besides rendering everything again.
 
-    ``url`` is the URL from which the controller fetches the state repo. It is only for a controller
-    that has no section in ``demandops.yaml`` yet. If it is None, such a controller gets the URL of
-    the current controller.
+    ``gitops`` is the new GitOps controller; None keeps the current one. ``url`` is the URL from
+    which a controller that has no section in ``demandops.yaml`` yet fetches the state repo; None
+    means the URL of the current controller.
     """
 
     gitops: str | None = None

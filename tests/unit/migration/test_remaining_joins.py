@@ -180,5 +180,5 @@ def test_resources_alone_give_the_requesters_of_the_last_request() -> None:
         "the requesters that its last request lists are imported, each with one hold"
     )
     assert warnings[-1] == (
-        "od-edge-station00 is not imported, because no application holds its object list"
+        "od-edge-station00 is not imported, because no application reads its object list"
     )

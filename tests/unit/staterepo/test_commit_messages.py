@@ -123,7 +123,7 @@ def test_a_release_says_what_stops_and_what_was_not_held(desk: Any) -> None:
         "  - od-edge-station00 (object-detection on edge for station00)\n"
         "  - of-edge-fusion-c9b035cdedb8 (object-fusion on edge for edge/fusion)\n"
         "\n"
-        "The request lists what the requester does not hold:\n"
+        "Listed in the request, but not held by the requester:\n"
         "  connection 'station00/edge' for vehicle00\n"
         "\n"
         "Operation: shutdown\n"

@@ -24,7 +24,7 @@ from demandops.cli.name_completion import names_of
 def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Run suspended applications and connections again.
 
-    Give the same options from --application to --requester as for `demandops suspend`, or NAME, the
+    Give the same selection as for `demandops suspend`, such as --requester vehicle00, or NAME, the
     override's name. The command ends this override.
 
     \b

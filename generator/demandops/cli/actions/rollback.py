@@ -126,9 +126,9 @@ def _roll_back(
 ) -> dict[str, Any]:
     """Roll back with a generator; return the outcome as JSON data.
 
-    The caller knows the consequences on top of the commit ``base``. The data contains consequences
-    only if others are true: none if the rollback was refused or had no effect, and different ones
-    if it was decided on another commit.
+    The caller knows the consequences on top of the commit ``base``. If the rollback was decided on
+    another commit, the data has the consequences on top of that commit. If the rollback was refused
+    or had no effect, the data says that there are none.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:

@@ -45,7 +45,7 @@ def suspend(
     """Stop applications and connections; their claims stay booked.
 
     Nothing runs for these claims, and new demands that match the options are refused. To end the
-    suspension, give `demandops resume` the same options from --application to --requester. The
+    suspension, give `demandops resume` the same selection, such as --requester vehicle00. The
     command creates an override with `deny` in your own name.
 
     \b

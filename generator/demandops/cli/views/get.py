@@ -174,7 +174,7 @@ def _refuse_unknown(
 ) -> None:
     """Refuse names and filters that match nothing: they are probably misspelled.
 
-    A filter may match an item's value, or a name that other kinds of items have.
+    A filter that matches no item is allowed if it names something that exists, such as a node.
     """
     faults: list[Fault] = []
     asked = [(name, "", {item["name"] for item in items}) for name in names]

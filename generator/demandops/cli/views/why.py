@@ -272,7 +272,7 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
     """Return the commits that started, changed and stopped the object of ``match``.
 
-    There are none of a node or requester, and none of a demand that no commit names.
+    Return no commits for a node, a requester, and a demand that no commit names.
     """
     if match.kind in ("node", "requester"):  # `demandops log` lists their commits
         return _history(repo, PathHistory(None, (), 0, None))

@@ -104,7 +104,7 @@ class LocalRepository(StateRepository):
     def tip(self) -> Oid:
         """Return the newest commit of main.
 
-        Raises StateRepoError if there is no main, or if main is only another name of a branch.
+        Raises StateRepoError if main does not exist, or is a symbolic reference.
         """
         found = self.objects.references.get(self.main_reference)
         if found is None:

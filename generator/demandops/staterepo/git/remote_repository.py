@@ -303,8 +303,8 @@ class RemoteRepository(StateRepository):
     ) -> tuple[str, str]:
         """Push a branch although another reference of the remote ends with the branch's name.
 
-        Git takes the name of a branch literally only if it comes from a pattern, and a pattern
-        needs a reference here.
+        Git finds a plain reference ambiguous if another one ends with it, but not the result of a
+        pattern. The source of a pattern must be a reference, so one is made for the commit.
         """
         pushed = f"refs/pushed/{reference}"
         self.objects.references.create(pushed, commit, force=True)

@@ -95,7 +95,7 @@ def of_decision(
         [one_line(title, _MAX_SUBJECT)],
         [f"Why: {why}"],
         _desired_state(decision.releases) if decision.releases or claims else [_UNCHANGED],
-        _list("The request lists what the requester does not hold:", decision.changes.not_held),
+        _list("Listed in the request, but not held by the requester:", decision.changes.not_held),
         _list("Warnings:", decision.warnings),
     ]
     keys = [change.key for change in claims]

@@ -60,8 +60,8 @@ class ConfigSource:
 class LastValidConfig:
     """A commit's configuration, with the last valid versions of its invalid files.
 
-    ``source`` is the source of ``config``. ``config`` is None if the configuration is not valid
-    even with these versions; ``source`` is then that of the configuration in effect before.
+    ``source`` is the source of ``config``. If the configuration is not valid even with these
+    versions, ``config`` is None, and ``source`` is the source that was in effect before the commit.
     """
 
     config: Config | None
@@ -87,7 +87,7 @@ def end_markers_at(tree: Tree) -> dict[str, str]:
 
 
 def ended_overrides_at(tree: Tree) -> dict[str, str]:
-    """Return the end that each ended override had when it ended, by the override's name."""
+    """Return the time ``expires`` of each ended override when it ended, by the override's name."""
     return ended_override_file.read(end_markers_at(tree))
 
 

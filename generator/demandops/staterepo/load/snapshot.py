@@ -279,10 +279,10 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Remembers the last advance, so that the next attempt to publish reads only newer commits.
+    """Remembers what was read, so that the next attempt to publish reads only newer commits.
 
-    If each attempt had to read all commits since this generator's last publication, other
-    generators could publish first every time.
+    Reading takes time. If each attempt read all commits since this generator's last publication,
+    other generators could publish first every time.
     """
 
     def __init__(self) -> None:

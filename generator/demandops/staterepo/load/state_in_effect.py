@@ -105,9 +105,9 @@ def start_at(
 ) -> Snapshot:
     """Return the state in effect at the generator's newest commit at or before ``commit``.
 
-    The generator recorded that state. If there is no such record, or it is wrong, return the state
-    of a commit whose files are all valid: the newest one that the generator followed, or else the
-    newest one.
+    The generator's commit records that state. If the record is missing or wrong, return the state
+    of the newest valid commit up to the generator's commit or, if there is none, up to ``commit``.
+    A commit is valid if all its files are.
 
     Raises InvalidInput or StateRepoError if no commit is valid.
     """
@@ -218,16 +218,20 @@ class Judgement:
     """The configuration that was in effect before, with the new ledger."""
 
     def with_new_config(self) -> Advance:
-        """Return the advance to the new configuration, without the claims at fault."""
+        """Return the advance with the new configuration.
+
+        Claims at fault keep their last valid versions.
+        """
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
         return self._quarantined(self.advance, _merged(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        """Return the advance that keeps the old configuration, without the claims at fault.
+        """Return the advance with the old configuration.
 
-        ``faults`` are the reasons why the new configuration is refused.
+        Claims at fault keep their last valid versions. ``faults`` are the reasons why the new
+        configuration is refused.
         """
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
@@ -337,8 +341,8 @@ def _located_in_claim_files(
 ) -> list[Fault]:
     """Return the faults of a subject, each located in a claim file.
 
-    If a fault is not in a claim file, it gets the path of one of the subject's claims, of a changed
-    one if there is any. If the subject has no claim, the fault stays where it is.
+    A fault outside claim files gets the path of a claim on the subject, if possible of a changed
+    claim. If the subject has no claim, the fault stays where it is.
     """
     claims = snapshot.state.ledger.claims_on(subject)
     changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]

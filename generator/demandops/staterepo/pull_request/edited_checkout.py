@@ -161,7 +161,7 @@ def _started_from(repo: Repository, target: str) -> Commit:
 
 
 def author_of(folder: Path) -> str:
-    """Return the name of the author of the checked-out commit, or an empty text if none is."""
+    """Return the name of the checked-out commit's author; empty if no commit is checked out."""
     try:
         repo = Repository(str(folder))
         return str(repo.head.peel(Commit).author.name)

@@ -41,9 +41,9 @@ class RenderedCharts:
     """Which charts helm rendered, for how many releases and examples, and the faults found.
 
     ``rendered`` has each chart that helm tried to render, even if there were faults.
-    ``not_rendered`` maps each chart that helm could not get as a whole, or all charts if helm is
-    missing, to the reason. A chart that is not used, or whose lint or schema has a fault, is in
-    neither.
+    ``not_rendered`` maps a chart to the reason why helm could not try: helm is missing, the chart
+    is in a registry, or a dependency is missing. A chart that is not used, or whose lint or schema
+    has a fault, is in neither.
     """
 
     rendered: tuple[str, ...] = ()

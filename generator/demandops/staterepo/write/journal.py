@@ -132,7 +132,7 @@ class Journal:
         If ``durably`` is true, the removal is fsynced; a failure raises StateRepoError and keeps
         the demands. Otherwise the next :meth:`append` makes the removal durable. If the process or
         the machine fails before that, the demands may be evaluated again after a restart. This is
-        harmless only if a commit records their outcome; a refused demand could then be booked.
+        harmless if a commit records their outcome, but a refused demand could be booked.
         Raises Unsound if the content of the file is unknown.
         """
         done = [each for each in dict.fromkeys(operations) if each in self.pending]

@@ -153,7 +153,7 @@ class ProposalBranches:
             raise self._why_denied(branch) or self._remote.push_error(error) from None
 
     def _why_denied(self, branch: str) -> PushDenied | None:
-        """Return an error if a branch is called like a folder of ``branch``, else None."""
+        """Return an error if ``branch`` is like ``a/b`` and a branch ``a`` exists, else None."""
         folders = (branch[:end] for end, letter in enumerate(branch) if letter == "/")
         taken = next(filter(self.exists, folders), "")
         if not taken:
