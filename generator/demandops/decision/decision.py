@@ -102,9 +102,9 @@ class Decision:
     def lease_s(self) -> int | None:
         """The shortest lease of the demand in seconds, or ``None`` if the demand has no lease.
 
-        For a demand without an id, only the claims that the request changed count. For a waiting
-        demand, this is the shortest lease that the demand may get later. So the client renews the
-        demand often enough.
+        For a demand without an id, this is the shortest lease of the claims that the request added
+        or changed. For a waiting demand, this is the shortest lease that the demand may get later.
+        So the client renews the demand often enough.
         """
         waiting = self.state.ledger.waiting.get(self.request.demand)
         if waiting is not None:

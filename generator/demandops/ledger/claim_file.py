@@ -33,7 +33,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only newer generators write; their files record the node of each service."""
+"""Folders that only later generator versions write; the files record the node of each service."""
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of what demandops.demand.claim.demand_id returns
 _VERSION = re.compile(r"^demandops\.ledger/v([0-9]{1,9})$")
@@ -356,8 +356,7 @@ def read(text: str, path: str) -> Claim:
     """Return the claim in a file.
 
     Raises:
-        InvalidInput: with every fault in the fields; if there is none, if the path does not match
-            the ids in the file.
+        InvalidInput: if the file is not valid, or if its path does not match the ids in the file.
     """
     data = strict_yaml.load(text, path)
     kind = data.get("kind") if isinstance(data, dict) else None

@@ -47,7 +47,7 @@ def text_of(override: Override) -> str:
 
 
 def read(files: Mapping[str, str]) -> dict[str, str]:
-    """Return a map from the name of each ended override to the end that the override then had.
+    """Return a map from the name of each ended override to the end that its marker records.
 
     ``files`` maps paths to texts. Files that are not valid markers are skipped;
     :func:`stale_markers` lists them for removal.

@@ -62,9 +62,9 @@ Each step has fewer replicas and a later end than the previous step.
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
     """Return the steps of a service whose demands now need more or fewer replicas.
 
-    If the demands need fewer, a new step keeps ``was_needed`` replicas until ``until``. It replaces
-    the steps that keep no more replicas than that. Steps that keep no more than ``needed`` replicas
-    or have ended are left out.
+    If the demands need fewer, a new step with ``was_needed`` replicas replaces each step with as
+    many or fewer. A step with ``needed`` replicas or fewer is left out, and so is a step that has
+    ended.
 
     Args:
         steps: the steps so far.
@@ -99,7 +99,7 @@ class KeptReplicas:
     by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
 
     def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
-        """Return all records, with that of ``instance`` set to ``steps``; empty steps remove it."""
+        """Return the records with ``steps`` for ``instance``; empty steps remove its record."""
         known = self.steps.get(instance) or ()
         if known == steps:
             return self
@@ -117,7 +117,7 @@ class KeptReplicas:
         return KeptReplicas(all_steps, by_minute)
 
     def due(self, now: datetime) -> list[Instance]:
-        """Return the instances that are to scale down, as their first step has ended, sorted."""
+        """Return the instances whose first step of scaling down has ended, sorted."""
         minutes = [minute for minute in self.by_minute if minute <= _minute(now)]
         instances = (one for minute in minutes for one in self.by_minute[minute])
         return sorted(one for one in instances if self.steps[one][0].until <= now)

@@ -150,7 +150,7 @@ class Ledger:
         yield from sorted(usual - {excluded})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for inputs in ``role`` for which ``part`` replaces ``{instance}``.
+        """Yield (input, version) for each input in ``role`` that topic names show as ``part``.
 
         An input with the usual topic of its source is yielded only if its application is a separate
         instance. ``version`` is the version of the separate instance; it is empty for an input of
@@ -271,7 +271,7 @@ class Ledger:
         return tuple(sorted(found | set(self._ids("broker", node))))
 
     def indexed_names(self, entry: str) -> set[str]:
-        """Return the last word of each index entry of one kind, such as ``requester``.
+        """Return the last text of each index entry whose first text is ``entry``.
 
         This scans the whole index, so it is slow for a large ledger.
         """

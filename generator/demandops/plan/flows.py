@@ -1,7 +1,7 @@
 """The flow of topics through an application: which topics services read, and where they come from.
 
-What an application needs of a service depends on one demanded topic, on the topics of one source,
-or only on the application. So the flows of a demand do not depend on other demands.
+The flows of a demand follow from its own applications and the configuration, never from other
+demands.
 """
 
 from __future__ import annotations

@@ -51,7 +51,7 @@ def instance_of(config: Config, role: str, topic: InputTopic, version: str = "")
 
 
 def distinguishing_text(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return the text by which names that are made from topics of one source differ.
+    """Return the text that makes topic names differ although their source is the same.
 
     The text contains ``topic`` if ``topic`` is a further topic of its source. The text also
     contains ``version``, which may be empty.
@@ -85,7 +85,7 @@ def usual_topic(config: Config, source: str, role: str) -> str | None:
 def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
     """Return the request in which ``further`` says for each input whether it is a further topic.
 
-    Only the inputs in roles for whose topics services run are marked.
+    Only inputs that may have a service instance of their own are marked.
     """
     if not request.adds_claims:
         return request

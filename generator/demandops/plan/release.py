@@ -51,7 +51,7 @@ class ServiceKey:
 
     @property
     def instance(self) -> Instance:
-        """The texts of this key, by which the ledger records kept replicas."""
+        """This key as a tuple of texts: the key of the instance's record of kept replicas."""
         named = (self.service, self.node, self.application, self.source, self.topic, self.version)
         scope = "cluster" if self.for_cluster else ""
         return ("replicas", *(name or "" for name in named), scope)

@@ -72,8 +72,7 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
     """Return the changes of claims that restore the earlier commit, sorted by path.
 
-    A claim does not change if it differs from the restored claim only in the term or the end of the
-    lease.
+    A claim stays as it is if the earlier claim differs only in the length or the end of the lease.
     """
     restored = {claim.key: claim for claim in request.claims}
     gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in restored]

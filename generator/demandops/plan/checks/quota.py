@@ -1,4 +1,4 @@
-"""Quotas: how many claims a requester and how many services a node of an access domain may have.
+"""Quotas of an access domain: claims for each requester, and services on each node.
 
 A booking that does not raise an exceeded count is allowed. The quota ``demandsPerMinute`` is
 checked elsewhere (:mod:`demandops.service.timing.rate_limit`).

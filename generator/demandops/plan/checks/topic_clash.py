@@ -87,10 +87,10 @@ def _of_service(
 def _clashes(
     world: World, key: ServiceKey, service: Service, output: str, topic: str
 ) -> Iterator[tuple[str, str]]:
-    """Yield (clash, remedy), in words, for each source of an output's topic on the node of ``key``.
+    """Yield (clash, remedy) for each other source of ``topic`` on the node of ``key``.
 
-    The instance at ``key`` itself does not count as a source. The clash names the source, as in
-    ``connection 'a' already brings this topic to``.
+    The instance at ``key`` publishes ``topic`` as ``output``. Clash and remedy are parts of a
+    message. A clash is, for example, ``connection 'a' already brings this topic to``.
     """
     for other in _publishers(world, key.node, topic, excluded=key):
         clash = f"{_words(other)} already publishes this topic on"
@@ -210,7 +210,7 @@ def _keys_called(
     instance: str,
     excluded: ServiceKey | None,
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of the service's instances on ``node`` with ``instance`` in topic names.
+    """Yield the keys of a service's instances on ``node`` that topic names show as ``instance``.
 
     Some of the instances may not run. The instance ``excluded`` may be left out.
     """
@@ -257,7 +257,7 @@ def _words(key: ServiceKey) -> str:
 def _remedy(
     key: ServiceKey, other: ServiceKey | None, service: Service, output: str, config: Config
 ) -> str:
-    """Return, in words, how to resolve a clash; ``other`` is ``None`` for one with a connection."""
+    """Return how to resolve a clash; ``other`` is ``None`` if the clash is with a connection."""
     is_named = "{instance}" in service.outputs[output]
     is_of_same = (
         other is not None

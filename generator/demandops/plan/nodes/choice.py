@@ -262,8 +262,8 @@ class Choice:
     def none_fits(self, positions: Positions) -> Fault:
         """Return the fault for an application or a service that gets no node.
 
-        The fault lists some nodes and what each of them lacks. The nodes that lack the least come
-        first. Callers have found that :meth:`candidates` yields no node.
+        Call this only if :meth:`candidates` yields no node. The fault lists some nodes and what
+        each of them lacks. The nodes that lack the least come first.
         """
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")

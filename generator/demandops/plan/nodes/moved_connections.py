@@ -1,9 +1,9 @@
 """Moved connections: when an application moves, the connections of its demands follow.
 
 The connections then carry the same topics to or from the new node, with the same type and options.
-If an application needed connections before the move and its demand holds none of them, the move
-adds none. A goal of the reference's action lists its connections itself, so a move does not change
-these connections.
+A move adds no connections if the application needed some before and its demand held none of them.
+A goal of the reference's action lists its connections itself, so a move does not change these
+connections.
 """
 
 from __future__ import annotations
@@ -115,10 +115,10 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
 
 
 def _carried_by(flow: Flow, known: Connection | None, claim: Claim, world: World) -> Claim:
-    """Return a demand's claim on the connection that carries a flow from now on.
+    """Return a demand's new or extended claim on the connection that carries a flow from now on.
 
-    ``known`` is the connection that carried the topic before the move, or ``None``. If no claimed
-    connection brings the topic to the new node, the result has the type and options of ``known``.
+    ``known`` is the connection that carried the topic before the move, or ``None``. If no claim
+    brings the topic to the receiver yet, the connection gets the type and options of ``known``.
     """
     route = known.topics[0] if known else None
     flow = replace(flow, topic=route.read_topic) if route else flow

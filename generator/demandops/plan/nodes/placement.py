@@ -50,9 +50,9 @@ def with_chosen_nodes(
     """Return the request with a node for each application and service that is to be placed.
 
     A booked application or service stays on its node if the node still fits. If other demands hold
-    it too, the node may be drained or no longer permitted. Any other application or service gets
-    the first node that fits and has room. ``placement`` in the settings decides the order of the
-    nodes. Finally, services move to the nodes that overrides name.
+    it too, it stays even on a node that is drained or no longer permitted. Any other application or
+    service gets the first node that fits and has room. ``placement`` in the settings decides the
+    order of the nodes. Finally, services move to the nodes that overrides name.
 
     Args:
         request: the request.
@@ -155,9 +155,9 @@ def _placed(
 def _so_far(
     request: DemandRequest, demanded: list[Demanded], index: int, app: Application
 ) -> DemandRequest:
-    """Return the request without the applications that have no node yet.
+    """Return the request with the items of ``demanded``, except applications without a node.
 
-    The items of the result are ``demanded``, with ``app`` as the application at ``index``.
+    ``app`` takes the place of the application at ``index``.
     """
     listed = [*demanded[:index], replace(demanded[index], held=app), *demanded[index + 1 :]]
     placed = (one for one in listed if not isinstance(one.held, Application) or one.held.node)
@@ -174,10 +174,9 @@ def _with_named_service_nodes(one: Demanded, world: World) -> Demanded:
 
 
 def may_wait(request: DemandRequest, world: World) -> bool:
-    """Return whether a demand that lacks room may wait.
+    """Return whether a demand that lacks only room may wait.
 
-    Callers have found that it lacks only room. For each application and service to place, there
-    must be a node that would fit if it had room.
+    For each application and service to place, there must be a node that would fit if it had room.
     The node's access domain must let demands wait, and must ask for no approval. A demand that
     needs approval cannot wait, because a person approves only what can be booked at once.
     """

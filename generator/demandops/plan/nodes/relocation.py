@@ -44,7 +44,7 @@ _ANY = Requirement()
 
 
 def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
-    """Return the drain with the moves of all applications and services that can leave the node.
+    """Return ``request`` with the moves of all applications and services that can leave the node.
 
     Args:
         request: the drain; its ``id`` is the node.
@@ -80,10 +80,9 @@ _Moved = tuple[World, Chosen, list[ClaimKey]]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return what of an application is on ``node`` by a choice of its own.
+    """Return the services of an application for which ``node`` was chosen or named.
 
-    ``None`` stands for the application itself. A service is listed only if a node was chosen or
-    named for this service.
+    If ``node`` is the application's own node, the first item is ``None``.
     """
     app = world.ledger.application(id)
     if app is None:

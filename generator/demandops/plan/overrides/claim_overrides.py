@@ -248,8 +248,8 @@ def _kept_claim(
 ) -> Claim | None:
     """Return the claim by which an override keeps a subject, or ``None`` if no override does.
 
-    The claim is one of ``existing``, or a new claim. A subject whose last claim is suspended gets
-    no new claim. No demand may hold the subject.
+    Call this only for a subject that no demand holds. The claim is one of ``existing``, or a new
+    claim. A subject whose last claim is suspended gets no new claim.
 
     Args:
         existing: the kept claims on the subject before the update.
@@ -283,8 +283,8 @@ def _kept_claim(
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     """Return the overrides that keep the subject of a claim, the highest in rank first.
 
-    If an override keeps the claim already, the claim's only requester is the override's owner. So
-    ``requesters`` of a selector is ignored for such a claim.
+    A kept claim names only the override's owner, not the requesters of the demand. So
+    ``requesters`` of a selector is ignored for a kept claim.
     """
     traits = traits_of(claim)
     if claim.keeping_override is not None:

@@ -20,7 +20,7 @@ from demandops.plan.replicas import overridden
 def apply_overrides(release: Release, world: World) -> Release | None:
     """Return a release with the effects of all overrides, or ``None`` if one of them denies it.
 
-    An override never moves the release here: its node is the one that the booking recorded.
+    The node of the release stays, because claims already record the moves by overrides.
     """
     if not world.overrides:
         return release

@@ -294,7 +294,7 @@ def _changes(
 
 
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    """Yield the facts about ``entry``, as texts, for a comparison with those about ``other``."""
+    """Yield the facts about ``entry``; the caller compares them with the facts about ``other``."""
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
         yield f"from {entry.source} to {entry.target}"

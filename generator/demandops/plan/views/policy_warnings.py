@@ -110,10 +110,10 @@ def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each access domain that the network of the hosts opens to other domains.
+    """Yield warnings of access domains that are open because pods use the host's network.
 
     One kind of warning says that ``network: namespace`` has no effect. The other kind says which
-    domains share a ROS domain in one cluster.
+    access domains share a ROS domain in one cluster.
     """
     nodes = [
         (config.domain_of[node.id].name, node)
