@@ -138,8 +138,8 @@ PATTERN_WORDS = {
         "ends, or nothing"
     ),
     r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$": (
-        f"a topic such as /{{instance}}_objects: each part is '/' and then {_ANY} and '_', with no "
-        "digit first, and may have {instance} once"
+        f"a topic such as /{{instance}}_objects, with '/' before each part; a part has only {_ANY} "
+        "and '_', no digit first, and at most one {instance}"
     ),
 }
 """For each regular expression of a field: the texts that match it, in words for messages."""

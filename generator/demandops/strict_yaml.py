@@ -80,7 +80,7 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if a text cannot be read with stand-ins for its lists (:data:`_STAND_IN`)."""
+    """Raised if stand-ins (:data:`_STAND_IN`) cannot replace the lists of a text."""
 
 
 class _Parser:
@@ -412,7 +412,7 @@ def to_json(value: object) -> str:
     Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
 
     Raises:
-        TypeError: if a part of ``value`` is no JSON, as a method is none.
+        TypeError: if a part of ``value`` cannot be JSON, for example a method.
         ValueError: if a number in ``value`` is infinite or not a number.
     """
     text = _JSON.encode(value)

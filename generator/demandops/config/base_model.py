@@ -202,7 +202,7 @@ def parse_file(model: type[Model], text: str, file: str) -> Model:
     """Parse the text of a YAML file, and return its content as an instance of ``model``.
 
     Raises:
-        InvalidInput: if the text is not strict YAML or not a mapping, or as :func:`parse` does.
+        InvalidInput: if the text is not strict YAML, is not a mapping, or does not fit ``model``.
     """
     data = strict_yaml.load(text, file)
     if not isinstance(data, dict):

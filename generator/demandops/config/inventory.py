@@ -249,8 +249,8 @@ class Node(CamelModel):
     topics: dict[Word, Topic] = Field(default_factory=dict)
     """The node's usual topic for each input role.
 
-    The names of releases and derived topics contain the node's id. For any other topic, these names
-    also contain the topic.
+    The names of releases and derived topics contain the node's id. For a further topic of the node,
+    these names also contain the topic.
     """
     tolerations: Items[Toleration] = ()
     image_pull_secrets: Items[DnsLabel] = ()

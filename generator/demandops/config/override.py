@@ -177,7 +177,7 @@ class OverrideFile(FileModel):
         return self
 
     def _misplaced(self) -> Iterable[str]:
-        """Yield a problem for each selector whose releases and claims cannot have an effect."""
+        """Yield the problems of selectors that do not fit the override's effects."""
         effects = self.effects()
         if self.values is not None and self.selects_clients() and not self.patches_clients():
             yield (

@@ -138,9 +138,9 @@ class Limits(CamelModel):
 class RepoSettings(FileModel):
     """``demandops.yaml``: the settings of the whole state repo.
 
-    The file may also contain the section of the controller that ``gitops`` does not name. That
-    section is not used. ``placement`` is the rule by which the generator chooses among the nodes
-    that fit an application (:mod:`demandops.plan.nodes.placement`).
+    The file may contain both ``flux`` and ``argocd``. Only the section that ``gitops`` names is
+    used. ``placement`` is the rule by which the generator chooses among the nodes that fit an
+    application (:mod:`demandops.plan.nodes.placement`).
     """
 
     kind: Literal["StateRepository"]

@@ -117,9 +117,9 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return what is left of the connection without ``node``, the node of an end or the broker.
+        """Return what is left of the connection without ``node``.
 
-        Without an end, nothing is left, so return ``None``. Without the broker's node, return the
+        If ``node`` is an end, return ``None``. If ``node`` is the broker's node, return the
         connection without a broker.
         """
         return None if node in self.nodes else replace(self, broker="")

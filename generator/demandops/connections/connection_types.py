@@ -74,7 +74,7 @@ def choose_type(connection: Connection, config: Config) -> ConnectionType | None
 def no_type_fault(connection: Connection, config: Config) -> Fault:
     """Return a fault that says for each type one reason why it cannot carry a connection.
 
-    No type may be able to carry the connection (:func:`choose_type`).
+    Call this only if no type can carry the connection (:func:`choose_type`).
     """
     reasons = []
     for kind in CONNECTION_TYPES:

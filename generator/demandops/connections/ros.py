@@ -188,8 +188,8 @@ class RosEnd(End):
     def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
         """Return what a router reads only at its start: all but ``allowlist``.
 
-        So a new topic restarts the router if it has QoS settings or is a reverse topic, because it
-        then needs an entry elsewhere too.
+        So a new topic restarts the router only if it needs an entry in ``topics`` (QoS settings) or
+        ``topic-routes`` (reverse direction).
         """
         return {name: value for name, value in configuration.items() if name != "allowlist"}
 

@@ -218,7 +218,7 @@ def _counted_filter(name: str, function: Callable[..., Any]) -> Callable[..., An
 
 @lru_cache(maxsize=256)
 def _counted_test(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Change a Jinja test (``is …``) so that each part of its arguments takes a step."""
+    """Change a Jinja test (``is …``) so that it takes steps from the budget."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)

@@ -247,8 +247,8 @@ values: values/follower.yaml.j2
     with pytest.raises(InvalidInput) as raised:
         MemoryRepo(changed)
     assert [str(fault) for fault in raised.value.faults] == [
-        "appdefs/object-detection-fusion/appdef.yaml: uses.follower.lists: is "
-        "'object-detection.object_list', but 'object-detection' runs once for each version "
-        "(versions: separate), and the shared service 'follower' once for all versions; make "
+        "appdefs/object-detection-fusion/appdef.yaml: uses.follower.lists: the "
+        "shared service 'follower' reads 'object-detection.object_list' and runs once for all "
+        "versions, but 'object-detection' runs once for each version (versions: separate); make "
         "'object-detection' a shared service too, or define 'follower' in this appdef"
     ]

@@ -31,13 +31,10 @@ class Service(Deployed):
     """The origin of each input: a role of the appdef, or ``<service>.<output>``."""
     parameters: dict[str, Parameter]
     root: str | None = None
-    """The role for each of whose topics a service with ``each`` runs once."""
+    """For a service that runs once for each topic of a role: that role."""
     roots: tuple[str, ...] = ()
-    """The roles whose topics an instance reads from its only source.
-
-    The instance reads them directly or through other services. The roles are empty if an instance
-    may have several sources.
-    """
+    """If each instance has only one source: the roles of the source's topics that the instance
+    reads, directly or through other services. Empty for any other service."""
     nodes: dict[str, str] = Field(default_factory=dict)
     """For a service that runs once for each cluster: the service's node in each cluster."""
     runs_at: dict[str, str] = Field(default_factory=dict)
@@ -81,7 +78,7 @@ def resolved_services(
 ) -> tuple[Services, list[Problem]]:
     """Return all services of an appdef and no problem, or no service and the problems.
 
-    Problems that depend on mended ones are found only in a later call.
+    Some problems are found only after a person has mended others.
     """
     services = {
         name: Service.model_construct(
@@ -182,9 +179,9 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
             )
             yield (
                 _place(service, role),
-                f"'{origin}' is published at the application's node, so applications on several "
-                "nodes may publish it under one name; run "
-                f"'{producer.name}' at the source, or {other}",
+                f"'{origin}' is published at the application's node, so '{name}' could get it "
+                f"from several nodes under one name; run '{producer.name}' at the source, or "
+                f"{other}",
             )
         if role == service.each:
             root = producer.root if producer else origin

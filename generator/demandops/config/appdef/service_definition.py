@@ -169,9 +169,8 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         return
     if parameter.merge in ("max", "min"):
         yield (
-            f"{place}: '{name}' has 'merge: {parameter.merge}', which is for numbers, "
-            "but sizes are words; use 'merge: union', which lists the demanded sizes, and the "
-            "largest of them counts"
+            f"{place}: '{name}' has 'merge: {parameter.merge}' and so compares numbers, but sizes "
+            "are words; use 'merge: union', with which the largest demanded size counts"
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)

@@ -283,10 +283,9 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Refuse ``versions: separate`` if a shared service runs for each topic of an unshared one.
+    """Refuse ``versions: separate`` if a shared service's ``each`` input is from an unshared one.
 
-    Each version has its own instance of the unshared service, but one instance of the shared
-    service would serve all versions.
+    The unshared service runs once for each version, but the shared service only once for all.
     """
     services = config.services.get(appdef, {})
     for name, service in services.items():
@@ -296,14 +295,14 @@ def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
             reader.add_fault(
                 f"appdefs/{appdef}/appdef.yaml",
                 f"uses.{name}.{service.each}",
-                f"is '{origin}', but '{producer.name}' runs once for each version (versions: "
-                f"separate), and the shared service '{name}' once for all versions; make "
+                f"the shared service '{name}' reads '{origin}' and runs once for all versions, but "
+                f"'{producer.name}' runs once for each version (versions: separate); make "
                 f"'{producer.name}' a shared service too, or define '{name}' in this appdef",
             )
 
 
 def _is_unlisted(reader: ConfigReader, appdef: str) -> bool:
-    """Return whether no file lists versions of an appdef, not even in an invalid entry."""
+    """Return whether no file lists versions of an appdef; False if an entry is invalid."""
     return not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, appdef)
 
 

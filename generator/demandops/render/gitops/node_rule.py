@@ -19,9 +19,10 @@ _SELECTOR = "variables.selector"
 
 
 def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
-    """Return the expression that is true if a pod's selector names a node of the domain.
+    """Return the expression that is true if a pod's selector has all labels of a node's selector.
 
-    A node with an empty selector makes the expression true for every pod.
+    Only nodes of the domain count. A node with ``selector: {}`` makes the expression true for
+    every pod.
     """
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
