@@ -37,7 +37,7 @@ class OwnWork:
     def postpone(self) -> None:
         """For a minute, count no end of an override and no scale-down as due.
 
-        A fetch or a publication has failed. :meth:`commit_due` commits both even so.
+        A fetch or a publication failed. :meth:`commit_due` commits ends and scale-downs even so.
         """
         self._override_expiry.postpone(self._runtime.now())
         self._scale_down.postpone(self._runtime.now())
