@@ -37,8 +37,8 @@ class InputTopic(NamedTuple):
     def part_in(self, version: str) -> str:
         """Return the text that stands for this input in the topic names of a separate instance.
 
-        The text is also made from ``version``, the instance's version. If ``version`` is empty, the
-        text is :attr:`part`.
+        The text is made like :attr:`part`, but also from ``version``, the instance's version. If
+        ``version`` is empty, the text is :attr:`part`.
         """
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
@@ -171,10 +171,9 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return those further inputs of a role that topic names show as ``part``.
+        """Return the further inputs of a role for which ``part`` stands in topic names.
 
-        For a separate instance, also return those usual inputs of the role that topic names show as
-        ``part``.
+        For a separate instance, also return the usual inputs for which ``part`` stands.
         """
         if not self._further:  # computed only once, because the plans of many services need it
             for known, topic in self.all_inputs():
@@ -251,7 +250,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def matches_listed(self, listed: object) -> bool:
         """Return whether a shutdown that lists ``listed`` means this application.
 
-        Both must have the same id. A listed application without a node means it on any node.
+        Both must have the same id. If ``listed`` names no node, the nodes are not compared.
         """
         return (
             isinstance(listed, Application)
@@ -297,7 +296,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return self.with_inputs(left) if any(left.values()) else None
 
     def without_node(self, node: str) -> Application | None:
-        """Return the application without inputs from a node and deliveries to it.
+        """Return the application without its inputs from ``node`` and its deliveries to ``node``.
 
         Return ``None`` if no input is left, or if the application or a service runs on the node.
         """

@@ -96,10 +96,10 @@ def _field(service: str) -> str:
 def _chosen(
     one: Demanded, booked: Held | None, config: Config, adds: bool, faults: list[Fault]
 ) -> Iterator[tuple[str, str]]:
-    """Yield (field, name of the node in its chosen domain) for each field for which one is chosen.
+    """Yield (field, name) for each node for which an access domain is chosen.
 
-    This concerns only nodes that are in several domains. If the rules allow several of them and the
-    request adds claims, add a fault for the field.
+    ``name`` is the node's name in the chosen domain. Nodes in only one domain are left out. If the
+    rules allow several domains and the request adds claims, add a fault for the field.
     """
     held, known = one.held, dict(_named(booked)) if booked else {}
     for field, node in _named(held):

@@ -226,7 +226,7 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
         remedy = (
             "to release a part of the demand, put the demand without that part"
             if goal.operation == "release"
-            else "leave the field out; to change the demand, put it"
+            else "leave the field out; to change the demand, send a put"
         )
         yield fault(
             "applications" if goal.applications else "connections",

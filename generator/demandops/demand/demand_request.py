@@ -20,8 +20,9 @@ from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
 Place = Callable[[str], str]
-"""Takes the path of a field in an application or connection (``inputs.ego_data[2].source``), and
-returns the path of the field in the goal, for faults.
+"""Takes a field's path in an application or connection, and returns the field's path in the goal.
+
+For example, ``inputs.ego_data[2].source`` becomes ``applications[0].inputs.ego_data[2].source``.
 """
 
 
@@ -145,12 +146,12 @@ class Expire(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Decommission(DemandRequest):
-    """An operator's request to release what needs the node, or names the requester, ``id``.
+    """An operator's request to release what needs a node or names a requester.
 
-    ``kinds`` are ``node``, ``requester`` or both. ``nodes`` lists the names that the node has in
-    its access domains; the admission of the request fills it in. ``by`` is the operator as
-    ``name <email>``; ``reason`` may be empty. The journal stores the request; no action and no
-    demand file can express it.
+    ``id`` is the name of the node or requester. ``kinds`` are ``node``, ``requester`` or both.
+    ``nodes`` lists the names that the node has in its access domains; the admission of the request
+    fills it in. ``by`` is the operator as ``name <email>``; ``reason`` may be empty. The journal
+    stores the request; no action and no demand file can express it.
     """
 
     kinds: frozenset[str] = frozenset()

@@ -88,7 +88,7 @@ class Lease:
 def renewed(current: Lease | None, term: Term | None, now: datetime) -> Lease | None:
     """Return a claim's lease after a request with ``term``; ``None`` without a term.
 
-    The result is ``current`` after a renewal, or a new lease if ``current`` is ``None``.
+    Without ``current``, the lease is new. With ``current``, :meth:`Lease.renewed` gives the lease.
     """
     if term is None:
         return None

@@ -101,8 +101,8 @@ class Detector:
 
         An event ends if its rule is gone or is no longer for its entities. If the rule has changed,
         the event wants the goal of the changed rule. If the template of the changed rule needs a
-        value that is not known, the event keeps its goal. Dwell times begin anew. The entities of
-        the other events are awaited as after a restart; ``settle_s`` is as in :meth:`resume`.
+        value that is not known, the event keeps its goal. Dwell times begin anew. As in
+        :meth:`resume`, the entities of lasting events count as gone if unseen for ``settle_s``.
         """
         before, old = self._state.lasting, self._rules
         self.file, self._engine = file, EventEngine(file)

@@ -20,7 +20,7 @@ from typing import Any
 from demandops.service.ticket import Ticket
 
 _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
-"""Fields of a goal that lists the subjects that it touches.
+"""A goal with one of these fields touches only the subjects that it lists.
 
 A goal without any of these fields may touch any subject.
 """
@@ -71,7 +71,7 @@ class FairQueue:
     def put_back(self, tickets: Sequence[Ticket]) -> None:
         """Put demands back, each before the other demands of its requester.
 
-        Their requesters take their turns first, each with one demand, as always.
+        The requesters of these demands get the next turns, one demand per turn.
 
         Args:
             tickets: in the order in which they left the queue.

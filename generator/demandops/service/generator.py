@@ -256,9 +256,9 @@ class Generator:
         """Refuse further demands, finish the queued ones and stop; return at once.
 
         Args:
-            timeout: seconds for the queued demands. After that, unpublished demands stay in the
-                journal for the next start, and their futures raise ``ShuttingDown``. So do the
-                demands that await approval. Only the timeout of the first call counts.
+            timeout: seconds for the queued demands. Demands that are then unpublished or
+                await approval stay in the journal for the next start, and their futures raise
+                ``ShuttingDown``. Only the timeout of the first call counts.
 
         Returns:
             A future that returns whether everything was published, apart from demands that await

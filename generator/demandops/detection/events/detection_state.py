@@ -69,11 +69,11 @@ class State:
 
     now: float
     due: float
-    """The time before which only an observation can change anything."""
+    """The earliest time at which anything may change without an observation."""
     settled: float
-    """The time before which no condition on a count stops."""
+    """Before this time, a low count ends no event."""
     hours_due: float
-    """The time before which no schedule begins or ends."""
+    """The time at which the schedules are checked next."""
     seen: Mapping[Who, Observation] = field(default_factory=dict)
     """The last observation of each entity that is not gone."""
     awaited: Mapping[Who, float] = field(default_factory=dict)

@@ -91,8 +91,8 @@ class RuleDemand:
     def outline(self, values: Values) -> Goal:
         """Return the goal that starts the demand, if ``values`` has all names of the template.
 
-        If ``values`` lacks a name, the goal has only the demand's id and its requesters, which
-        suffice to end the demand. Only the template of a ``Demand`` may use such names.
+        If ``values`` lacks a name, the template must be that of a ``Demand``. The goal then has
+        only the demand's id and its requesters, which suffice to end the demand.
         """
         if self.names() <= set(values):
             return self.goal(values)
@@ -118,8 +118,8 @@ class RuleDemand:
 
         Returns:
             The entity for each name in ``subjects``. ``None`` if the rule makes no demand with this
-            id and these requesters, or if neither tells the entities, such as an id
-            ``{entity}-{other}`` of entities with dashes.
+            id and these requesters, or if the entities cannot be found. For example, the template
+            ``{entity}-{other}`` can give the id ``a-b-c`` in two ways.
         """
         named = {*requesters_in(self.action, self.data)}
         if len(held.requesters) > len(named):

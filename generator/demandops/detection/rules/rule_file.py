@@ -41,9 +41,9 @@ POSITIONS: Mapping[str, tuple[str, str]] = {
 class Source(CamelModel):
     """The topics on which one kind of entity reports.
 
-    The name of the entity is either the part of the topic for which ``{entity}`` stands, or the
-    text in the message's field that ``entity`` names. ``x`` and ``y`` name the fields with the
-    entity's position. An entity counts as gone when it has been silent for ``timeout``.
+    If ``topic`` contains ``{entity}``, a topic has the entity's name at that place. If not,
+    ``entity`` is the message's field with the entity's name. ``x`` and ``y`` are the fields with
+    the entity's position. An entity counts as gone when it has been silent for ``timeout``.
     """
 
     topic: Annotated[Text, without(topic_pattern_problem)]

@@ -35,9 +35,8 @@ class Schedule:
     def next_check(self, now: float) -> float:
         """Return the time after ``now`` at which to call :meth:`is_on` again.
 
-        Until then the result of :meth:`is_on` stays the same. Only if summer time begins or ends in
-        between, the result may change earlier. So the returned time is at most an hour after
-        ``now``.
+        Before that time, the result of :meth:`is_on` changes only if summer time begins or ends.
+        To notice such a change soon, that time is at most an hour after ``now``.
         """
         local = datetime.fromtimestamp(now, self.zone)
         ahead = [now + 3600.0]

@@ -131,12 +131,12 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """Withdraw demands in ``earlier`` that need approval and that the demand ``by`` releases.
+        """Withdraw each demand in ``earlier`` that needs approval, if ``by`` releases the demand.
 
         Args:
             earlier: the demands of the batch that are evaluated already, with their results. For a
                 withdrawn demand, the result is replaced by :class:`Withdrawn`.
-            by: the next demand of the batch, whether it releases a demand or not.
+            by: the next demand of the batch, of any kind.
             state: the state on which ``by`` will be evaluated.
         """
         request = _release_request(by, state) if earlier else None
@@ -188,7 +188,7 @@ class Approvals:
         return next(full, "")
 
     def withdraw_replaced(self, request: DemandRequest) -> None:
-        """Withdraw the open proposal of a demand that ``request``, if it is a put, replaces.
+        """Withdraw the open proposal that ``request`` replaces, if ``request`` is a put.
 
         The caller has found that ``request`` needs no approval.
         """

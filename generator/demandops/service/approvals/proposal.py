@@ -93,9 +93,9 @@ class Proposal:
         """Return the verdict on the proposal's demands.
 
         A demand counts as booked if a commit of main names its operation id in a trailer. A squash
-        merge may lose this trailer, so two more kinds of demands count as booked: a demand that
-        would change no file of main; and, if a person edited the branch before the merge, a demand
-        that would change only claims in ``added``, unless the proposal's demands differ.
+        merge may lose the trailer. So a demand also counts as booked if it would change no file of
+        main, or if it would change only claims in ``added`` and all demands of the proposal have
+        the same goal.
 
         If no demand is booked, and the branch is gone or the pull request was closed, the demands
         that still need approval are turned down.

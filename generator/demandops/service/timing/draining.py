@@ -52,7 +52,7 @@ class Draining:
             self._warn(node, decision.warnings)
 
     def _warn(self, node: str, stays: Iterable[str]) -> None:
-        """Log which applications stay on a drained node and why, except texts of the last try."""
+        """Log why applications stay on a drained node; repeat no text of the last try."""
         texts = frozenset(stays)
         for text in sorted(texts - self._logged.get(node, frozenset())):
             log.warning("'%s' is drained: %s", node, text)

@@ -48,10 +48,9 @@ class LeaseExpiry:
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, to release its claims.
 
-        If the last ticket of a demand was answered and the demand still has an ended lease, the
-        demand gets no new ticket until the last ticket is a minute old. The tickets are correct
-        only at the time of the call: later, a requester may renew a lease, or a person may set the
-        clock.
+        If an answered ticket did not release the claims, the demand's next ticket comes at least a
+        minute after that ticket. The tickets are correct only at the time of the call: later, a
+        requester may renew a lease, or a person may set the clock.
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
@@ -135,7 +134,7 @@ class OverrideExpiry:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
     def postpone(self, now: datetime) -> None:
-        """For a minute, report no end as due, because a publication failed.
+        """For a minute, count no end as due, because a fetch or a publication failed.
 
         :meth:`end_due` commits the ends even so.
         """
@@ -179,7 +178,7 @@ class ScaleDown:
                     log.error("cannot scale down: %s; trying again later", problem)
 
     def postpone(self, now: datetime) -> None:
-        """For a minute, report no scale-down as due, because a publication failed.
+        """For a minute, count no scale-down as due, because a fetch or a publication failed.
 
         :meth:`end_due` commits the scale-downs even so.
         """

@@ -35,9 +35,9 @@ class OwnWork:
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
-        """For a minute, report no end of an override and no scale-down as due.
+        """For a minute, count no end of an override and no scale-down as due.
 
-        The caller has failed to publish them. :meth:`commit_due` commits them even so.
+        A fetch or a publication failed. :meth:`commit_due` commits ends and scale-downs even so.
         """
         self._override_expiry.postpone(self._runtime.now())
         self._scale_down.postpone(self._runtime.now())
