@@ -146,8 +146,8 @@ def _apart(
 ) -> tuple[list[_Drawn], list[_Drawn]]:
     """Return the parts to draw together, and the parts to draw one by one.
 
-    Up to ``most`` parts are drawn one by one: all parts if they are so few, else all special parts
-    if those are so few, else none.
+    No more than ``most`` parts are drawn one by one: if possible all parts, else if possible all
+    special parts, else none.
     """
     if len(drawn) <= most:
         return [], drawn
