@@ -98,7 +98,7 @@ class InvalidInput(DemandOpsError):
 def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
     """Yield the first faults of each file, and one fault that says how many more the file has.
 
-    Long field names are shortened. A fault that already counts further faults is kept.
+    Long field names are shortened. A fault with the code ``more``, from an earlier call, is kept.
     """
     counts: dict[str, int] = {}
     for fault in faults:

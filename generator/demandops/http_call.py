@@ -32,7 +32,7 @@ _CAUSES = {
     "RemoteProtocolError": "the answer is not HTTP, or not complete; check the URL and the server",
     "ProxyError": "the proxy refuses the connection; check HTTPS_PROXY and ALL_PROXY",
 }
-"""For types of httpx's errors, a text without the error's own, which may echo the request."""
+"""The reason for each type of httpx error whose own text may echo the request."""
 
 for _name in ("httpx", "httpcore"):  # they log URLs and headers
     logging.getLogger(_name).setLevel(logging.WARNING)

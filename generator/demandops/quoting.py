@@ -55,7 +55,7 @@ def lines(text: str) -> str:
 
 
 def quoted(value: str, most: int = 80) -> str:
-    """Return a value on one line, cut to at most ``most`` characters, in quotes besides."""
+    """Return a value on one line, cut to at most ``most`` characters and then put in quotes."""
     return f"'{one_line(value, most)}'"
 
 

@@ -34,7 +34,7 @@ _RESULT_S = 900
 """How many seconds at least :class:`LastingResults` keeps a result that ROS has forgotten."""
 _MOST_RESULTS = 2_000
 """How many results :class:`LastingResults` keeps; if there are more, it forgets the oldest ones,
-even before that time."""
+even within ``_RESULT_S``."""
 
 
 class DemandError(Exception):

@@ -95,7 +95,7 @@ class DemandAdapter(DeploymentRequestAdapter):
         return Demand.Feedback(stage=stage, message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return a result with a code and, as its message, the text of the other adapter.
+        """Return a result with a code, and with the message of ``DeploymentRequest``.
 
         After success, the result also has ``reached`` and fields of the receipt.
         """

@@ -48,8 +48,8 @@ _PROBABLY_RELEASED = (
 class Answer:
     """The result of a goal.
 
-    ``outcome`` is booked, waiting, released or unchanged. ``commit`` is empty if only an earlier
-    attempt, which got no response, can have released the demand. ``lease_s`` is 0 without a lease.
+    ``outcome`` is booked, waiting, released or unchanged. ``commit`` is empty if the demand was
+    probably released by an earlier attempt that got no response. ``lease_s`` is 0 without a lease.
     ``reached`` is pushed, reconciled or healthy.
     """
 
@@ -202,8 +202,7 @@ class HeldDemand:
     def __enter__(self) -> HeldDemand:
         """Put the demand, start to renew its lease if it has one, and return this object.
 
-        Raises:
-            DemandError: as in :meth:`DemandClient.put`, and its other errors.
+        The errors are those of :meth:`DemandClient.put`.
         """
         lease_s = self._put_and_remember().lease_s
         if lease_s:
@@ -213,10 +212,10 @@ class HeldDemand:
     def __exit__(self, kind: object, error: object, traceback: object) -> None:
         """Release the demand.
 
-        A failure is only logged if the block raised an error, or if the demand holds nothing.
+        If the block raised an error or the demand holds nothing, a failure is logged, not raised.
 
         Raises:
-            DemandError: otherwise, as in :meth:`DemandClient.release`.
+            DemandError: for any other failure, as in :meth:`DemandClient.release`.
         """
         self._over.set()
         if self._renewer is not None:

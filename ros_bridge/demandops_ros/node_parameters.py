@@ -39,8 +39,8 @@ _DESCRIPTIONS = {
     "answer": "When a DeploymentRequest is answered.",
     "answer_timeout": "How many seconds a goal may take to be reconciled or healthy.",
     "state_repo": "Folder or URL of the state repo.",
-    "fetch_interval": "How often people's commits are fetched while no demand comes; 0 for no "
-    "interval.",
+    "fetch_interval": "How often people's commits are fetched while no demand comes; 0 means no "
+    "fetches at an interval.",
     "requester_queue_limit": "How many demands of one requester may be without an answer; more "
     "are rejected.",
     "log_level": "Lowest level of messages in the log.",

@@ -1,9 +1,9 @@
-"""Reads the parameters of the reference's node, and warns about those to act on.
+"""Reads the parameters of the reference's node, and warns about those that have no effect.
 
 A fleet may start our node with the parameter file of the reference's node. The file calls that node
-``application_manager``. Our node takes the action's name from the file. Brokers, topics and
-namespaces come from the state repo. If the file names a broker, a topic or a namespace that the
-state repo lacks, the node warns. It also warns about parameters that it replaces by other means.
+``application_manager``. Our node takes the action's name from the file. Brokers, topics, namespaces
+and the image registry come from the state repo. If the file names one that the state repo lacks,
+the node warns. The node also warns about parameters that it replaces by other means.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ class ExecutorThread:
     """Runs a node's callbacks in a thread; :meth:`close` ends the thread.
 
     The thread must end before the node is destroyed. rclpy's ``shutdown`` is not enough, because it
-    does not wait for running callbacks. The thread must also end before Python exits. If the thread
-    still waits for ROS then, the process aborts.
+    does not wait for running callbacks. The thread must also end before Python exits. A thread that
+    waits for ROS while Python exits aborts the process.
     """
 
     def __init__(self, node: Node, name: str = "executor") -> None:

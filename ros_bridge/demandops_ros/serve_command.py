@@ -56,8 +56,8 @@ _FLUSH_S = 0.3
 @click.option(
     "--fetch-interval",
     metavar="DURATION",
-    help="How often to fetch people's commits while no demand comes, such as 30s; 0 for no "
-    f"interval. Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
+    help="How often to fetch people's commits while no demand comes, such as 30s; 0 means no "
+    f"fetches at an interval. Default: {DEFAULT_INTERVAL}; also the ROS parameter fetch_interval.",
 )
 @click.option(
     "--webhook",

@@ -118,7 +118,7 @@ class ObjectCache:
     def pods(self, namespace: str, deployment: str) -> list[Any]:
         """Read and return the pods of a Deployment.
 
-        The list is empty if the Deployment is not in the cache, or selects its pods without labels.
+        The list is empty if the Deployment is not in the cache, or has no ``matchLabels``.
 
         Raises:
             Exception: from the library, if the cluster does not answer or refuses.

@@ -32,8 +32,8 @@ class WebServer:
         Args:
             address: ``host:port``; port 0 picks a free port.
             option: the option that gave the address, for messages.
-            follower: provides what the page shows. :meth:`close` closes it, and so does an address
-                on which the server cannot listen.
+            follower: provides what the page shows; closed by :meth:`close`, or if the server cannot
+                listen.
 
         Raises:
             InvalidInput: if the server cannot listen on the address.

@@ -143,7 +143,7 @@ class CommitState:
     def _with_other_claims(
         self, before: CommitState, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield the planned releases of ``before`` that other claims on ``subjects`` need now.
+        """Yield each planned release of ``before`` whose claims on ``subjects`` have changed.
 
         Each yielded release has the claims that need it now.
         """
@@ -175,9 +175,10 @@ class CommitState:
 
     @property
     def planned(self) -> dict[ReleaseKey, Planned | None]:
-        """The planned releases by key; the value is None if nothing runs at the key.
+        """The planned releases by key.
 
-        An override denies the release then, or the client of a connection carries no topic.
+        The value is None if an override denies the release, if overrides suspend all claims that
+        need the release, or if the client of a connection carries no topic.
         """
         if self._planned is None:
             self._planned = {key: self._plan(key) for key in all_keys(self.state)}

@@ -16,7 +16,7 @@ from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
 REST_OF_BAG = "the rest of the bag"
-"""Stands for a topic in ``left_out``, because nobody knows how many messages could not be read."""
+"""Stands in ``left_out`` for the damaged end of a bag, whose topics are unknown."""
 
 
 class RecordedBag:
@@ -25,7 +25,8 @@ class RecordedBag:
     ``topics`` are the topics that the sources read. ``unread`` has the topics whose name matches a
     source but whose message type does not, each with its message type. ``left_out`` counts
     unreadable messages by topic and reason; a message counts once for each source that reads it.
-    If the end of the bag is damaged, ``left_out`` also has :data:`REST_OF_BAG` with the count 1.
+    If the end of the bag is damaged, ``left_out`` also has :data:`REST_OF_BAG`, with the count 1
+    because the lost messages cannot be counted.
     """
 
     def __init__(self, path: Path, file: RuleFile) -> None:

@@ -23,8 +23,8 @@ class Consequence:
 
     ``how`` says in words how to release the demand. ``file`` is the text of a file for ``demandops
     request`` that releases the demand by its id; it is empty if ``how`` names another way.
-    ``approval`` says because of what a person must approve the release. ``refused`` is the reason
-    why the generator would refuse the release, or empty.
+    ``approval`` has the reasons why releasing the demand needs a person's approval. ``refused`` is
+    the reason why the generator would refuse to release the demand, or empty.
     """
 
     releases: tuple[ReleaseChange, ...]

@@ -146,9 +146,8 @@ def _apart(
 ) -> tuple[list[_Drawn], list[_Drawn]]:
     """Return the parts to draw together, and the parts to draw one by one.
 
-    If there are at most ``most`` parts, all are drawn one by one. If there are more, only the
-    special parts are drawn one by one. But if there are more than ``most`` special parts, all parts
-    are drawn together.
+    No more than ``most`` parts are drawn one by one: if possible all parts, else if possible all
+    special parts, else none.
     """
     if len(drawn) <= most:
         return [], drawn

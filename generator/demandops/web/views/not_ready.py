@@ -113,7 +113,7 @@ def causes(
 def applications(now: Situation, found: Iterable[Cause], wanted: Filter) -> list[Ready]:
     """Return the applications that match the filter ``wanted``.
 
-    Those that a cause in ``found`` concerns come first.
+    Applications with a cause in ``found`` come first.
     """
     by_application: dict[str, list[Cause]] = {}
     for cause in found:

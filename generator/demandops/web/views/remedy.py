@@ -68,8 +68,7 @@ def remedy_of(
         who = f"the operator of the GitOps controller of cluster {cluster}"
         if kind != "failing":
             who = (
-                f"the GitOps controller of cluster {cluster} by itself; if the controller fails, "
-                "its operator"
+                f"the GitOps controller of cluster {cluster}; if the controller fails, its operator"
             )
         return Remedy(who, "", command)
     if kind == "starting":
