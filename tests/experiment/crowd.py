@@ -76,7 +76,7 @@ def rules(near: Near) -> str:
 def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> list[Event]:
     """Return the events before `until`, sorted by time.
 
-    `passing` maps each vehicle to the condition that it is near the intersection on its way.
+    `passing` maps each vehicle to the nearness condition of the intersection that it passes.
     """
     own: defaultdict[Near, list[Pose]] = defaultdict(list)
     for pose in poses:

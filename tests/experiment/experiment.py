@@ -35,7 +35,7 @@ from .standins.image import image
 ROOT = Path(__file__).resolve().parents[2]
 _PATIENCE_S = 120.0
 _STAND_S = 0.5
-"""If the vehicles must wait, they stop this many seconds before the pose that causes an event."""
+"""How many seconds before an event's cause the vehicles stop, to wait for the event before it."""
 _CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
 
 

@@ -32,7 +32,7 @@ from .process_runner import ProcessRunner
 from .rules import poses_in
 
 _LOOKS = 12
-"""At about this many commits, the run records the whole bookkeeping.
+"""The run records the whole bookkeeping at about this many of its commits.
 
 These commits are spread evenly over the run, and the last commit is one of them.
 """
@@ -172,7 +172,7 @@ class LargeExperiment(Experiment):
     def _formed(self, since: str) -> Iterator[Formed]:
         """Yield the demand of each commit after ``since``.
 
-        At about :data:`_LOOKS` of the commits, the demand has the bookkeeping too.
+        Of these demands, about :data:`_LOOKS` come with the bookkeeping.
         """
         stages, commits = self._cloud.commits(), self._commits(since)
         looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}

@@ -24,7 +24,7 @@ class Step:
     - `pods`: after a join, the last pod of the vehicle's connection got its node; after a leave,
       all pods of the connection had ended.
     - `first`: the first fused message had the vehicle's ego data; None after a leave.
-    - `gone`: after a join, all pods of the connection had ended; None after a leave.
+    - `gone`: all pods that came with a join had ended, after a later leave; None for a leave.
     """
 
     event: Event

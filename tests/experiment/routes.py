@@ -196,8 +196,8 @@ def many(seed: int, count: int) -> tuple[Route, ...]:
 def vanishing(routes: Sequence[Route], vehicle: str) -> tuple[Route, ...]:
     """Return the routes, changed so that ``vehicle`` falls silent while it is near.
 
-    The vehicle falls silent in the middle of the longest time without other events. Shortly before
-    an event, the experiment may stop all vehicles, and a stopped vehicle goes on sending.
+    Shortly before an event, the experiment may stop all vehicles, and a stopped vehicle goes on
+    sending. So ``vehicle`` falls silent in the middle of the longest time without other events.
     """
     (lost,) = (route for route in routes if route.vehicle == vehicle)
     moments = sorted(

@@ -18,9 +18,9 @@ from tests.kit import rig
 def test_an_interrupted_request_says_which_demands_are_answered(
     bare: Path, data_home: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], number: int
 ) -> None:
-    """After a batch is booked, a folder in place of the branch's lock file stops more commits.
+    """Once a batch is published, the test puts a folder where Git needs the lock file of `main`.
 
-    So some demands have no answer when the interrupt comes.
+    So nothing more is committed, and some demands have no answer when the interrupt comes.
     """
     file = tmp_path / "demands.yaml"
     file.write_text(yaml.safe_dump_all(rig.goal(each) for each in range(60)))

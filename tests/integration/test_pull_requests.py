@@ -462,7 +462,7 @@ def test_a_sparse_checkout_is_told_how_to_become_whole(branch: Path, check: Run)
 def test_a_checkout_that_git_cannot_open_is_not_taken_for_files_without_git(
     branch: Path, demandops: Run
 ) -> None:
-    """A checkout of another user is one, as is a work tree whose repository is not there."""
+    """Git cannot open a checkout of another user, nor a work tree whose repository is missing."""
     shutil.rmtree(branch / ".git")
     (branch / ".git").write_text("gitdir: /nowhere\n")
     told = f"error: {branch} is a Git repository that cannot be opened: "

@@ -131,8 +131,7 @@ class Fleet:
 def servers(tmp_path: Path, data_home: Path, ros_domain: int) -> Iterator[Servers]:
     """A starter that runs each command in a new process, as a person does.
 
-    A detector that is forked from a process with imported modules starts too fast: the detector
-    still receives old bookkeeping.
+    A forked detector could start before the node publishes the newest bookkeeping.
     """
     started = Servers(tmp_path, ros_domain)
     yield started

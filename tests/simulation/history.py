@@ -311,8 +311,8 @@ class History:
     def set_clocks(self) -> None:
         """Set the wall clocks forward or back; after the first step back, only further back.
 
-        A step forward could cancel a step back. If another machine recorded a lease between the
-        two steps, a machine that noticed no step might end the lease too early.
+        A machine may notice neither of a step back and a step forward. The machine could then end a
+        lease too early that another machine renewed between the steps.
         """
         self.oracle.check()
         self.oracle.counts["faults"] += 1

@@ -60,7 +60,7 @@ def kustomize(world: World, goal: dict[str, Any]) -> None:
 
 
 def source(world: World, goal: dict[str, Any]) -> None:
-    """Kill source-controller as soon as it is triggered."""
+    """Tell source-controller to fetch, and kill it at once."""
     world.demand(goal)
     world.domain.wake()
     killed(world, "source-controller")

@@ -160,7 +160,7 @@ def assert_exact(domain: Namespace, *vehicles: str) -> None:
 
 
 def lines(*vehicles: str) -> Iterator[str]:
-    """Yield a line for each object and each input of the fusion that these vehicles need."""
+    """Yield the lines that a demand for these vehicles adds to `Namespace.lines`."""
     yield from (f"ConfigMap {FUSION}-{part}" for part in ("params", "watcher"))
     services = [(FUSION, "edge"), (PLANNER, "edge")]
     clients = []

@@ -756,7 +756,7 @@ def test_what_a_person_edits_and_squashes_is_booked(
 
 
 def test_a_merge_of_what_was_replaced_books_not_what_replaced_it(bare: Path, petra: Person) -> None:
-    """The person's squash keeps no trailers, and the generator sees both at once."""
+    """The person squashes ``first``, without trailers, before the generator decides ``second``."""
     link = {"id": "x", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
     made = {"kind": "Demand", "demand": "d", "requesters": ["vehicle00"], "connections": [link]}
     gate = Gate()

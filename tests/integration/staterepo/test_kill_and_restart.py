@@ -26,8 +26,8 @@ LANES = 4
 def _client(lane: int) -> list[tuple[str, rig.Goal]]:
     """Return a client's demands in order; of every three joins, two are followed by a leave.
 
-    No two joins have a requester in common. Otherwise a leave that is sent again could mean another
-    join of its requester (docs/decisions/0023-a-shutdown-takes-holds.md).
+    No two joins have a requester in common. If two had one, a repeated leave of the first could end
+    the second (docs/decisions/0023-a-shutdown-takes-holds.md).
     """
     made = []
     for turn in range(60):
@@ -245,7 +245,7 @@ def test_a_join_that_was_refused_before_a_release_is_not_booked_by_a_replay(
 def test_what_was_answered_without_a_commit_is_not_booked_after_a_power_loss(
     bare: Path, data_home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, node: str
 ) -> None:
-    """``again`` changes nothing (``edge``) or is refused (``cloud``).
+    """``again`` changes nothing if its node is ``edge``, and is refused if it is ``cloud``.
 
     If ``again`` were decided once more after the release, it would be booked.
     """

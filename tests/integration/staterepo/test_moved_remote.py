@@ -97,7 +97,7 @@ def _kinds(bare: Path) -> list[str]:
 def test_a_generator_renders_again_after_a_person_undid_another_generators_work(
     address: str, bare: Path, person: Person, tmp_path: Path, deletes: bool
 ) -> None:
-    """The claims or brokers are as at the first generator's last commit; rendered files are not."""
+    """The person undoes a change of claims or brokers, but not what ``second`` rendered for it."""
     with rig.running(address) as first, rig.running(address, data=tmp_path / "other") as second:
         rig.book(first, goal(3))
         rig.book(second, goal(3))
@@ -340,7 +340,7 @@ def test_a_release_of_what_another_generator_booked_is_not_refused(
 def test_no_demand_is_answered_from_a_stale_clone_while_the_remote_is_away(
     url: str, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """By the clone, ``again`` changes nothing and ``late`` is refused; the remote is newer."""
+    """Decided from the clone, ``again`` would change nothing, and ``late`` would be refused."""
     with rig.running(url) as generator:
         rig.book(generator, goal(1))
         _delete_claims(bare)(person)

@@ -133,7 +133,7 @@ def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_tra
 def test_a_rejected_push_is_told_to_its_batch_and_a_refusal_to_the_refused_demand(
     url: str, bare: Path
 ) -> None:
-    """``moved`` contradicts a demand of its batch, but no demand of the batch is published.
+    """``moved`` contradicts ``goal(2)`` of the same batch, but the batch is never published.
 
     So ``moved`` must fail because of the push, and not because of the contradiction.
     """

@@ -90,7 +90,7 @@ def _cut(server: Server) -> None:
 
 
 def test_a_push_is_repeated_until_the_server_takes_it(bare: Path) -> None:
-    """`403`, `denied` and `rejected` in the server's address make no error a refusal."""
+    """An error 503 is no refusal, even if the URL has `403`, `denied` and `rejected` in it."""
     prefix = "/403/denied-and-rejected"
     with serving(bare.parent, prefix) as server, rig.running(f"{server.url}/state.git") as one:
         server.faults.pushes_to_refuse, server.faults.status = 3, 503
