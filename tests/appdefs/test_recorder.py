@@ -302,7 +302,7 @@ class TestParameters:
     def test_a_shared_driver_merges_over_all_kinds_of_its_applications(
         self, books: MemoryRepo, recorder: dict[str, int], monitor: int
     ) -> None:
-        """The largest demanded rate counts; a demand without a rate changes nothing."""
+        """The driver gets the largest rate that a recorder or a monitor demands."""
         books.send(self.demand("a", "recorder", **recorder))
         books.send(self.demand("b", "monitor", rate=monitor))
         assert self.values(books, "drv-")["rate"] == 20

@@ -113,8 +113,8 @@ def lay_down(
 def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
     """Make a bare state repo with one application that many vehicles hold; return its path.
 
-    ``vehicles`` is the number of these vehicles. The inventory has ``further`` more vehicles, which
-    demand nothing yet.
+    ``vehicles`` is the number of vehicles that hold the application. ``further`` is the number of
+    other vehicles in the inventory, which demand nothing yet.
     """
     _lay_down(path, 1, 1, vehicles, further)
     return path

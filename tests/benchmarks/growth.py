@@ -43,8 +43,8 @@ def _costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
 def _rows(folder: Path, sizes: dict[int, int], rounds: int, ego: Ego) -> list[Row]:
     """Return a row for each size: what the join and the leave of one more vehicle cost.
 
-    A size is the number of vehicles that hold the application, or the number of topics that a goal
-    lists. ``sizes`` maps each size to the number of vehicles. ``ego`` takes a size and a goal's
+    ``sizes`` maps each size to the number of vehicles that hold the application. A size is what
+    the rows vary: the number of vehicles, or of topics in a goal. ``ego`` takes a size and a goal's
     number, and returns the goal's ego topics.
     """
     generators: dict[int, Generator] = {}

@@ -86,11 +86,10 @@ _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh pac
 
 
 _UNNOTICED = ("git receive-pack", "getdents64", "state.git/objects/tmp_objdir-incoming-*/??")
-"""A system call of the server. If it fails, Git takes the error for the end of a list.
+"""The system call by which ``git receive-pack`` lists a folder of objects that it received.
 
-So Git may lose an object.
-
-The generator cannot see the loss. docs/reliability.md describes it under "Known and open".
+If the call fails, Git believes that the list is complete, and may lose an object. The generator
+cannot see the loss. docs/reliability.md describes the loss under "Known and open".
 """
 
 
@@ -217,10 +216,10 @@ def _is_of_journal(site: Site) -> bool:
 
 
 def _counted(rig: Rig, site: Site) -> tuple[int, list[str]]:
-    """Return the call's number for strace, and the options that limit what strace counts.
+    """Return the number of the call to inject at, and the options that limit what strace counts.
 
-    For a thread's call on the journal, strace counts only calls on the journal. The number of other
-    calls, such as those that wake a thread, depends on timing.
+    For a thread's call on the journal, strace counts only calls on the journal, because the number
+    of other calls, such as calls that wake a thread, depends on timing.
     """
     if _is_of_journal(site):
         return site.place + 1, ["-P", str(next(rig.home.rglob("outbox.jsonl")))]
@@ -242,11 +241,12 @@ def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call.
 
-    With ``short``, choose some calls, and some faults for each:
+    With ``short``, choose the last call of each class, and these of its faults:
 
-    - The last call of each class. Without a remote, also the first call of a class of syncs.
-    - For a call that only reads: EIO. With a remote, no fault.
-    - For a call that changes or syncs a file: those of its faults that ``_SHORT`` lists.
+    - For a call that changes or syncs a file: the faults that ``_SHORT`` lists.
+    - For a call that only reads: EIO without a remote, no fault with a remote.
+
+    For syncs without a remote, choose the first call of the class too.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
@@ -292,7 +292,7 @@ def run(rig: Rig, job: Job) -> Result:
 
 
 def _counted_anew(rig: Rig, wanted: Site, here: Site, *, only_here: bool) -> Site:
-    """Run a new process without a fault; return a call with the number that it has there.
+    """Book the demand without a fault; return the wanted call with its number in this run.
 
     If ``only_here``, trace only the thread or process that makes the call, which is cheaper. If
     the thread or process does not make the call this time, trace all threads and processes.

@@ -184,10 +184,7 @@ class Disk:
             yield f"without {change.name}", [change]
 
     def write(self, missing: Iterable[_Change]) -> None:
-        """Write the folder as it is after a loss of power that removes ``missing``.
-
-        The safe parts of ``missing`` stay.
-        """
+        """Write the folder as a power loss leaves it: without the unsafe parts of ``missing``."""
         left_out = {id(change) for change in missing}
         names = dict(self._first_names)
         data = {node: bytearray(text) for node, text in self._first_data.items()}

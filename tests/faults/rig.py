@@ -34,7 +34,7 @@ from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
 
 LIMIT_S = 8.0
-"""How many seconds a process that books a demand has, at least, until it gets SIGTERM.
+"""How many seconds after its start a process that books a demand gets SIGTERM.
 
 The process needs half a second, but it may have to wait for its disk. :meth:`Rig.is_slower` raises
 the limit on a busy machine.
@@ -47,9 +47,9 @@ END_S = 8.0
 """How many seconds after SIGTERM a process gets SIGKILL."""
 BEGIN = "/faults-begin"
 _FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
-"""The time at which the clock of a rig's first process stands still.
+"""The time that the stopped clock of a rig's first process shows.
 
-The clock of each further process stands still a minute later. So each run of a demand makes the
+The stopped clock of each further process shows one minute more. So each run of a demand makes the
 same commits. Its system calls keep their numbers, except for small differences, and a rig
 recognizes a state of the disk that it has met before (:meth:`Rig.fingerprint`).
 """
@@ -106,9 +106,9 @@ class Strace:
 class GitTrace:
     """The calls of one process of git.
 
-    ``which`` is the number of the process, from 1, among those of its ``command``, such as
-    ``git push``. ``folder`` is the working directory of the process, and ``text`` is the output of
-    strace.
+    The processes of each ``command``, such as ``git push``, are numbered from 1: ``which`` is the
+    number of this process. ``folder`` is the working directory of the process, and ``text`` is the
+    output of strace.
     """
 
     command: str

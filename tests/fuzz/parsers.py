@@ -322,7 +322,7 @@ def _seen(
 
 
 class _Message(float):
-    """A number that is also a message: each of its fields is the number itself."""
+    """A number that can be read as a message: ``message.a.b[0]`` is the number itself."""
 
     def __getattr__(self, name: str) -> _Message:
         return self

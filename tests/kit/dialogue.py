@@ -63,7 +63,7 @@ class Dialogue:
         return os.waitstatus_to_exitcode(status)
 
     def _runs_on(self) -> bool:
-        """Return whether the command still runs; repeat the last text if it is ignored."""
+        """Return whether the command runs; if it ignored the typed text, type the text again."""
         if select.select([self._master], [], [], 0)[0]:
             return self._read(0)
         if not self.text[self._typed_at :].strip("^C\r\n"):

@@ -104,8 +104,8 @@ def numbered(
     """Return demand ``number``.
 
     Its requesters are ``user<number>``, who has no other demand, and ``station00``. If ``alone``,
-    ``station00`` is left out. Every fifth number gives the same application. Without ``vehicle``,
-    every fourth number gives the same connection.
+    ``station00`` is left out. Demands 0, 5, 10, … have the same application. Without ``vehicle``,
+    demands 0, 4, 8, … have the same connection.
     """
     name = f"vehicle{(number if vehicle is None else vehicle) % 4:02}"
     who = [f"user{number}", *([] if alone else ["station00"])]

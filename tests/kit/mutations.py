@@ -52,7 +52,7 @@ class Mutation(NamedTuple):
     def names(self) -> set[str]:
         """Return the keys on the path to the mistake, and all texts in the former value.
 
-        A fault in a field that refers to the former value quotes one of these names.
+        A fault at another place must quote one of these names.
         """
         names = {str(part) for part in self.place}
         values = [self.value]

@@ -1,4 +1,4 @@
-"""Random requests with leases, and the ledger's claims as the model of leases writes them."""
+"""Random requests with leases, and the ledger's claims in the form of the model of leases."""
 
 from __future__ import annotations
 

@@ -70,8 +70,8 @@ class Reference:
         """Write an operator's versioning file and its bookkeeping file.
 
         The operators have an oddity: for a new connection or detection, the bookkeeping and the
-        first request share one list of requesters. So in the versioning file, the first request
-        shows the requesters that the bookkeeping had when the file was written.
+        first request are one list of requesters in memory. So the versioning file also shows later
+        requesters under the first request.
         """
         self._versions[kind].setdefault(name, {})[str(self._version)] = request
         self._saved[kind] = copy.deepcopy(self._versions[kind])

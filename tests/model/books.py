@@ -218,8 +218,8 @@ class Books:
     def _shut_down(self, goal: Goal, found: Claims) -> Result:
         """Take the holds that a shutdown lists.
 
-        ``found`` has the claims before the shutdown. The claim that gives up a hold is chosen among
-        these, so a hold that is listed twice is taken once. The design leaves one case open: a
+        ``found`` has the claims before the shutdown. If a hold is listed twice, both entries choose
+        the same claim in ``found``, so the hold is taken once. The design leaves one case open: a
         shutdown with several requesters and no topics. In this model, each requester then gives up
         its holds on one claim, which may be another claim for each requester.
         """

@@ -1,8 +1,8 @@
 """Random requests in the form of the reference's action.
 
-A maker draws its random numbers from Hypothesis's ``randoms()``, with which Hypothesis can shrink a
-failed example, or from a plain seed. It uses few subjects, requesters and topics, so that requests
-often concern the same ones.
+A maker draws its random numbers from a plain seed or from Hypothesis's ``randoms()``, which lets
+Hypothesis shrink a failed example. A maker uses few subjects, requesters and topics, so that
+requests often concern the same ones.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from tests.model import leases
 from tests.model.leases import Goal, Promises, Subject
 
 Outcome = Literal["booked", "released", "unchanged", "refused", "waiting", "waits"]
-"""``waiting``: the demand begins to wait or waits with a change; ``waits``: nothing changes."""
+"""``waiting``: a put adds or changes a waiting demand; ``waits``: a put repeats the demand."""
 
 
 @dataclass(frozen=True)

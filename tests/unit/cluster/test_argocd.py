@@ -48,8 +48,8 @@ def application(
 ) -> dict[str, Any]:
     """Return an Application whose spec has the source ``wanted``.
 
-    If ``sync`` is set, Argo CD has compared the Application with the source ``compared``. By
-    default this is the source ``wanted``.
+    If ``sync`` is set, the status names the source to which Argo CD compared the cluster:
+    ``compared`` or, by default, ``wanted``.
     """
     status: dict[str, Any] = {"conditions": list(conditions), "resources": list(resources)}
     status["health"] = {"status": health, "lastTransitionTime": AT}

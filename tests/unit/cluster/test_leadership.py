@@ -38,7 +38,7 @@ class Server:
 
     ``trouble`` returns ``before`` or ``after`` if the next call fails before or after its effect,
     or an empty text if it does not fail. ``takes`` returns how many seconds the next call takes.
-    After each call, the age of the Lease is appended to ``ages``, once for each process that leads.
+    If a process leads after a call, the age of the Lease is appended to ``ages``.
     """
 
     turns: Turns

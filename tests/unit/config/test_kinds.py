@@ -178,7 +178,7 @@ def test_a_kind_that_the_domain_may_not_have_is_told_with_its_line() -> None:
     ],
 )
 def test_a_remedy_can_be_followed(fields: dict[str, str], kind: str, remedy: str) -> None:
-    """A list that lacks the default kinds would break other charts, and some kinds never fit."""
+    """The remedy names the field that keeps the kind out: ``kinds`` or ``network``."""
     agent = {f"{CHART}/templates/agent.yaml": f"kind: {kind}\n"}
     found = [told for told in warned({**agent, **domain(**fields)}) if f"{CHART}/templ" in told]
     assert [f"one; {remedy}" in told for told in found if f": {kind} is" in told] == [True]

@@ -228,7 +228,7 @@ class TestValues:
         return sorted(one.split(": ")[1] for one in found)
 
     def test_text_glued_to_a_value_does_not_become_another_value(self) -> None:
-        """A template writes a text as JSON, in quotes. In a longer text, the quotes are content."""
+        """``/prefix{{ topic }}`` gives ``/prefix"/points"``: the quotes are part of the text."""
         text = skeleton()[TEMPLATE].replace("{{ source_topic }}", "/prefix{{ source_topic }}")
         (found,) = faults(text)
         assert found.startswith(

@@ -111,7 +111,7 @@ def test_the_receipt_says_so_and_a_put_moves_it() -> None:
 
 
 def test_a_channel_moved_off_the_default_version_changes_nothing_that_runs() -> None:
-    """Two demands share an application: one names the channel, the other names no version."""
+    """At first, ``stable`` names the default version, so both demands share an application."""
     repo = MemoryRepo(SEPARATE)
     repo.send(put("a"))
     repo.send(put("b", "stable"))

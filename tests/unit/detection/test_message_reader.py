@@ -23,7 +23,7 @@ def reader(type_name: str = "a_msgs/msg/A", **fields: Any) -> MessageReader:
 
 
 def message(x: object = 1, y: object = 2, **more: Any) -> Message:
-    """Return a message with a position in every field in which a known type has one."""
+    """Return a message that has the position fields of all known types."""
     point = Message(position=Message(x=x, y=y))
     pose = Message(position=Message(x=x, y=y), pose=point)
     state = Message(continuous_state=[x, y])

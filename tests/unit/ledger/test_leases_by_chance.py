@@ -48,7 +48,7 @@ def restart(world: running.World, random: Random) -> None:
 def assert_released(world: running.World, promises: Promises, now: int) -> None:
     """Release the expired demands.
 
-    Check that every claim that must end is released, and only claims that may end.
+    Check that each claim that must end is released, and that each released claim may end.
     """
     before = set(claims_of(world.state.ledger))
     demands = world.do_what_is_due()

@@ -137,7 +137,7 @@ services:
 
 
 def test_another_definition_with_the_same_output_must_change() -> None:
-    """Neither another id nor another usual topic would give the output another name."""
+    """If the id or the usual topic changed, both outputs would still have the same name."""
     values = "appdefs/other/values/other.yaml.j2"
     repo = MemoryRepo({"appdefs/other/appdef.yaml": OTHER, values: "replicas: 1\n"})
     repo.send(put(FRONT))

@@ -82,8 +82,8 @@ class Recorded:
     """One of the two tables of the recorded run: ``books`` (who requests what) or ``runs``.
 
     ``theirs`` is the table of the reference after a step, and ``ours`` is the table that DemandOps
-    must have after the step. The record of a step lists only changes: to the entries of ``theirs``,
-    and to the list of entries in which ``ours`` differs from ``theirs``.
+    must have after the step. The record of a step lists only changes: changed entries of
+    ``theirs``, and entries of ``ours`` that begin or cease to differ from ``theirs``.
     """
 
     def __init__(self, name: str) -> None:

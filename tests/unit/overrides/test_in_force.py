@@ -181,7 +181,7 @@ def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
 
 
 def test_a_refusal_names_the_override_that_breaks_the_demand() -> None:
-    """A patch may fit the demand that `check` invents, but not a real demand."""
+    """``check`` tries a patch only with an invented demand, so ``check`` can miss a mistake."""
     fields = {"select": [{"services": ["object-detection"]}], "values": {"replicas": {"x": 1}}}
     books = MemoryRepo(files(tested=fields))
     with pytest.raises(InvalidInput) as refusal:

@@ -58,8 +58,8 @@ class Graphs:
     ) -> None:
         """Make the definitions.
 
-        ``place`` has fields that services with the scope ``application`` may get. If ``each`` is
-        set, services with the scope ``topic`` may get these fields too.
+        ``place`` has fields for the definitions of services with the scope ``application``. If
+        ``each`` is set, some services with the scope ``topic`` get the fields too.
         """
         self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}

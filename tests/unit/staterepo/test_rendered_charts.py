@@ -1,4 +1,4 @@
-"""The remedy for a kind that an access domain does not allow can be followed."""
+"""The fault for an object whose kind the access domain does not allow says what to do."""
 
 from __future__ import annotations
 
