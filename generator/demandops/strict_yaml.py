@@ -86,8 +86,9 @@ class _Misread(Exception):
 class _Parser:
     """Builds the values of a text in one pass over PyYAML's events.
 
-    Deep nesting is refused, because recursive code that reads the values could fail. ``lists`` maps
-    each stand-in in the text (:data:`_STAND_IN`) to the list that it replaces.
+    Deep nesting is refused, because recursive code that reads the values could fail. Some lists of
+    the text may have been cut out and replaced by placeholders (:data:`_STAND_IN`); ``lists`` maps
+    each placeholder to its list.
     """
 
     def __init__(self, text: str, lists: Mapping[str, list[str]] = MappingProxyType({})) -> None:

@@ -373,7 +373,7 @@ class History:
             self.oracle.edits[commit] = lambda books: books.waiting.pop(demand)
 
     def _come_down(self) -> None:
-        """Let a service come down: delete the record of the replicas that it keeps."""
+        """Let a service scale down at once: delete the record of the replicas that it keeps."""
         self.oracle.check()
         if found := sorted(self._files(KEPT_REPLICAS).items()):
             path, text = self.chance.choice(found)

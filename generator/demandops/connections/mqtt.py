@@ -74,7 +74,8 @@ class Mqtt(ConnectionType):
     ) -> Iterator[Fault]:
         """Yield a fault if ``mqtt.messages`` of the clients does not list the route's package.
 
-        There is none if the list is empty, the message type is unknown or the route is primitive.
+        Yield nothing if ``mqtt.messages`` is empty, the message type is unknown, or the message is
+        carried as a primitive type.
         """
         package = message_type(route, sender, config).partition("/")[0]
         carried = config.clients.mqtt.messages

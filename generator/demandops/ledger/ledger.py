@@ -348,7 +348,8 @@ def _counted(
 ) -> HashTrieMap[str, int]:
     """Return ``counts`` (:attr:`Ledger.applications_on`) with one application counted anew.
 
-    ``before`` and ``after`` are the old and the new first claim on the application.
+    Of all claims on the application, the first decides where it runs. ``before`` and ``after`` are
+    that claim before and after a change.
     """
     old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
     for nodes, change in ((old - new, -1), (new - old, 1)):

@@ -96,8 +96,8 @@ def _note(needed: Connection, type: str) -> str:
         return ""
     topic = needed.topics[0].source
     return (
-        f"already carries {topic} and is {needed.type.name}, so this topic gets no "
-        f"{type.upper()} connection"
+        f"already carries {topic} by {needed.type.name}, so {topic} gets no {type.upper()} "
+        "connection"
     )
 
 

@@ -111,11 +111,12 @@ def test_a_failing_release_without_images_in_the_registry_names_its_maintainer(
 def test_not_everything_is_ready_while_a_cluster_is_not_watched(
     shown: Shown, follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    watched = with_health(follower)
-    monkeypatch.setattr(follower, "_newest", watched)
+    situation = with_health(follower)
+    # the follower's thread may set its own newest situation at any time
+    monkeypatch.setattr(Follower, "newest", property(lambda self: situation))
     assert shown.look("/").texts("h1") == ["Everything is ready"]
     assert shown.look("/", q="vehicle00").texts("h1") == ["Everything that matches is ready"]
-    monkeypatch.setattr(follower, "_newest", replace(watched, watched=frozenset({"other"})))
+    situation = replace(situation, watched=frozenset({"other"}))
     page = shown.look("/")
     assert page.texts("h1") == ["Nothing in the state repo keeps an application from being ready"]
     assert "Whether pods run on c-its is unknown" in page.text

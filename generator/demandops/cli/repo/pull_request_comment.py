@@ -88,7 +88,7 @@ def _head(checked: CheckResult) -> Iterator[str]:
         yield "## DemandOps: valid, and every release renders\n"
     yield from (f"\n{line}\n" for line in chart_lines(checked.charts, code))
     if checked.base:
-        invalid = ", and for its invalid files with their last valid versions"
+        invalid = "; instead of its invalid files, their last valid versions were compared"
         yield f"\nCompared with {code(checked.base[:10])}{'' if checked.base_valid else invalid}.\n"
 
 
