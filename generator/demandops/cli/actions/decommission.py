@@ -69,11 +69,11 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     """Release all claims of a node or a requester.
 
     For a node, the command releases the applications on the node, the inputs that come from the
-    node, and the connections from and to the node, for every requester. Then you can delete the
-    node from the inventory. For a requester, the command releases all claims of this requester,
-    even claims that also name other requesters. It also ends the waiting demands that name only
-    this requester. If NAME is both a node and a requester, the
-    command does both. At a terminal, the command first shows the consequences and asks.
+    node, the deliveries to the node, and the connections from and to the node, for every requester.
+    Then you can delete the node from the inventory. For a requester, the command releases all
+    claims of this requester, even claims that also name other requesters. It also ends the waiting
+    demands that name only this requester. If NAME is both a node and a requester, the command does
+    both. At a terminal, the command first shows the consequences and asks.
 
     \b
     Examples:

@@ -109,7 +109,7 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
         )
         yield fault("", message, code="newer").within(path_of(claim.key))
     more = len(changes) - _SHOWN
-    others = f"{more} more claims would change; " if more > 0 else ""
+    others = f"{more} more {'claims' if more > 1 else 'claim'} would change; " if more > 0 else ""
     message = f"{others}claims that were booked or changed since are undone only with --drop-newer"
     yield fault("", message, code="newer")
 
