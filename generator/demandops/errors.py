@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 
-from demandops.quoting import clipped, one_line
+from demandops.quoting import clipped, escaped, one_line
 
 MOST_FAULTS = 100
 """How many faults of one file, or of a request, are listed; further ones are only counted."""
@@ -113,6 +113,14 @@ def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
             yield Fault(_MORE, "", f"has {count - MOST_FAULTS} more faults", file)
 
 
+class OverLimit(InvalidInput):
+    """Raised when what a person wrote takes too long, or too much memory, to evaluate.
+
+    The faults name the file. Whether this happens may depend on the machine, so such an error
+    refuses a demand or fails a check, but never says whether a file is valid.
+    """
+
+
 class Refused(InvalidInput):
     """Raised when a demand cannot be fulfilled; no part of it was booked."""
 
@@ -163,6 +171,17 @@ class QueueFull(DemandOpsError):
 def fault(field: str, message: str, *, code: str = "invalid", line: int | None = None) -> Fault:
     """Return a fault without a file; :meth:`Fault.within` adds the file later."""
     return Fault(code=code, field=field, message=message, line=line)
+
+
+def field_path(location: tuple[int | str, ...]) -> str:
+    """Return ``nodes[3].cluster`` for ``("nodes", 3, "cluster")``."""
+    path = ""
+    for part in location:
+        if isinstance(part, int):
+            path += f"[{part}]"
+        elif part != "[key]":
+            path += f".{part}" if path else part
+    return escaped(path)
 
 
 def internal(error: Exception) -> StateRepoError:

@@ -279,14 +279,14 @@ class TestAutoscaler:
         told = "is 0, but an autoscaler keeps at least one replica; to run none, use 'deny' instead"
         assert str(invalid.value) == f"overrides/o1.yaml: replicas: {told}"
         with pytest.raises(InvalidInput) as invalid:
-            render_trial_demands(repo.state, repo.state.engine)
+            render_trial_demands(repo.state, repo.state.evaluate)
         assert str(invalid.value) == f"overrides/o1.yaml: replicas: {told}"
 
     def test_a_template_that_knows_only_replicas_is_a_fault(self) -> None:
         text = ADDITIONS["appdefs/driver/values/driver.yaml.j2"]
         repo = books(AUTOSCALED, **{TEMPLATE: text})
         with pytest.raises(InvalidInput) as invalid:
-            render_trial_demands(repo.state, repo.state.engine)
+            render_trial_demands(repo.state, repo.state.evaluate)
         assert str(invalid.value) == f"{TEMPLATE}:1: 'replicas' is undefined; fix the template"
 
 

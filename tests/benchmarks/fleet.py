@@ -24,7 +24,7 @@ from demandops.staterepo.history import commit_message
 from rich.table import Table
 
 from tests.kit import goals
-from tests.kit.config import configuration
+from tests.kit.config import configuration, state_of
 from tests.kit.repo import write_tree
 
 VEHICLES_PER_EDGE = 10
@@ -145,14 +145,14 @@ def _lay_down(
     files["inventory/brokers.yaml"] = _file("Brokers", brokers=[broker])
     configure(files)
     config = load(files)
-    state, now = State.of(config, Ledger()), datetime.now(timezone.utc)
+    state, now = state_of(config), datetime.now(timezone.utc)
     ledger = Ledger()
     for number in range(edges):
         for place in range(vehicles):
             request = admit(state, goal(edge_id(number), vehicle_id(number, place)))
             ledger, _ = apply(ledger, request, now)
     files |= {claim_file.path_of(claim.key): claim_file.text_of(claim) for claim in ledger}
-    files |= rendered_files(State(config, ledger, state.engine))
+    files |= rendered_files(State(config, ledger, state.evaluate))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync for now
     tree = write_tree(repo, None, files)

@@ -25,7 +25,7 @@ from demandops.config import override, policy
 from demandops.config.base_model import parse_file
 from demandops.config.config import Config
 from demandops.config.load import load
-from demandops.decision import State, try_configuration
+from demandops.decision import try_configuration
 from demandops.detection.detector import Detector, Want
 from demandops.detection.events.detection_state import Observation
 from demandops.detection.message_reader import MessageReader, Unreadable
@@ -40,7 +40,6 @@ from demandops.ledger import (
     recent_shutdowns,
     waiting,
 )
-from demandops.ledger.ledger import Ledger
 from demandops.migration import imported_goals, reference_files, reference_map
 from demandops.service.push_webhook import PushWebhook
 from demandops.service.ticket import ticket_from_journal
@@ -54,7 +53,7 @@ from hypothesis import strategies as st
 from tests.fuzz import Target
 from tests.kit import detection, golden, rich
 from tests.kit.cluster import Letters, condition, deployment
-from tests.kit.config import configuration
+from tests.kit.config import configuration, state_of
 from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW
 from tests.kit.reference import Reference
@@ -213,7 +212,7 @@ def chart_values(file: tuple[str, Any]) -> None:
 
 def _try(changed: dict[str, str]) -> None:
     try:
-        try_configuration(State.of(load(_CONFIG | changed), Ledger()))
+        try_configuration(state_of(load(_CONFIG | changed)))
     except InvalidInput as error:
         _told(error)
 

@@ -22,13 +22,12 @@ from demandops.cli.actions.person_change import EditOptions
 from demandops.config.base_model import parse_file
 from demandops.config.load import load
 from demandops.config.override import Override, OverrideFile
-from demandops.decision import State, try_configuration
+from demandops.decision import try_configuration
 from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_goal import _value_problem
 from demandops.errors import InvalidInput
 from demandops.identifiers import topic_problem
 from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
 from demandops.service.approvals import proposal
 from demandops.staterepo.history import commit_log, commit_message
 from demandops.staterepo.write.proposal_branch import branch_name
@@ -37,6 +36,7 @@ from hypothesis import strategies as st
 
 from tests.fuzz import Target
 from tests.kit import rich
+from tests.kit.config import state_of
 from tests.kit.memory import NOW, MemoryRepo
 from tests.kit.plain_yaml import FAST
 from tests.unit.ledger.test_claim_file import TRICKY, claims, joined_claims, values
@@ -133,7 +133,7 @@ def _strings(data: Any) -> list[tuple[Any, Any]]:
 
 def rendered_file(given: tuple[dict[str, str], Any]) -> None:
     files, goal = given
-    state = State.of(load(files), Ledger())
+    state = state_of(load(files))
     try_configuration(state)
     books = MemoryRepo(state=state)
     for asked in (goal, {**_only(goal, "connections"), "demand": "b"}):

@@ -21,13 +21,12 @@ from demandops.detection.detector import Detector
 from demandops.detection.events.detection_state import Observation
 from demandops.detection.rules import rule_file
 from demandops.errors import Refused
-from demandops.ledger.ledger import Ledger
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 from demandops.render.output_check import check_files
 from demandops.staterepo import skeleton
 from demandops.staterepo.history import commit_message
 
-from tests.kit.config import brokers, configuration, edited
+from tests.kit.config import brokers, configuration, edited, state_of
 from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
@@ -49,7 +48,7 @@ def block(name: str, start: str) -> str:
 
 
 def state(**files: str) -> State:
-    return State.of(load(configuration(files)), Ledger())
+    return state_of(load(configuration(files)))
 
 
 def demand() -> dict[str, Any]:

@@ -7,7 +7,10 @@ from functools import lru_cache
 from typing import Any
 
 import yaml
-from demandops.config.config import CONFIG_ROOTS
+from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.decision import State
+from demandops.ledger.ledger import Ledger
+from demandops.render.evaluation import evaluate
 from demandops.staterepo.skeleton import files
 
 
@@ -23,6 +26,11 @@ def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, 
     }
     files |= changed or {}
     return {path: text for path, text in files.items() if text is not None}
+
+
+def state_of(config: Config, ledger: Ledger | None = None) -> State:
+    """Return a state whose values are computed in this process."""
+    return State(config, ledger or Ledger(), evaluate)
 
 
 def edited(path: str, old: str, new: str) -> dict[str, str]:

@@ -9,10 +9,9 @@ from typing import Any
 import yaml
 from demandops.config.load import load
 from demandops.decision import State
-from demandops.ledger.ledger import Ledger
 
 from tests.kit import plain_yaml
-from tests.kit.config import configuration, skeleton
+from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.memory import MemoryRepo
 
 REACHABLE = {"zenoh": {"endpoint": "tcp/edge:7447"}}
@@ -44,7 +43,7 @@ def state(
     }
     if not brokers:
         changed["inventory/brokers.yaml"] = NO_BROKERS
-    return State.of(load(configuration(changed)), Ledger())
+    return state_of(load(configuration(changed)))
 
 
 def demand(kind: str = "auto", topics: Any = None, **more: Any) -> dict[str, Any]:

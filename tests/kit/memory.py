@@ -20,7 +20,7 @@ from demandops.ledger.ledger import Ledger
 from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.plan.views.bookkeeping import as_data, bookkeeping
 
-from tests.kit.config import configuration, skeleton
+from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.goals import Goal
 from tests.kit.plain_yaml import FAST
 from tests.model.books import in_model_words, object_lists
@@ -30,7 +30,7 @@ NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 
 @lru_cache(maxsize=1)
 def _unchanged() -> State:
-    return State.of(load(configuration()), Ledger())
+    return state_of(load(configuration()))
 
 
 class MemoryRepo:
@@ -51,7 +51,7 @@ class MemoryRepo:
             self.state, self._initial = _unchanged(), dict(skeleton())
         else:
             files = configuration(changed)
-            self.state = State.of(load(files), Ledger())
+            self.state = state_of(load(files))
             self._initial = files | rendered_files(self.state)
         self.files = dict(self._initial)
 

@@ -31,7 +31,7 @@ from pydantic import Field, model_validator
 from tests.kit import plain_yaml
 from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
-from tests.kit.config import skeleton
+from tests.kit.config import skeleton, state_of
 from tests.kit.memory import NOW as START
 from tests.kit.memory import MemoryRepo, is_of_ledger, ledger_in
 
@@ -281,11 +281,11 @@ def _purpose(entry: Mapping[str, Any]) -> str:
 def run(scenario: Scenario) -> None:
     """Run all steps; raise an AssertionError if a step has other effects than it expects."""
     files = configuration(scenario.appdefs, scenario.config)
-    world = World(State.of(load(files), Ledger()), files)
+    world = World(state_of(load(files)), files)
     for number, step in enumerate(scenario.steps, 1):
         if step.config:
             files = configuration(scenario.appdefs, _laid_over(scenario.config, step.config))
-            world.configure(State.of(load(files), Ledger()), files)
+            world.configure(state_of(load(files)), files)
         place = f"step {number}{f' ({step.why})' if step.why else ''}"
         _take(step, world, place)
         try:

@@ -94,6 +94,19 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
     return result
 
 
+def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
+    """Return ``target`` with a JSON merge patch (RFC 7386) applied; null removes a key."""
+    if not isinstance(patch, Mapping):
+        return patch
+    result = dict(target) if isinstance(target, Mapping) else {}
+    for key, value in patch.items():
+        if value is None:
+            result.pop(key, None)
+        else:
+            result[key] = merge_patch(result.get(key), value)
+    return result
+
+
 def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
     """Yield a fault for each library that is not in the folder which ``file://…`` names for it.
 

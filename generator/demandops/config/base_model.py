@@ -21,9 +21,9 @@ from pydantic import (
 from pydantic.alias_generators import to_camel
 
 from demandops import strict_yaml
-from demandops.errors import Fault, InvalidInput, fault, suggestion
+from demandops.errors import Fault, InvalidInput, fault, field_path, suggestion
 from demandops.identifiers import PATTERN_WORDS, control_character
-from demandops.quoting import escaped, quoted
+from demandops.quoting import quoted
 
 Model = TypeVar("Model", bound=BaseModel)
 Item = TypeVar("Item")
@@ -102,17 +102,6 @@ class FileModel(CamelModel):
     """A configuration file; ``apiVersion`` names its format."""
 
     apiVersion: Literal["demandops/v1"]
-
-
-def field_path(location: tuple[int | str, ...]) -> str:
-    """Return ``nodes[3].cluster`` for ``("nodes", 3, "cluster")``."""
-    path = ""
-    for part in location:
-        if isinstance(part, int):
-            path += f"[{part}]"
-        elif part != "[key]":
-            path += f".{part}" if path else part
-    return escaped(path)
 
 
 def faults_of(

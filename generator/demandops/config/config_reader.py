@@ -9,9 +9,9 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from demandops import strict_yaml
-from demandops.config.base_model import DnsLabel, faults_of, field_path, parse, parse_file
+from demandops.config.base_model import DnsLabel, faults_of, parse, parse_file
 from demandops.config.config import collection_of, place_of_collection
-from demandops.errors import Fault, InvalidInput, fault, suggestion
+from demandops.errors import Fault, InvalidInput, fault, field_path, suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
 Valid = TypeVar("Valid")

@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import AfterValidator, Field, StringConstraints, ValidationError, model_validator
 
+from demandops.charts.chart_files import merge_patch
 from demandops.config.base_model import (
     DnsLabel,
     FileModel,
@@ -307,19 +308,6 @@ def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
         yield (
             f"'hold' freezes the release, so {names} cannot apply; remove 'hold', or remove {names}"
         )
-
-
-def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
-    """Return ``target`` with a JSON merge patch (RFC 7386) applied; null removes a key."""
-    if not isinstance(patch, Mapping):
-        return patch
-    result = dict(target) if isinstance(target, Mapping) else {}
-    for key, value in patch.items():
-        if value is None:
-            result.pop(key, None)
-        else:
-            result[key] = merge_patch(result.get(key), value)
-    return result
 
 
 Settings = TypeVar("Settings", bound=ClientSettings)

@@ -35,7 +35,7 @@ def changeset_of_edit(
     """
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
-    return changeset.build_changeset(old, state, Changes(), keys, state.engine, read)
+    return changeset.build_changeset(old, state, Changes(), keys, state.evaluate, read)
 
 
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:

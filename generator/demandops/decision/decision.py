@@ -210,7 +210,7 @@ def _decided(
     after, changes, keys = _booked(state, request, now)
     ledger = after.ledger
     rendered = changeset.build_changeset(
-        state, after, changes, keys, state.engine, read, state.plans
+        state, after, changes, keys, state.evaluate, read, state.plans
     )
     differing = list(
         version_difference.differences(request, state, after, changes.claims, rendered.plans)
@@ -311,6 +311,8 @@ def scale_down(
     """
     after = replace(state, ledger=scale_downs.without_ended(state, instance, now))
     changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
-    change = changeset.build_changeset(state, after, changes, keys, state.engine, read, state.plans)
+    change = changeset.build_changeset(
+        state, after, changes, keys, state.evaluate, read, state.plans
+    )
     usage = state.usage().plus(_growth(state.config, change))
     return state.followed_by(after.ledger, change, usage), change

@@ -1,4 +1,4 @@
-"""What a decision about a demand starts from: the world at one commit, with a template engine."""
+"""What a decision about a demand starts from: the world at one commit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from types import MappingProxyType
 
 from rpds import HashTrieMap
 
-from demandops.config.config import Config
 from demandops.errors import Refused
 from demandops.ledger.claim_changes import ClaimChange
 from demandops.ledger.ledger import Ledger
@@ -20,27 +19,22 @@ from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
-from demandops.render.engine import Engine
+from demandops.render.evaluation import Evaluate
 
 
 @dataclass(frozen=True, slots=True)
 class State(World):
-    """The world at one commit, with the engine that renders its configuration's templates.
+    """The world at one commit, and what computes the values of services in it.
 
     ``plans`` are releases that earlier decisions on this configuration planned. A copy made with
     ``replace`` has no plans; only :meth:`followed_by` carries over those that are still valid.
     """
 
-    engine: Engine
+    evaluate: Evaluate
     plans: HashTrieMap[ReleaseKey, Release] = field(
         default_factory=HashTrieMap, init=False, compare=False, repr=False
     )
     _usage: Usage | None = field(default=None, init=False, compare=False, repr=False)
-
-    @classmethod
-    def of(cls, config: Config, ledger: Ledger) -> State:
-        """Return a state with a fresh engine for ``config``."""
-        return cls(config, ledger, Engine(config.files))
 
     def usage(self) -> Usage:
         """Return, for each node and resource, how much the services request.
@@ -87,7 +81,7 @@ def rendered_files(
         state: the world to render.
         current: the current generated files. An override with ``hold`` keeps some of these files.
     """
-    return changeset.render_all(state, state.engine, all_keys(state), current)
+    return changeset.render_all(state, state.evaluate, all_keys(state), current)
 
 
 def try_configuration(state: State) -> None:
@@ -97,4 +91,4 @@ def try_configuration(state: State) -> None:
         Refused, InvalidInput: if a template, its values or an override does not work. Each fault
             names what does not work.
     """
-    trial_render.render_trial_demands(state, state.engine)
+    trial_render.render_trial_demands(state, state.evaluate)

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from demandops import strict_yaml
-from demandops.config.base_model import faults_of, field_path
-from demandops.errors import Fault, fault
+from demandops.config.base_model import faults_of
+from demandops.errors import Fault, fault, field_path
 
 _DEEPEST = 100
 """How deeply a goal may be nested: as deeply as a YAML file of the state repo."""

@@ -16,15 +16,14 @@ from typing import Any
 
 import jsonschema_rs
 
-from demandops.config.base_model import field_path
 from demandops.config.config import IMAGES_FILE, Config
 from demandops.connections.connection_type import UNSUPPORTED, Client
-from demandops.errors import InvalidInput, Refused, fault
-from demandops.render.engine import Engine
+from demandops.errors import InvalidInput, Refused, fault, field_path
+from demandops.render import engine
 from demandops.settings import data_folder
 
 
-def render(client: Client, config: Config, engine: Engine) -> str:
+def render(client: Client, config: Config) -> str:
     """Return the manifests of a client as one YAML text.
 
     Raises:

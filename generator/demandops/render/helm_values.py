@@ -8,19 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from demandops.config.config import Config
 from demandops.config.inventory import Node
-from demandops.config.override import merge_patch
 from demandops.errors import Fault, InvalidInput
 from demandops.plan.release import ServiceRelease
-from demandops.render.engine import Engine
-from demandops.render.output_check import check_values
+from demandops.render.evaluation import Evaluate, ValuesTask
 
 
-def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[str, Any]:
+def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> dict[str, Any]:
     """Return the Helm values of a service, with the patches of overrides merged in.
 
     Raises:
@@ -35,27 +32,23 @@ def values_of(release: ServiceRelease, config: Config, engine: Engine) -> dict[s
             "is 0, but an autoscaler keeps at least one replica; to run none, use 'deny' instead"
         )
         raise InvalidInput.at("replicas", message, file=by[-1])
+    task = ValuesTask(
+        template, _context(release, config), release.chart.folder, tuple(release.shaping.patches)
+    )
     try:
-        check = partial(check_values, chart=release.chart, config=config, template=template)
-        values = engine.data(template, check, **_context(release, config))
+        return evaluate(config.files, task)
     except InvalidInput as error:
-        raise InvalidInput(_name_overrides(error, release)) from None
-    for file, patch in release.shaping.patches:
-        values = merge_patch(values, patch)
-        check_values(values, release.chart, config, file)
-    return values
+        raise type(error)(_name_overrides(error, release, template)) from None
 
 
-def _name_overrides(error: InvalidInput, release: ServiceRelease) -> Iterable[Fault]:
-    """Yield the faults of ``error``.
-
-    If overrides change the template's variables, each message also names these overrides.
-    """
+def _name_overrides(error: InvalidInput, release: ServiceRelease, template: str) -> Iterable[Fault]:
+    """Yield the faults of ``error``; those of the template also name overrides of its variables."""
     changing = {"version", "images", "replicas", "node"}
     files = [override.path for override, effects in release.shaping.by if changing & {*effects}]
     note = f" (overrides change what the template gets, so check {' and '.join(files)} too)"
     for fault in error.faults:
-        yield replace(fault, message=fault.message + note) if files else fault
+        is_shaped = files and fault.file == template
+        yield replace(fault, message=fault.message + note) if is_shaped else fault
 
 
 def _context(release: ServiceRelease, config: Config) -> dict[str, object]:

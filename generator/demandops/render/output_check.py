@@ -1,8 +1,8 @@
 """The last check of rendered files before a commit.
 
-Helm values must match the chart's ``values.schema.json``. Objects of Kubernetes' built-in kinds
-must match the schemas of Kubernetes. Every path must be in a folder that the generator owns. No two
-objects of a cluster may have the same kind, namespace and name.
+Objects of Kubernetes' built-in kinds must match the schemas of Kubernetes. Every path must be in a
+folder that the generator owns. No two objects of a cluster may have the same kind, namespace and
+name.
 """
 
 from __future__ import annotations
@@ -18,13 +18,7 @@ from typing import Any
 import jsonschema_rs
 
 from demandops import strict_yaml
-from demandops.charts import chart_files
-from demandops.config.base_model import field_path
-from demandops.config.config import Config
-from demandops.config.override import OVERRIDES_ROOT
-from demandops.config.registry import ChartSource
-from demandops.errors import Fault, InvalidInput, fault
-from demandops.render import values_validator
+from demandops.errors import Fault, InvalidInput, fault, field_path
 
 KUBERNETES_VERSION = "1.36.0"
 """The version of Kubernetes whose schemas are used to check objects of built-in kinds."""
@@ -41,43 +35,6 @@ _BUILT_IN = frozenset(
     }
 )
 _API = re.compile(r"^apiVersion: (\S+)$", re.MULTILINE)
-
-
-def check_values(
-    values: Mapping[str, Any], chart: ChartSource, config: Config, template: str
-) -> None:
-    """Check Helm values against the chart's schema, if the state repo has this schema.
-
-    Like Helm, the function first merges the values into the chart's defaults, because a schema may
-    require a value that has a default.
-
-    Args:
-        values: the values to check.
-        chart: the chart's source and version.
-        config: the configuration, which holds the chart's files.
-        template: the path of the file that the values come from: a template or an override.
-
-    Raises:
-        InvalidInput: if values do not match the schema; the error names ``template`` and each of
-            these values. Also if the schema or the chart's ``values.yaml`` is not valid; the error
-            names that file.
-    """
-    schema = config.files.get(f"{chart.folder}/values.schema.json") if chart.folder else None
-    if schema is None:
-        return
-    file = f"{chart.folder}/values.schema.json"
-    validator = values_validator.validator(schema, file)
-    defaults = chart_files.defaults(str(chart.folder), config.files)
-    origin = "the override" if template.startswith(f"{OVERRIDES_ROOT}/") else "the template"
-    faults = [
-        fault(
-            f"values.{path}" if path else "values",
-            f"{message}; fix {origin} or {chart.folder}",
-        ).within(template)
-        for path, message in _problems(validator, chart_files.merged(defaults, values))
-    ]
-    if faults:
-        raise InvalidInput(faults)
 
 
 def check_files(files: Mapping[str, str | None]) -> None:
@@ -106,8 +63,8 @@ def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, 
     """Yield a file's valid documents, and append the faults of its other documents to ``faults``.
 
     Documents for Flux and Argo CD are yielded without their ``spec``. The ``spec`` needs no check
-    here, because a template of the program writes it, and :func:`check_values` checks the Helm
-    values in it.
+    here, because a template of the program writes it, and Helm values were checked when they
+    were computed.
     """
     for part in text.split("\n---\n"):
         api = _API.search(part)

@@ -13,7 +13,7 @@ from demandops.config.config import Config
 from demandops.config.override import Override, format_time
 from demandops.ledger.world import World
 from demandops.plan.release import Release
-from demandops.render.engine import Engine
+from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 
@@ -27,13 +27,13 @@ _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
-def release_text(release: Release, config: Config, engine: Engine, current: str | None) -> str:
+def release_text(release: Release, config: Config, evaluate: Evaluate, current: str | None) -> str:
     """Return the text of a release's file. A held release keeps the body of ``current``.
 
     Args:
         release: the release.
         config: the configuration with which the release was planned.
-        engine: the engine of that configuration.
+        evaluate: computes the values of services.
         current: the file's text in the state repo; ``None`` if there is no file.
 
     Raises:
@@ -42,13 +42,13 @@ def release_text(release: Release, config: Config, engine: Engine, current: str 
     shaping = release.shaping
     if not shaping.held:
         comments = [override_comment(override, effects) for override, effects in shaping.by]
-        return _join(comments, manifests.render(release, config, engine))
+        return _join(comments, manifests.render(release, config, evaluate))
     outside, of_body = list[str](), list[str]()
     for override, effects in shaping.by:
         comments = outside if _OUTSIDE_BODY & {*effects} else of_body
         comments.append(override_comment(override, effects))
     if current is None:
-        return _join([*outside, *of_body], manifests.render(release, config, engine))
+        return _join([*outside, *of_body], manifests.render(release, config, evaluate))
     comments, body = split_comments(current)
     frozen = [comment for comment in comments if not _UPDATED_COMMENT.match(comment)]
     return _join([*outside, *frozen], body)

@@ -11,7 +11,7 @@ from demandops.config.config import Config
 from demandops.config.override import Override
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.demand_request import Demanded, Join
-from demandops.errors import Fault, InvalidInput
+from demandops.errors import InvalidInput, OverLimit
 from demandops.ledger.apply import apply
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
@@ -19,7 +19,7 @@ from demandops.plan.overrides.release_overrides import apply_effects, effects_on
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import affected_keys
-from demandops.render.engine import Engine
+from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import manifests
 
 _NEVER = datetime.fromtimestamp(0, timezone.utc)
@@ -100,7 +100,7 @@ def overridden_releases(
                 yield shaped
 
 
-def render_trial_demands(world: World, engine: Engine) -> None:
+def render_trial_demands(world: World, evaluate: Evaluate) -> None:
     """Render every service of every appdef, with invented claims on a real node.
 
     So each appdef is checked before its first demand. A service is rendered for each version that
@@ -112,33 +112,41 @@ def render_trial_demands(world: World, engine: Engine) -> None:
     Raises:
         Refused, InvalidInput: if a service cannot be planned or rendered. The error names the
             template, the schema or the override at fault.
+        OverLimit: if nothing is known to be wrong, but some of it took too long to render.
     """
     config = world.config
     invented = trial_releases(config)
-    faults = [
-        fault
+    errors = [
+        error
         for releases in (*invented.values(), _other_versions(config, invented))
-        for fault in _render_faults(releases, config, engine)
+        for error in _render_errors(releases, config, evaluate)
     ]
-    for override in () if faults else world.overrides:
+    for override in () if errors else world.overrides:
         overridden = [
             list(overridden_releases(override, releases, appdef, config))
             for appdef, releases in invented.items()
         ]
-        failed = [_render_faults(releases, config, engine) for releases in overridden if releases]
+        failed = [_render_errors(releases, config, evaluate) for releases in overridden if releases]
         if failed and all(failed):
-            faults += failed[0]
-    if faults:
-        raise InvalidInput(dict.fromkeys(faults))
+            errors += failed[0]
+    if errors:
+        only_late = all(isinstance(error, OverLimit) for error in errors)
+        faults = dict.fromkeys(fault for error in errors for fault in error.faults)
+        raise (OverLimit if only_late else InvalidInput)(faults)
 
 
-def _render_faults(
-    releases: Iterable[ServiceRelease], config: Config, engine: Engine
-) -> list[Fault]:
-    faults: list[Fault] = []
+def _render_errors(
+    releases: Iterable[ServiceRelease], config: Config, evaluate: Evaluate
+) -> list[InvalidInput]:
+    errors: list[InvalidInput] = []
+    late = set[str]()
     for release in releases:
+        if config.values_template(release.service) in late:
+            continue
         try:
-            manifests.render(release, config, engine)
+            manifests.render(release, config, evaluate)
         except InvalidInput as error:
-            faults += error.faults
-    return faults
+            errors.append(error)
+            if isinstance(error, OverLimit):
+                late.add(config.values_template(release.service))
+    return errors

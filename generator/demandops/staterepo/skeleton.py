@@ -11,6 +11,7 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE, as_git_url
 from demandops.decision import State, rendered_files
+from demandops.evaluator import EVALUATE
 from demandops.ledger.ledger import Ledger
 from demandops.settings import RENDER_VERSION, data_folder
 
@@ -47,7 +48,7 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
         root = re.sub(r"(?m)^flux:\n  url: (.*)$", r"flux:\n  interval: 1m\n  # url: \1", root)
     contents[ROOT_FILE] = root
     config = load({p: text for p, text in contents.items() if p.split("/")[0] in CONFIG_ROOTS})
-    return contents | rendered_files(State.of(config, Ledger()))
+    return contents | rendered_files(State(config, Ledger(), EVALUATE))
 
 
 def files_of_library(folder: str) -> dict[str, str]:

@@ -19,6 +19,7 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, faults_of_edit
 from demandops.demand.claim import ClaimKey
 from demandops.errors import InvalidInput, StateRepoError, fault
+from demandops.evaluator import EVALUATE
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.claim_file import LEDGER_ROOT
 from demandops.ledger.ledger import Ledger
@@ -164,7 +165,7 @@ def _plan(
     before = files[ROOT_FILE]
     files[ROOT_FILE] = _root(before, old, request)
     config = load(files)
-    state = State.of(config, snapshot.state.ledger)
+    state = State(config, snapshot.state.ledger, EVALUATE)
     # people's changes since the generator's last commit are applied too
     start = state_in_effect.start_at(objects, tip)
     known = start.state

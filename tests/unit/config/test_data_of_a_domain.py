@@ -9,11 +9,10 @@ from typing import Any
 import pytest
 import yaml
 from demandops.config.load import load
-from demandops.decision import State
 from demandops.errors import InvalidInput
 from demandops.plan.views import policy_warnings
 
-from tests.kit.config import configuration, skeleton
+from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.memory import MemoryRepo
 
 DOMAINS, NODES, BROKERS = (
@@ -122,7 +121,7 @@ def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     books.send(CONNECTION)
     assert list(policy_warnings.warnings(books.state)) == []
     config = load(configuration(domains("ros: {domainId: 1}")))
-    told = policy_warnings.warnings(State.of(config, books.state.ledger))
+    told = policy_warnings.warnings(state_of(config, books.state.ledger))
     assert list(map(str, told)) == [
         f"{DOMAINS}: no rule of access domain 'fleet' has 'city' among its 'peers', so nobody "
         "can demand a connection between the two domains; claims on such connections stay in "

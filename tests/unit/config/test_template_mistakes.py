@@ -6,11 +6,10 @@ import json
 
 import pytest
 from demandops.config.load import load
-from demandops.decision import State, try_configuration
+from demandops.decision import try_configuration
 from demandops.errors import InvalidInput
-from demandops.ledger.ledger import Ledger
 
-from tests.kit.config import configuration, skeleton
+from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.goals import perception
 from tests.kit.http import serving
 from tests.kit.memory import MemoryRepo
@@ -77,34 +76,14 @@ APPENDED: dict[str, tuple[str, str]] = {
         "x: {{ ''.swapcase() }}\n",
         "a template may not call the method 'swapcase'",
     ),
-    "a width from a value": (
-        "x: {{ '%*d' % (1000000000, 1) }}\n",
-        "the format of '%' has '*' or a brace inside braces; write each width as a number",
-    ),
-    "a width from a named value": (
-        "x: {{ '{:>{w}}'.format(1, w=1000000000) }}\n",
-        "the format of 'format' has '*' or a brace inside braces; write each width as a number",
-    ),
 }
 """Lines of a template with a mistake, each with a word of Jinja's message."""
-TOO_LARGE = [
-    *("'a' * 1000000000", "[1] * 1000000000", "10 ** 1000", "'%1000000000d' % 1"),
-    *("'%1000000000d' | format(1)", "'{:>1000000000}'.format(1)"),
-    "'{x:>1000000000}'.format_map({'x': 1})",
-    *("'a'.ljust(1000000000)", "'a'.center(1000000000)", "'1'.zfill(1000000000)"),
-    *("'a' | center(1000000000)", "'a' | indent(1000000000, true)"),
-    *("[1] | batch(1000000000, 'x') | list", "[1] | slice(1000000000) | list"),
-]
-"""Expressions whose values would fill the memory, so they are refused before their evaluation."""
 
 
 @pytest.mark.parametrize(
     ("text", "word"),
-    [
-        *APPENDED.values(),
-        *(("x: {{ " + expression + " }}\n", " too large") for expression in TOO_LARGE),
-    ],
-    ids=[*APPENDED, *TOO_LARGE],
+    APPENDED.values(),
+    ids=APPENDED,
 )
 def test_a_mistake_is_told_with_template_and_line(text: str, word: str) -> None:
     (found,) = appended(text)
@@ -130,42 +109,6 @@ def test_a_mistake_is_told_with_template_and_line(text: str, word: str) -> None:
 def test_whatever_a_template_does_it_is_told_as_the_templates_fault(text: str) -> None:
     (found, *_) = appended(text)
     assert found.startswith(f"{TEMPLATE}:")
-
-
-GROWING = (
-    "{% set ns = namespace(x=START) %}{% for i in range(99) %}{% set ns.x = NEXT %}{% endfor %}"
-)
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "{% for a in range(99999) %}{% for b in range(99999) %}{% endfor %}{% endfor %}",
-        "{% set x = range(9999) | list %}{% for a in x if a in range(9999) | list %}{% endfor %}",
-        "{% for a in range(99999) %}" + "y" * 90 + "{{ a }}{% endfor %}",
-        "{% set z %}{% for a in range(99999) %}" + "y" * 900 + "{% endfor %}{% endset %}",
-        GROWING.replace("START", "'aaaa'").replace("NEXT", "ns.x ~ ns.x"),
-        GROWING.replace("START", "[1]").replace("NEXT", "[ns.x, ns.x]"),
-        GROWING.replace("START", "[1]").replace("NEXT", "ns.x + ns.x"),
-        GROWING.replace("START", "(1,)").replace("NEXT", "(ns.x, ns.x)") + "{{ {ns.x: 1} }}",
-        GROWING.replace("START", "{}").replace("NEXT", "dict(a=ns.x, b=ns.x)"),
-        GROWING.replace("START", "99999").replace("NEXT", "ns.x * ns.x"),
-        "x: {{ ('a' * 9999).replace('a', 'b' * 9999) }}",
-        "x: {{ range(9999) | join('b' * 9999) }}",
-        "x: {{ ('%9999d' * 999) % ((1,) * 999) }}",
-        "x: {{ ('a\n' * 999) | indent(9999) }}",
-        "x: {{ 1 | round(999999999, 'ceil') }}",
-        "{% if 0 %}" + "{% elif 0 %}" * 20_000 + "{% endif %}",
-        "a: &a [1, 1]\nb: [*a, *a]",
-        "a: " + "[" * 5000,
-        "a:\n" + "- " * 5000 + "b",
-    ],
-    ids=lambda text: repr(text[-50:]),
-)
-def test_what_would_run_for_ever_or_grow_is_the_templates_fault(text: str) -> None:
-    (found, *_) = faults(text)
-    assert found.startswith(f"{TEMPLATE}:")
-    assert any(word in found for word in ("steps", "large", "longer", "most", "allowed", "deeper"))
 
 
 @pytest.mark.parametrize(
@@ -257,25 +200,8 @@ class TestValues:
         assert release["spec"]["values"]["podAnnotations"] == {"a": text}
 
 
-def doubling(times: int) -> dict[str, object]:
-    """Return a schema of ``times`` nested definitions; each doubles the work of a validation."""
-    steps: dict[str, object] = {
-        f"d{i}": {"allOf": [{"$ref": f"#/$defs/d{i + 1}"}] * 2} for i in range(times)
-    }
-    return {"$ref": "#/$defs/d0", "$defs": {**steps, f"d{times}": {"type": "object"}}}
-
-
-def doubling_in_list(times: int) -> dict[str, object]:
-    """Return a schema like that of ``doubling``, with its definitions as the items of a list.
-
-    The references write the ``O`` of ``allOf`` as ``%4f``.
-    """
-    steps = [{"anyOf": [{"$ref": f"#/all%4ff/{i + 1}"}] * 2} for i in range(times)]
-    return {"allOf": [*steps, {"type": "object"}]}
-
-
 class TestSchema:
-    """Validation by a chart's schema reads no other file, and always ends."""
+    """Validation by a chart's schema reads no other file."""
 
     def faults(self, schema: object) -> list[str]:
         text = schema if isinstance(schema, str) else json.dumps(schema)
@@ -296,30 +222,7 @@ class TestSchema:
         ]
         assert server.calls == []
 
-    @pytest.mark.parametrize(
-        "schema",
-        [
-            doubling(60),
-            '{"not":' * 100_000 + "{}" + "}" * 100_000,
-            doubling_in_list(60),
-            {"allOf": [{"$ref": "#"}]},
-            {"additionalProperties": {"allOf": [{"$ref": "#"}] * 2}},
-            {"patternProperties": {"a": {"$ref": "#"}, "e": {"$ref": "#"}}},
-        ],
-        ids=[
-            "doubling",
-            "doubling in a list",
-            "deep",
-            "itself",
-            "doubling by depth",
-            "doubling by patterns",
-        ],
-    )
-    def test_a_schema_that_would_not_end_is_a_fault(self, schema: object) -> None:
-        (found,) = self.faults(schema)
-        assert found.startswith(f"{CHART}/values.schema.json: is nested too deeply or applies too")
-
-    @pytest.mark.parametrize("pattern", ["^(a+)+$", "^(a|a)*$", "^(?=(a+)+b)"])
+    @pytest.mark.parametrize("pattern", ["^(a+)+$", "^(a|a)*$", "^(a*)*b"])
     def test_a_pattern_ends_soon_on_any_text(self, pattern: str) -> None:
         schema = {"properties": {"podLabels": {"propertyNames": {"pattern": pattern}}}}
         path, labels = f"{CHART}/values.schema.json", f"podLabels: {{'{'a' * 900}!': x}}\n"
@@ -329,8 +232,28 @@ class TestSchema:
 
     def test_a_schema_may_refer_to_itself_for_parts(self) -> None:
         tree = {"properties": {"image": {"$ref": "#"}, "ros": {"$ref": "#top"}}, "$anchor": "top"}
-        for schema in (tree, doubling(3)):
-            MemoryRepo({f"{CHART}/values.schema.json": json.dumps(schema)}).send(perception())
+        MemoryRepo({f"{CHART}/values.schema.json": json.dumps(tree)}).send(perception())
+
+    @pytest.mark.parametrize(
+        "schema",
+        [
+            {"properties": {"image": {"$id": "https://example.invalid/other"}}},
+            {"$defs": {"a": {"$id": "#a"}}},
+            {
+                "$schema": "http://json-schema.org/draft-04/schema#",
+                "properties": {"image": {"id": "https://example.invalid/other"}},
+            },
+        ],
+        ids=["of a property", "of a definition", "as draft 4 writes it"],
+    )
+    def test_an_id_below_the_root_would_change_what_references_mean(self, schema: object) -> None:
+        (found,) = self.faults(schema)
+        assert "only the whole schema may have an id" in found
+
+    @pytest.mark.parametrize("pattern", ["^(?=(a+)+b)", r"(a)\1", "(?<!a)b"])
+    def test_a_pattern_that_must_track_back_is_a_fault(self, pattern: str) -> None:
+        (found,) = self.faults({"properties": {"image": {"pattern": pattern}}})
+        assert "look-around" in found
 
 
 class TestBeforeTheFirstDemand:
@@ -338,7 +261,7 @@ class TestBeforeTheFirstDemand:
 
     def rehearsal(self, changed: dict[str, str | None]) -> list[str]:
         with pytest.raises(InvalidInput) as invalid:
-            try_configuration(State.of(load(configuration(changed)), Ledger()))
+            try_configuration(state_of(load(configuration(changed))))
         return [str(found) for found in invalid.value.faults]
 
     def test_a_template_that_nobody_has_demanded_is_checked(self) -> None:
@@ -353,4 +276,4 @@ class TestBeforeTheFirstDemand:
         assert [found.split(":")[0] for found in self.rehearsal(dict(change))] == [TEMPLATE, other]
 
     def test_the_configuration_of_init_passes(self) -> None:
-        try_configuration(State.of(load(configuration()), Ledger()))
+        try_configuration(state_of(load(configuration())))

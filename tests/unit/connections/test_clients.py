@@ -22,7 +22,7 @@ from demandops.render.changes.changeset import ReleaseChange
 from demandops.render.connection_client import check_configuration
 from demandops.subject import Subject, SubjectKind
 
-from tests.kit.config import skeleton
+from tests.kit.config import skeleton, state_of
 from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state
 from tests.kit.memory import MemoryRepo
 
@@ -211,7 +211,7 @@ class TestMqtt:
         files = dict(skeleton())
         files["inventory/brokers.yaml"] += "    tls: {}\n"
         config = load({path: text for path, text in files.items() if "README" not in path})
-        world = World(State.of(config, before.ledger))
+        world = World(state_of(config, before.ledger))
         world.send(demand("mqtt"))
         for path, text in world.files.items():
             if "mqtt-" in path and path.startswith("clusters"):

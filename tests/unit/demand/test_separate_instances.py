@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import State, rendered_files
+from demandops.decision import rendered_files
 from demandops.errors import InvalidInput
 from demandops.plan.release import ServiceRelease
 from hypothesis import given
 
 from tests.appdefs.test_recorder import ADDITIONS
 from tests.kit.chance import chances, examples
-from tests.kit.config import edited
+from tests.kit.config import edited, state_of
 from tests.kit.memory import MemoryRepo, ledger_in
 from tests.unit.demand.test_versions_on_demand import (
     CHANNELS,
@@ -116,7 +116,7 @@ def test_a_channel_moved_off_the_default_version_changes_nothing_that_runs() -> 
     repo.send(put("a"))
     repo.send(put("b", "stable"))
     moved = config("separate", channels=CHANNELS | {"stable": "2.0.0"})
-    state = State.of(MemoryRepo(moved).config, repo.state.ledger)
+    state = state_of(MemoryRepo(moved).config, repo.state.ledger)
     assert rendered_files(state) == rendered_files(repo.state)
     again = MemoryRepo(moved)
     again.send(put("a"))

@@ -8,12 +8,12 @@ from typing import Any
 
 import pytest
 from demandops.config.registry import precedence
-from demandops.decision import State, rendered_files, try_configuration
+from demandops.decision import rendered_files, try_configuration
 from demandops.errors import InvalidInput, Refused
 from hypothesis import given
 
 from tests.kit.chance import chances, examples
-from tests.kit.config import edited, override, skeleton
+from tests.kit.config import edited, override, skeleton, state_of
 from tests.kit.memory import MemoryRepo, ledger_in, rebuilt
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
@@ -185,7 +185,7 @@ def test_a_denied_claim_asks_for_nothing() -> None:
     repo = MemoryRepo(config("update"))
     repo.send(put("a"))
     repo.send(put("b", "1.1.0"))
-    state = State.of(
+    state = state_of(
         MemoryRepo(config("update") | {"overrides/deny.yaml": denied}).config, repo.state.ledger
     )
     assert {*running(MemoryRepo(state=state)).values()} == {"1.0.0"}
@@ -195,7 +195,7 @@ def test_a_denied_claim_asks_for_nothing() -> None:
 def test_a_version_that_is_gone_from_the_registry_is_the_default() -> None:
     repo = MemoryRepo(config("update"))
     repo.send(put("a", "testing"))
-    state = State.of(MemoryRepo(config("update", channels={})).config, repo.state.ledger)
+    state = state_of(MemoryRepo(config("update", channels={})).config, repo.state.ledger)
     assert {*running(MemoryRepo(state=state)).values()} == {DEFAULT}
 
 
@@ -252,7 +252,7 @@ class Walk:
         claims = sorted(self.repo.state.ledger, key=lambda claim: str(claim.key))
         self.random.shuffle(claims)
         for ledger in (rebuilt(claims), ledger_in(self.repo.files)):
-            files = rendered_files(State.of(self.repo.config, ledger))
+            files = rendered_files(state_of(self.repo.config, ledger))
             assert files == self.repo.below("clusters", "bootstrap")
 
 

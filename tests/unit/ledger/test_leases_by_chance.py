@@ -11,7 +11,7 @@ from random import Random
 from typing import Any
 
 from demandops.config.load import load
-from demandops.decision import Decision, State
+from demandops.decision import Decision
 from demandops.ledger import claim_file
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.recent_shutdowns import RecentShutdowns
@@ -19,6 +19,7 @@ from hypothesis import given, note
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
+from tests.kit.config import state_of
 from tests.kit.memory import ledger_in
 from tests.kit.promises import Maker, claims_of, name_of
 from tests.model.leases import Promises
@@ -32,7 +33,7 @@ DOMAIN = {
     "leases": {"slack": f"{SLACK_S}s"},
 }
 FILES = running.configuration((), {"policy/access-domains.yaml": {"domains": [DOMAIN]}})
-EMPTY = State.of(load(FILES), Ledger())
+EMPTY = state_of(load(FILES))
 PAUSES = (1, 1, 2, 5, 10, 11, 29, 30, 31, 59, 60, 61, 90, 91, 121, 900, 3600)
 
 

@@ -116,7 +116,7 @@ def test_what_the_configuration_no_longer_has_is_refused() -> None:
     application = next(c for c in then if c.subject.kind.value == "applications")
     ledger = then.replace(application.key, None)
     config = _without_node(repo.state.config, application.application.node)
-    state = State(config, ledger, repo.state.engine)
+    state = State(config, ledger, repo.state.evaluate)
     with pytest.raises(Refused) as told:
         decide(state, back_to(then), LATER, repo.files.get)
     found = [one for one in told.value.faults if one.field == "node"]

@@ -15,11 +15,11 @@ from demandops.decision import Decision, State
 from demandops.demand.demand_request import Expire
 from demandops.errors import Refused
 from demandops.ledger.claim_changes import ClaimChange
-from demandops.ledger.ledger import Ledger
 from demandops.plan.nodes.capacity import whole_usage
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo
 from tests.scenarios.running import configuration
 
@@ -47,7 +47,7 @@ def recorders() -> State:
             "policy/access-domains.yaml": {"domains": [{"name": "all", "namespace": "all"}]},
         },
     )
-    return State.of(load(files), Ledger())
+    return state_of(load(files))
 
 
 def recorder(random: Random) -> dict[str, Any]:

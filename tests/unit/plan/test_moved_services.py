@@ -15,7 +15,7 @@ import yaml
 from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.config.override import Override, OverrideFile, Selector
-from demandops.decision import State, rendered_files
+from demandops.decision import rendered_files
 from demandops.errors import Refused
 from demandops.plan.nodes.relocation import following_overrides
 from demandops.plan.override_lifecycle import changed_claim_files
@@ -27,7 +27,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
-from tests.kit.config import configuration, override
+from tests.kit.config import configuration, override, state_of
 from tests.kit.goals import application, goal
 from tests.kit.memory import MemoryRepo, ledger_in
 from tests.unit.plan.test_flows import (
@@ -78,7 +78,7 @@ def configure(repo: MemoryRepo, config: Config) -> tuple[tuple[str, str], ...]:
 
     Return (file, reason) for each override that cannot move a service.
     """
-    state = State.of(config, repo.state.ledger)
+    state = state_of(config, repo.state.ledger)
     moved = following_overrides(state)
     for path, text in changed_claim_files(state.ledger, moved.ledger, moved.keys).items():
         repo.files.pop(path) if text is None else repo.files.update({path: text})

@@ -13,9 +13,8 @@ import pytest
 import yaml
 from demandops.config.config import Config
 from demandops.config.load import load
-from demandops.decision import State, rendered_files
+from demandops.decision import rendered_files
 from demandops.errors import Refused
-from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.drain import Drain
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceKey, ServiceRelease
@@ -25,7 +24,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
-from tests.kit.config import skeleton
+from tests.kit.config import skeleton, state_of
 from tests.kit.goals import application, goal
 from tests.kit.memory import NOW, MemoryRepo, ledger_in
 from tests.scenarios.running import configuration
@@ -73,7 +72,7 @@ def with_gpus(config: Config, random: Random, drained: str = "") -> Config:
 
 
 def configure(repo: MemoryRepo, config: Config) -> None:
-    repo.state = State.of(config, repo.state.ledger)
+    repo.state = state_of(config, repo.state.ledger)
 
 
 def services(repo: MemoryRepo) -> dict[str, Mapping[str, str]]:
@@ -190,7 +189,7 @@ def repo_with(domains: list[dict[str, Any]], **nodes: dict[str, Any]) -> MemoryR
     files = {"inventory/nodes.yaml": inventory, f"appdefs/{TYPE}/appdef.yaml": services}
     if domains:
         files["policy/access-domains.yaml"] = {"domains": domains}
-    return MemoryRepo(state=State.of(load(configuration(config=files)), Ledger()))
+    return MemoryRepo(state=state_of(load(configuration(config=files))))
 
 
 TYPE = "object-detection-fusion"
@@ -251,7 +250,7 @@ def test_a_deployment_request_has_its_services_placed_and_is_told_what_is_not_ca
 def test_a_service_at_its_sources_has_no_node_that_a_demand_names() -> None:
     services = {"services": {"object-detection": {"placement": "source"}}}
     config = load(configuration(config={f"appdefs/{TYPE}/appdef.yaml": services}))
-    repo, named = MemoryRepo(state=State.of(config, Ledger())), {"object-detection": "edge"}
+    repo, named = MemoryRepo(state=state_of(config)), {"object-detection": "edge"}
     refused = repo.take(DEMAND | {"applications": [APP | {"services": named}]})
     assert isinstance(refused, Refused)
     assert "services.object-detection: object-detection runs at its sources" in str(refused)

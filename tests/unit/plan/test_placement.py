@@ -14,7 +14,7 @@ from demandops.config.config import Config
 from demandops.config.inventory import Node, Position
 from demandops.config.load import load
 from demandops.config.policy import AccessDomain, Rule
-from demandops.decision import Decision, State
+from demandops.decision import Decision
 from demandops.demand.application import Application, InputTopic, Requirement
 from demandops.demand.demand_request import Demanded, Put, place_in
 from demandops.ledger.ledger import Ledger
@@ -26,7 +26,7 @@ from demandops.staterepo.history import commit_message
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.kit.config import skeleton
+from tests.kit.config import skeleton, state_of
 from tests.kit.memory import NOW, MemoryRepo
 from tests.scenarios.running import configuration
 
@@ -258,7 +258,7 @@ def with_limits(random: Random) -> MemoryRepo:
         "inventory/brokers.yaml": {"brokers": brokers or [{"node": SOURCES[0], "host": "any"}]},
         "policy/access-domains.yaml": {"domains": domains},
     }
-    return MemoryRepo(state=State.of(load(configuration(config=files)), Ledger()))
+    return MemoryRepo(state=state_of(load(configuration(config=files))))
 
 
 @settings(max_examples=8, deadline=None)

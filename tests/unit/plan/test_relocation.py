@@ -7,7 +7,7 @@ from random import Random
 from typing import Any
 
 from demandops.config.config import Config
-from demandops.decision import State, rendered_files
+from demandops.decision import rendered_files
 from demandops.demand.application import Requirement
 from demandops.ledger.operations.drain import Drain
 from demandops.plan.release import ServiceKey
@@ -16,6 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
+from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo, rebuilt
 from tests.unit.plan.test_flows import (
     NODES,
@@ -55,7 +56,7 @@ def with_nodes(config: Config, drained: str | None = None) -> Config:
 
 
 def configure(repo: MemoryRepo, config: Config) -> None:
-    repo.state = State.of(config, repo.state.ledger)
+    repo.state = state_of(config, repo.state.ledger)
 
 
 @examples(12)
@@ -112,6 +113,6 @@ def test_what_leaves_a_node_is_spread_over_the_others() -> None:
         for one in repo.state.ledger
     ]
     ledger = rebuilt(claims)
-    repo.state = State.of(with_nodes(config, "cloud"), ledger)
+    repo.state = state_of(with_nodes(config, "cloud"), ledger)
     moved = repo.decide(Drain("cloud")).state.ledger
     assert dict(moved.applications_on) == {"edge": 2, "vehicle01": 2}

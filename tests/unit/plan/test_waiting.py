@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import Decision, State
+from demandops.decision import Decision
 from demandops.demand.demand_request import Decommission
 from demandops.errors import Refused
 from demandops.ledger import waiting
@@ -19,6 +19,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
+from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo, ledger_in
 from tests.unit.plan.test_capacity import CAPACITY, recorders, used
 
@@ -33,7 +34,7 @@ def waiting_repo() -> MemoryRepo:
         domains={domain.name: domain},
         domain_of=dict.fromkeys(state.config.domain_of, domain),
     )
-    return MemoryRepo(state=State.of(config, state.ledger))
+    return MemoryRepo(state=state_of(config, state.ledger))
 
 
 def put(name: str, topics: int = 1, **more: Any) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from demandops.config.load import load
 from demandops.config.registry import Image
 from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput, StateRepoError
+from demandops.evaluator import EVALUATE
 from demandops.ledger.ledger import Ledger
 from demandops.scaffold import new_application, new_entry, new_image
 from demandops.scaffold.new_application import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
@@ -433,7 +434,7 @@ def _lay_down(
     if strange := [path for path in found if ".." in path.split("/") or "//" in path]:
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
     with busy("rendering an example of each application"):
-        try_configuration(State.of(load({**known, **found}), Ledger()))
+        try_configuration(State(load({**known, **found}), Ledger(), EVALUATE))
     _write(
         directory,
         found,

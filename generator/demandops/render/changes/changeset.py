@@ -6,21 +6,22 @@ A file whose text stays the same is not in the changeset, so an unchanged releas
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
 from demandops.config.repo_settings import ROOT_FILE
-from demandops.errors import Refused, fault
+from demandops.errors import OverLimit, Refused, fault
 from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
 from demandops.ledger.claim_changes import Changes
 from demandops.ledger.world import World
 from demandops.plan.planner import plan
-from demandops.plan.release import Release
+from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey
 from demandops.quoting import one_line
 from demandops.render import release_file
-from demandops.render.engine import Engine
+from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.render.output_check import check_files
@@ -77,7 +78,7 @@ def build_changeset(
     after: World,
     changes: Changes,
     keys: Iterable[ReleaseKey],
-    engine: Engine,
+    evaluate: Evaluate,
     read: FileReader,
     plans: Mapping[ReleaseKey, Release] = MappingProxyType({}),
 ) -> Changeset:
@@ -88,7 +89,7 @@ def build_changeset(
         changes: the differences between both ledgers.
         keys: the keys of the releases that may differ
             (:func:`demandops.plan.release_keys.affected_keys`).
-        engine: the engine of the configuration.
+        evaluate: computes the values of services.
         read: returns the text of a file of the state repo before the change.
         plans: releases of ``before`` that the caller has planned already.
 
@@ -126,7 +127,7 @@ def build_changeset(
             files[old_path] = None
         current = read(new_path) if new_path else None
         blocked += _blocked(old, new) if current is not None else ()
-        text = release_file.release_text(new, after.config, engine, current) if new else None
+        text = release_file.release_text(new, after.config, evaluate, current) if new else None
         if new_path and text != current:
             files[new_path] = text
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
@@ -156,13 +157,15 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
 
 
 def render_all(
-    world: World, engine: Engine, keys: Iterable[ReleaseKey], current: Mapping[str, str]
+    world: World, evaluate: Evaluate, keys: Iterable[ReleaseKey], current: Mapping[str, str]
 ) -> dict[str, str]:
     """Return all generated files except those of the ledger, by path.
 
+    A release whose values take too long to compute keeps its file as it is.
+
     Args:
         world: the configuration and the ledger.
-        engine: the engine of the configuration.
+        evaluate: computes the values of services.
         keys: the keys of all releases (:func:`demandops.plan.release_keys.all_keys`).
         current: the generated files in the state repo, which ``hold`` overrides may preserve.
 
@@ -170,12 +173,25 @@ def render_all(
         Refused, InvalidInput: if a release cannot be planned or rendered.
     """
     config = world.config
-    files = manifests.base_files(config, engine)
+    files = manifests.base_files(config)
+    late = set[str]()  # the templates that took too long for a release; no other waits for them
     for key in keys:
         release = plan(world, key)
-        if release is not None:
-            path = path_of(release)
-            files[path] = release_file.release_text(release, config, engine, current.get(path))
+        if release is None:
+            continue
+        path = path_of(release)
+        template = (
+            config.values_template(release.service) if isinstance(release, ServiceRelease) else ""
+        )
+        with suppress(OverLimit):
+            if template not in late:
+                late.add(template)
+                files[path] = release_file.release_text(
+                    release, config, evaluate, current.get(path)
+                )
+                late.remove(template)
+        if path not in files and path in current:
+            files[path] = current[path]
     return files | release_file.kept_charts(files, current, world)
 
 

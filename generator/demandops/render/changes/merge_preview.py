@@ -21,7 +21,7 @@ from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
 from demandops.render.changes.changeset import ReleaseChange, describe_change
-from demandops.render.engine import Engine
+from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.strict_yaml import load_all, short_repr
@@ -87,7 +87,7 @@ def planned_releases(world: World) -> dict[ReleaseKey, Release]:
     return releases
 
 
-def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) -> list[Fault]:
+def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()) -> list[Fault]:
     """Return the faults because of which releases cannot be planned or rendered.
 
     A fault's file is the first of these that exists: a file in ``edited`` with a claim that needs
@@ -102,7 +102,7 @@ def render_faults(world: World, engine: Engine, edited: Collection[str] = ()) ->
         try:
             release = plan(world, key)
             if release is not None:
-                manifests.render(release, world.config, engine)
+                manifests.render(release, world.config, evaluate)
         except InvalidInput as error:
             files = files or _claim_files(world)
             claims = files.get(key, [])

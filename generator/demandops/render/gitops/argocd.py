@@ -14,7 +14,7 @@ from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.config.repo_settings import RepoSettings
 from demandops.plan.release import ServiceRelease
-from demandops.render.engine import Engine
+from demandops.render import engine
 from demandops.render.gitops.bootstrap_digest import with_digest
 from demandops.render.gitops.node_rule import node_rule
 from demandops.render.gitops.paths import (
@@ -37,9 +37,7 @@ def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
     return f"{repository.source}-{domain.name}"
 
 
-def render(
-    release: ServiceRelease, values: Mapping[str, Any], repository: RepoSettings, engine: Engine
-) -> str:
+def render(release: ServiceRelease, values: Mapping[str, Any], repository: RepoSettings) -> str:
     """Return the text of a service's file: an Application."""
     return engine.text(
         "argocd/release.yaml.j2",
@@ -53,10 +51,10 @@ def render(
     )
 
 
-def base_files(config: Config, engine: Engine) -> dict[str, str]:
+def base_files(config: Config) -> dict[str, str]:
     """Return the bootstrap files and a placeholder for each access domain of a cluster, by path."""
     files = {
-        bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
+        bootstrap_path(cluster): _bootstrap(cluster, domains, config)
         for cluster, domains in domains_by_cluster(config).items()
     }
     for cluster, domain in domains_in_use(config):
@@ -66,7 +64,7 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
     return files
 
 
-def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine: Engine) -> str:
+def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config) -> str:
     return with_digest(
         lambda digest: engine.text(
             "argocd/bootstrap.yaml.j2",

@@ -14,7 +14,7 @@ from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import ChartSource
 from demandops.plan.release import ServiceRelease
-from demandops.render.engine import Engine
+from demandops.render import engine
 from demandops.render.gitops.bootstrap_digest import with_digest
 from demandops.render.gitops.node_rule import node_rule
 from demandops.render.gitops.paths import (
@@ -26,7 +26,7 @@ from demandops.render.gitops.paths import (
 from demandops.settings import MAIN_BRANCH
 
 
-def render(release: ServiceRelease, values: Mapping[str, Any], engine: Engine) -> str:
+def render(release: ServiceRelease, values: Mapping[str, Any]) -> str:
     """Return the text of a service's file: a HelmRelease."""
     chart = release.chart
     return engine.text(
@@ -43,7 +43,7 @@ def chart_object(name: str, chart: ChartSource) -> str:
     return f"{name}-{chart.version}".lower()
 
 
-def base_files(config: Config, engine: Engine) -> dict[str, str]:
+def base_files(config: Config) -> dict[str, str]:
     """Return the files that do not depend on demands, by path.
 
     These are the bootstrap files, if ``flux.url`` is set in ``demandops.yaml``. For each access
@@ -51,7 +51,7 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
     """
     flux = config.repo_settings.flux
     files = {
-        bootstrap_path(cluster): _bootstrap(cluster, domains, config, engine)
+        bootstrap_path(cluster): _bootstrap(cluster, domains, config)
         for cluster, domains in domains_by_cluster(config).items()
         if flux is not None and flux.url is not None
     }
@@ -74,7 +74,7 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
     return files
 
 
-def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config, engine: Engine) -> str:
+def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config) -> str:
     return with_digest(
         lambda digest: engine.text(
             "flux/bootstrap.yaml.j2",

@@ -8,12 +8,12 @@ from __future__ import annotations
 from demandops.config.config import Config
 from demandops.plan.release import Release, ServiceRelease
 from demandops.render import connection_client
-from demandops.render.engine import Engine
+from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import argocd, flux
 from demandops.render.helm_values import values_of
 
 
-def render(release: Release, config: Config, engine: Engine) -> str:
+def render(release: Release, config: Config, evaluate: Evaluate) -> str:
     """Return the manifests of a release as the text of one file.
 
     Raises:
@@ -23,14 +23,14 @@ def render(release: Release, config: Config, engine: Engine) -> str:
             not valid (:func:`demandops.render.connection_client.render`).
     """
     if not isinstance(release, ServiceRelease):
-        return connection_client.render(release, config, engine)
-    values = values_of(release, config, engine)
+        return connection_client.render(release, config)
+    values = values_of(release, config, evaluate)
     if config.repo_settings.gitops == "argocd":
-        return argocd.render(release, values, config.repo_settings, engine)
-    return flux.render(release, values, engine)
+        return argocd.render(release, values, config.repo_settings)
+    return flux.render(release, values)
 
 
-def base_files(config: Config, engine: Engine) -> dict[str, str]:
+def base_files(config: Config) -> dict[str, str]:
     """Return the files that exist even without demands, by path.
 
     Each cluster has a bootstrap file, which makes the cluster's controller follow the repo. For
@@ -40,5 +40,5 @@ def base_files(config: Config, engine: Engine) -> dict[str, str]:
     cluster also has the sources of all charts.
     """
     if config.repo_settings.gitops == "argocd":
-        return argocd.base_files(config, engine)
-    return flux.base_files(config, engine)
+        return argocd.base_files(config)
+    return flux.base_files(config)

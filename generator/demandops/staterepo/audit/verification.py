@@ -82,7 +82,7 @@ class _Proof:
 
         The text of such a release's file depends on the parent commit.
         """
-        base_files = manifests.base_files(state.config, state.engine)
+        base_files = manifests.base_files(state.config)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)
         self._render(())
@@ -140,7 +140,9 @@ class _Proof:
     def _rendered(self, release: Release, before: Tree | None) -> tuple[str, Oid]:
         path, state = path_of(release), self.state
         current = trees.read_text(before, path)
-        return path, _blob(release_file.release_text(release, state.config, state.engine, current))
+        return path, _blob(
+            release_file.release_text(release, state.config, state.evaluate, current)
+        )
 
     def differing(self) -> tuple[str, ...]:
         wanted = self._undemanded | dict(self._planned.values())

@@ -21,6 +21,7 @@ from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, faults_of_edit, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
+from demandops.evaluator import EVALUATE
 from demandops.field_lines import with_lines
 from demandops.ledger import claim_file, ended_override_file, kept_replicas
 from demandops.ledger.claim_changes import changes_on
@@ -258,7 +259,7 @@ class _Edit:
         ledger = replace(ledger, kept=kept_replicas.read_all(kept))
         expired = expired_overrides(World(config, replace(ledger, ended=ended)), self.now)
         ended |= {one.name: format_time(one.end) for one in expired if one.end}
-        state = State.of(config, replace(ledger, ended=ended))
+        state = State(config, replace(ledger, ended=ended), EVALUATE)
         try_configuration(state)
         if self.start is None or self.start.state is None:
             return state
@@ -286,7 +287,7 @@ class _Edit:
         try:
             return rendered_files(state, self.generated_before)
         except InvalidInput as error:
-            found = merge_preview.render_faults(state, state.engine, self.changed)
+            found = merge_preview.render_faults(state, state.evaluate, self.changed)
             raise InvalidInput(found or error.faults) from None
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:

@@ -22,8 +22,8 @@ from demandops.config.policy import matches
 from demandops.decision import State
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.plan.release import ServiceRelease
-from demandops.render import values_validator
 from demandops.render.changes import merge_preview
+from demandops.render.evaluation import SchemaTask
 from demandops.render.gitops.paths import path_of
 from demandops.render.helm_values import values_of
 from demandops.render.trial_render import trial_releases
@@ -137,7 +137,7 @@ class _Run:
             self._not_rendered[name] = "it is in a registry"
             return
         try:
-            values = json.dumps(values_of(release, self._state.config, self._state.engine))
+            values = json.dumps(values_of(release, self._state.config, self._state.evaluate))
         except InvalidInput:  # only if an override holds the release's file, with older values
             return
         if folder not in self._sound:
@@ -165,7 +165,7 @@ class _Run:
             for schema in (one for one in self._files if one.startswith(f"{path}/")):
                 if schema.endswith("/values.schema.json"):
                     try:
-                        values_validator.validator(self._files[schema], schema)
+                        self._state.evaluate(self._files, SchemaTask(schema))
                     except InvalidInput as error:  # helm would fetch what a schema refers to
                         self._faults.update(dict.fromkeys(error.faults))
                         return False

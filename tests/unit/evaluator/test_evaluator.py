@@ -1,0 +1,199 @@
+"""What people wrote is evaluated in a process with limits, and no evaluation stops another."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+from demandops.config.load import load
+from demandops.decision import State, try_configuration
+from demandops.errors import InvalidInput, OverLimit
+from demandops.evaluator import Evaluator, processor_time
+from demandops.ledger.ledger import Ledger
+from demandops.render.evaluation import SchemaTask, ValuesTask, evaluate
+
+from tests.kit.config import configuration, skeleton
+from tests.kit.goals import perception
+from tests.kit.memory import MemoryRepo
+
+FOLDER = "appdefs/object-detection-fusion"
+TEMPLATE = f"{FOLDER}/values/object-detection.yaml.j2"
+SCHEMA = f"{FOLDER}/charts/object-detection/values.schema.json"
+GROWING = (
+    "{% set ns = namespace(x=START) %}{% for i in range(99) %}{% set ns.x = NEXT %}{% endfor %}"
+    "x: {{ ns.x }}"
+)
+SECONDS = 0.1
+"""How long an evaluation may take here, so that what never ends costs little."""
+
+
+def values(
+    text: str, context: Mapping[str, Any] | None = None, on: Evaluator | None = None
+) -> dict[str, Any]:
+    with processor_time(SECONDS):
+        return (on or Evaluator())({"a.j2": text}, ValuesTask("a.j2", context or {}, None))
+
+
+@pytest.fixture(scope="module")
+def shared() -> Evaluator:
+    return Evaluator()
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "{% for a in range(99999) %}{% for b in range(99999) %}{% endfor %}{% endfor %}",
+        "{% set x = range(9999) | list %}{% for a in x if a in range(9999) | list %}{% endfor %}",
+        GROWING.replace("START", "'aaaa'").replace("NEXT", "ns.x ~ ns.x"),
+        GROWING.replace("START", "[1]").replace("NEXT", "[ns.x, ns.x]"),
+        GROWING.replace("START", "[1]").replace("NEXT", "ns.x + ns.x"),
+        GROWING.replace("START", "{}").replace("NEXT", "dict(a=ns.x, b=ns.x)"),
+        GROWING.replace("START", "99999").replace("NEXT", "ns.x * ns.x"),
+        "x: {{ ('a' * 99999).replace('a', 'b' * 99999) }}",
+        "x: {{ range(99999) | join('b' * 99999) }}",
+        "x: {{ 'a' * 1000000000 }}",
+        "x: {{ [1] * 1000000000 }}",
+        "x: {{ 10 ** (10 ** 10) }}",
+        "x: {{ 7 ** 9999999 // 3 ** 9999998 % 5 }}",
+        "x: {{ ((('9' * 4000) | int(0, 16)) ** 99999) is divisibleby 7 }}",
+        "x: {{ '%1000000000d' % 1 }}",
+        "x: {{ '%*d' % (1000000000, 1) }}",
+        "x: {{ '{:>{w}}'.format(1, w=1000000000) }}",
+        "x: {{ 'a' | center(1000000000) }}",
+        "x: {{ [1] | batch(1000000000, 'x') | list }}",
+    ],
+    ids=lambda text: repr(text[-60:]),
+)
+def test_a_template_that_would_run_for_ever_or_grow_ends(text: str, shared: Evaluator) -> None:
+    with pytest.raises(OverLimit) as refused:
+        values(text, on=shared)
+    assert [(fault.code, fault.file) for fault in refused.value.faults] == [("over-limit", "a.j2")]
+    assert values("x: {{ 1 + 1 }}", on=shared) == {"x": 2}
+
+
+def doubling(times: int) -> dict[str, object]:
+    """Return a schema of ``times`` nested definitions; each doubles the work of a validation."""
+    steps: dict[str, object] = {
+        f"d{i}": {"allOf": [{"$ref": f"#/$defs/d{i + 1}"}] * 2} for i in range(times)
+    }
+    return {"$ref": "#/$defs/d0", "$defs": {**steps, f"d{times}": {"type": "object"}}}
+
+
+@pytest.mark.parametrize(
+    "schema",
+    [
+        doubling(60),
+        {"additionalProperties": {"allOf": [{"$ref": "#"}] * 2}},
+        {"patternProperties": {f"(a|b){{{n}}}": {"$ref": "#"} for n in range(300)}},
+    ],
+    ids=["doubling", "doubling by depth", "doubling by patterns"],
+)
+def test_a_schema_that_would_never_end_ends(schema: object, shared: Evaluator) -> None:
+    nested: dict[str, Any] = {}
+    for _ in range(60):
+        nested = {"ab" * 300: nested}
+    files = {"a.j2": "{{ x | block(0) }}", "c/values.schema.json": json.dumps(schema)}
+    with processor_time(SECONDS), pytest.raises(OverLimit):
+        shared(files, ValuesTask("a.j2", {"x": nested}, "c"))
+
+
+def test_a_schema_that_is_nested_without_end_is_a_fault(shared: Evaluator) -> None:
+    text = '{"not":' * 100_000 + "{}" + "}" * 100_000
+    with pytest.raises(InvalidInput):
+        shared({"s.json": text}, SchemaTask("s.json"))
+
+
+def test_the_answer_is_that_of_an_evaluation_in_this_process(shared: Evaluator) -> None:
+    tasks = list[tuple[Mapping[str, str], ValuesTask | SchemaTask]]()
+
+    def both(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:
+        tasks.append((files, task))
+        expected = evaluate(files, task)
+        assert shared(files, task) == expected
+        return expected
+
+    for gitops in ("flux", "argocd"):
+        files = {path: text for path, text in skeleton(gitops).items() if path in configuration()}
+        books = MemoryRepo(state=State(load(files), Ledger(), both))
+        books.send(perception())
+    assert tasks
+
+
+def test_only_what_changed_of_the_files_is_sent_and_what_is_gone_is_gone(shared: Evaluator) -> None:
+    task = ValuesTask("a.j2", {}, None)
+    assert shared({"a.j2": "{% include 'b.j2' %}", "b.j2": "x: 1"}, task) == {"x": 1}
+    assert shared({"a.j2": "{% include 'b.j2' %}", "b.j2": "x: 2"}, task) == {"x": 2}
+    with pytest.raises(InvalidInput, match=r"'b.j2' does not exist"):
+        shared({"a.j2": "{% include 'b.j2' %}"}, task)
+
+
+def test_evaluations_of_a_demand_share_its_time() -> None:
+    evaluator = Evaluator()
+    with processor_time(each=1, together=SECONDS):
+        with pytest.raises(OverLimit):
+            evaluator({"a.j2": "{% for a in range(9999) %}" * 3 + "{% endfor %}" * 3}, task())
+        with pytest.raises(OverLimit, match="took all the time"):
+            evaluator({"a.j2": "x: 1"}, task())
+    assert evaluator({"a.j2": "x: 1"}, task()) == {"x": 1}
+
+
+def task() -> ValuesTask:
+    return ValuesTask("a.j2", {}, None)
+
+
+def test_a_child_that_somebody_ended_is_replaced(shared: Evaluator) -> None:
+    assert values("x: 1", on=shared) == {"x": 1}
+    for child in shared._idle:
+        os.kill(child._process.pid, signal.SIGKILL)
+        child._process.wait()
+    assert values("x: 1", on=shared) == {"x": 1}
+
+
+def test_threads_do_not_wait_for_each_other(shared: Evaluator) -> None:
+    started, results = threading.Barrier(4), list[str]()
+
+    def endless() -> None:
+        started.wait()
+        with processor_time(30), pytest.raises(OverLimit):
+            shared({"a.j2": "{% for a in range(9999) %}" * 3 + "{% endfor %}" * 3}, task())
+        results.append("ended")
+
+    def quick() -> None:
+        started.wait()
+        results.append(str(values("x: 1", on=shared)["x"]))
+
+    hang = threading.Thread(target=endless, daemon=True)
+    others = [threading.Thread(target=quick) for _ in range(3)]
+    for thread in (hang, *others):
+        thread.start()
+    for thread in others:
+        thread.join()
+    assert results == ["1", "1", "1"]
+
+
+def test_the_child_has_neither_environment_nor_descriptors_of_its_parent(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("DEMANDOPS_SECRET", "not for templates")
+    evaluator = Evaluator()
+    with (tmp_path / "open").open("w") as file:
+        os.set_inheritable(file.fileno(), True)
+        values("x: 1", on=evaluator)
+        (child,) = evaluator._idle
+        process = Path(f"/proc/{child._process.pid}")
+        assert b"DEMANDOPS_SECRET" not in (process / "environ").read_bytes()
+        assert sorted(int(each.name) for each in (process / "fd").iterdir()) == [0, 1, 2]
+
+
+def test_a_configuration_is_not_invalid_because_it_takes_too_long() -> None:
+    endless = "{% for a in range(99999) %}{% for b in range(99999) %}{% endfor %}{% endfor %}"
+    config = load(configuration({TEMPLATE: endless + skeleton()[TEMPLATE]}))
+    with processor_time(SECONDS), pytest.raises(OverLimit) as late:
+        try_configuration(State(config, Ledger(), Evaluator()))
+    assert {fault.file for fault in late.value.faults} == {TEMPLATE}
