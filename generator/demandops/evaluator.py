@@ -33,6 +33,11 @@ from demandops.render.evaluation import SchemaTask, ValuesTask
 
 log = logging.getLogger("demandops")
 
+DEMAND_S = 0.75
+"""How many seconds of processor time the evaluations of one demand may take together.
+
+The values of a service with 8,000 topics take a third of it.
+"""
 MEMORY_MIB = 512
 _MOST_IDLE = 2  # the worker's and the page's
 _LONGEST_ANSWER = 64_000_000

@@ -31,11 +31,14 @@ def changeset_of_edit(
 ) -> changeset.Changeset:
     """Return the changes to rendered files after a person edited claims on ``subjects``.
 
-    ``before`` is the ledger before the edit, and ``state`` has the ledger after it.
+    ``before`` is the ledger before the edit, and ``state`` has the ledger after it. A release whose
+    values take too long to compute keeps its file: that is no fault of the claim.
     """
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
-    return changeset.build_changeset(old, state, Changes(), keys, state.evaluate, read)
+    return changeset.build_changeset(
+        old, state, Changes(), keys, state.evaluate, read, keeps_late=True
+    )
 
 
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:

@@ -73,15 +73,21 @@ class State(World):
 
 
 def rendered_files(
-    state: State, current: Mapping[str, str] = MappingProxyType({})
+    state: State,
+    current: Mapping[str, str] = MappingProxyType({}),
+    *,
+    keeps_late: bool = False,
 ) -> dict[str, str]:
     """Return every generated file that the state requires, as a map from path to text.
 
     Args:
         state: the world to render.
         current: the current generated files. An override with ``hold`` keeps some of these files.
+        keeps_late: whether a release whose values take too long to compute keeps its file, instead
+            of OverLimit.
     """
-    return changeset.render_all(state, state.evaluate, all_keys(state), current)
+    keys = all_keys(state)
+    return changeset.render_all(state, state.evaluate, keys, current, keeps_late=keeps_late)
 
 
 def try_configuration(state: State) -> None:

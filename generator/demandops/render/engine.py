@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping
 from functools import lru_cache
+from pathlib import Path
 from types import CodeType
 from typing import Any
 
@@ -100,9 +101,9 @@ OPTIONS: dict[str, Any] = {
 
 
 @lru_cache(maxsize=1)
-def _own() -> Environment:
+def _own(folder: Path) -> Environment:
     environment = Environment(  # noqa: S701 - YAML, not HTML
-        loader=FileSystemLoader(data_folder("templates")),
+        loader=FileSystemLoader(folder),
         bytecode_cache=CompiledTemplates(),
         **OPTIONS,
     )
@@ -116,4 +117,4 @@ def text(template: str, **context: object) -> str:
 
     A template is named by its path in the ``templates`` folder, like ``flux/release.yaml.j2``.
     """
-    return _own().get_template(template).render(**context)
+    return _own(data_folder("templates")).get_template(template).render(**context)

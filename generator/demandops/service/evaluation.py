@@ -10,6 +10,7 @@ import logging
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand.demand_request import Decommission
 from demandops.errors import DemandOpsError, InvalidInput, Refused, Withdrawn, fault, internal
+from demandops.evaluator import DEMAND_S, processor_time
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.approvals.proposal import is_release
@@ -55,16 +56,17 @@ class Evaluator:
             goal = ticket.goal
             if rollback_goal.is_rollback(goal):
                 goal = rollback_goal.to_restoration(goal, self._repository, commits.start)
-            decision = decide(
-                commits.head.state,
-                goal,
-                ticket.received,
-                commits.read,
-                lambda stage: ticket.notify(stage, stage),
-                lambda request, config: self._rate_limit.faults(
-                    request, config, ticket.operation, ticket.received
-                ),
-            )
+            with processor_time(each=DEMAND_S, together=DEMAND_S):
+                decision = decide(
+                    commits.head.state,
+                    goal,
+                    ticket.received,
+                    commits.read,
+                    lambda stage: ticket.notify(stage, stage),
+                    lambda request, config: self._rate_limit.faults(
+                        request, config, ticket.operation, ticket.received
+                    ),
+                )
             if decision.approval:
                 return decision
             if not self._demands.commit(ticket):

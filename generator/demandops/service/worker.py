@@ -19,6 +19,7 @@ from demandops.errors import (
     Withdrawn,
     internal,
 )
+from demandops.evaluator import DEMAND_S, processor_time
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.demand_lifecycle import Demands
 from demandops.service.evaluation import Evaluator
@@ -109,10 +110,11 @@ class Worker:
     def run(self) -> None:
         """Publish demands, until no further demand is accepted and no demand is queued."""
         # people may have decided about proposals before the start, so answer these demands first
-        if self._demands.proposed:
-            self._work()
-        while self._demands.wait(self._seconds_until_due()):
-            self._work()
+        with processor_time(each=DEMAND_S):
+            if self._demands.proposed:
+                self._work()
+            while self._demands.wait(self._seconds_until_due()):
+                self._work()
         self._approvals.suspend()
 
     def _work(self) -> None:

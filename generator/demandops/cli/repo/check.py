@@ -13,6 +13,7 @@ from demandops.cli.json_output import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.repo import pull_request_comment
 from demandops.cli.views.diff import entry_lines, release_lines
+from demandops.evaluator import processor_time
 from demandops.render.changes.merge_preview import FileChange, MergePreview
 from demandops.staterepo.pull_request import merge_check
 from demandops.staterepo.pull_request.merge_check import CheckResult
@@ -57,7 +58,7 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
       demandops check
       demandops check . --base origin/main --output markdown
     """
-    with busy("checking"):
+    with busy("checking"), processor_time(each=2, together=60):
         checked = merge_check.check(directory, base, require_helm=require_helm)
     if output == "json":
         print_json(_data(checked))

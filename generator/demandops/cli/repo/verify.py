@@ -12,6 +12,7 @@ from demandops.cli.json_output import output_option, show
 from demandops.cli.output import progress
 from demandops.cli.target import state_repo_option
 from demandops.errors import fault
+from demandops.evaluator import processor_time
 from demandops.staterepo import reader
 from demandops.staterepo.audit.verification import Verdict
 
@@ -40,7 +41,12 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
       demandops verify main~50..main
       demandops verify main --whole
     """
-    with reader.opened(state_repo) as repo, progress("rendering again") as report:
+    # what was rendered once must not fail here because this machine is slower
+    with (
+        processor_time(each=60),
+        reader.opened(state_repo) as repo,
+        progress("rendering again") as report,
+    ):
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
     show(output, [_row(verdict) for verdict in verdicts], _lines(verdicts))
     if not all(verdict.holds for verdict in verdicts):

@@ -6,7 +6,6 @@ A file whose text stays the same is not in the changeset, so an unchanged releas
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import suppress
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
@@ -73,7 +72,7 @@ class Changeset:
     """
 
 
-def build_changeset(
+def build_changeset(  # noqa: PLR0913
     before: World,
     after: World,
     changes: Changes,
@@ -81,6 +80,8 @@ def build_changeset(
     evaluate: Evaluate,
     read: FileReader,
     plans: Mapping[ReleaseKey, Release] = MappingProxyType({}),
+    *,
+    keeps_late: bool = False,
 ) -> Changeset:
     """Return the changes in the state repo that follow from a change of the ledger.
 
@@ -92,6 +93,8 @@ def build_changeset(
         evaluate: computes the values of services.
         read: returns the text of a file of the state repo before the change.
         plans: releases of ``before`` that the caller has planned already.
+        keeps_late: whether a release whose values take too long to compute keeps its file, instead
+            of OverLimit.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered, or if a file would not be
@@ -123,11 +126,16 @@ def build_changeset(
         old = former[key]
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
+        current = read(new_path) if new_path else None
+        try:
+            text = release_file.release_text(new, after.config, evaluate, current) if new else None
+        except OverLimit:
+            if keeps_late:
+                continue
+            raise
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
-        current = read(new_path) if new_path else None
         blocked += _blocked(old, new) if current is not None else ()
-        text = release_file.release_text(new, after.config, evaluate, current) if new else None
         if new_path and text != current:
             files[new_path] = text
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
@@ -157,17 +165,22 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
 
 
 def render_all(
-    world: World, evaluate: Evaluate, keys: Iterable[ReleaseKey], current: Mapping[str, str]
+    world: World,
+    evaluate: Evaluate,
+    keys: Iterable[ReleaseKey],
+    current: Mapping[str, str],
+    *,
+    keeps_late: bool = False,
 ) -> dict[str, str]:
     """Return all generated files except those of the ledger, by path.
-
-    A release whose values take too long to compute keeps its file as it is.
 
     Args:
         world: the configuration and the ledger.
         evaluate: computes the values of services.
         keys: the keys of all releases (:func:`demandops.plan.release_keys.all_keys`).
         current: the generated files in the state repo, which ``hold`` overrides may preserve.
+        keeps_late: whether a release whose values take too long to compute keeps its file, instead
+            of OverLimit.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered.
@@ -183,14 +196,16 @@ def render_all(
         template = (
             config.values_template(release.service) if isinstance(release, ServiceRelease) else ""
         )
-        with suppress(OverLimit):
-            if template not in late:
-                late.add(template)
+        if template not in late:
+            try:
                 files[path] = release_file.release_text(
                     release, config, evaluate, current.get(path)
                 )
-                late.remove(template)
-        if path not in files and path in current:
+            except OverLimit:
+                if not keeps_late:
+                    raise
+                late.add(template)
+        if template in late and path in current:
             files[path] = current[path]
     return files | release_file.kept_charts(files, current, world)
 

@@ -18,7 +18,7 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, try_configuration
 from demandops.demand.claim import Claim
 from demandops.errors import Fault, InvalidInput, OverLimit, fault
-from demandops.evaluator import EVALUATE
+from demandops.evaluator import DEMAND_S, EVALUATE, processor_time
 from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
 from demandops.ledger.claim_changes import ClaimChange
 from demandops.ledger.kept_replicas import Instance, Steps
@@ -278,7 +278,7 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
     if config != state.config:
         # what takes too long is a fault for `check`, and of each demand that needs it; whether a
         # configuration is valid must not depend on the machine
-        with suppress(OverLimit):
+        with suppress(OverLimit), processor_time(each=DEMAND_S, together=4 * DEMAND_S):
             try_configuration(State(config, Ledger(ended=state.ledger.ended), EVALUATE))
     return config
 

@@ -94,7 +94,9 @@ def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
     accepted = judgement.with_new_config().snapshot
     try:
         if advance.config_changed:
-            rendered_files(accepted.state, trees.texts(commit.tree, GENERATED_ROOTS))
+            rendered_files(
+                accepted.state, trees.texts(commit.tree, GENERATED_ROOTS), keeps_late=True
+            )
     except InvalidInput as error:
         accepted = judgement.with_old_config(error.faults).snapshot
     return accepted

@@ -294,7 +294,7 @@ class CommitBatch:
         Raises Refused or InvalidInput if a release cannot be planned or rendered.
         """
         generated = trees.texts(self._tree, GENERATED_ROOTS)
-        files: dict[str, str | None] = dict(rendered_files(state, generated))
+        files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
         changes = []
         known = {
             path: trees.is_file(one) for path, one in trees.entries(self._tree, GENERATED_ROOTS)
