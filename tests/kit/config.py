@@ -10,8 +10,8 @@ import yaml
 from demandops.config.config import CONFIG_ROOTS, Config
 from demandops.decision import State
 from demandops.ledger.ledger import Ledger
-from demandops.render.evaluation import evaluate
 from demandops.staterepo.skeleton import files
+from demandops.templating.values import evaluate
 
 
 @lru_cache

@@ -19,7 +19,7 @@ from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
-from demandops.render.evaluation import Evaluate
+from demandops.templating.values import Evaluate
 
 
 @dataclass(frozen=True, slots=True)

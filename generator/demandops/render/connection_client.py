@@ -19,8 +19,8 @@ import jsonschema_rs
 from demandops.config.config import IMAGES_FILE, Config
 from demandops.connections.connection_type import UNSUPPORTED, Client
 from demandops.errors import InvalidInput, Refused, fault, field_path
-from demandops.render import engine
 from demandops.settings import data_folder
+from demandops.templating import engine
 
 
 def render(client: Client, config: Config) -> str:

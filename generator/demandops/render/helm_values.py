@@ -14,7 +14,7 @@ from demandops.config.config import Config
 from demandops.config.inventory import Node
 from demandops.errors import Fault, InvalidInput
 from demandops.plan.release import ServiceRelease
-from demandops.render.evaluation import Evaluate, ValuesTask
+from demandops.templating.values import Evaluate, ValuesTask
 
 
 def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> dict[str, Any]:

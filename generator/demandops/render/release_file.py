@@ -13,9 +13,9 @@ from demandops.config.config import Config
 from demandops.config.override import Override, format_time
 from demandops.ledger.world import World
 from demandops.plan.release import Release
-from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import CLUSTERS_ROOT
+from demandops.templating.values import Evaluate
 
 _START = "# override overrides/"
 _OUTSIDE_BODY = frozenset({"hold", "keep"})

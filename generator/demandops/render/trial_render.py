@@ -19,8 +19,8 @@ from demandops.plan.overrides.release_overrides import apply_effects, effects_on
 from demandops.plan.planner import plan
 from demandops.plan.release import ServiceRelease
 from demandops.plan.release_keys import affected_keys
-from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import manifests
+from demandops.templating.values import Evaluate
 
 _NEVER = datetime.fromtimestamp(0, timezone.utc)
 

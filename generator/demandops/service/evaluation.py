@@ -10,7 +10,7 @@ import logging
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand.demand_request import Decommission
 from demandops.errors import DemandOpsError, InvalidInput, Refused, Withdrawn, fault, internal
-from demandops.evaluator import DEMAND_S, processor_time
+from demandops.evaluator.process import DEMAND_S, processor_time
 from demandops.service import rollback_goal
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.approvals.proposal import is_release

@@ -19,7 +19,7 @@ from demandops.errors import (
     Withdrawn,
     internal,
 )
-from demandops.evaluator import DEMAND_S, processor_time
+from demandops.evaluator.process import DEMAND_S, processor_time
 from demandops.service.approvals.approvals import Approvals, Result
 from demandops.service.demand_lifecycle import Demands
 from demandops.service.evaluation import Evaluator

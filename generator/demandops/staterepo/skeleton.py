@@ -11,7 +11,7 @@ from demandops.config.config import CONFIG_ROOTS
 from demandops.config.load import load
 from demandops.config.repo_settings import ROOT_FILE, as_git_url
 from demandops.decision import State, rendered_files
-from demandops.evaluator import EVALUATE
+from demandops.evaluator.process import EVALUATE
 from demandops.ledger.ledger import Ledger
 from demandops.settings import RENDER_VERSION, data_folder
 

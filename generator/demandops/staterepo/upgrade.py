@@ -19,7 +19,7 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, faults_of_edit
 from demandops.demand.claim import ClaimKey
 from demandops.errors import InvalidInput, StateRepoError, fault
-from demandops.evaluator import EVALUATE
+from demandops.evaluator.process import EVALUATE
 from demandops.ledger import claim_file, ended_override_file
 from demandops.ledger.claim_file import LEDGER_ROOT
 from demandops.ledger.ledger import Ledger

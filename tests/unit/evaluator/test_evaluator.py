@@ -14,9 +14,9 @@ import pytest
 from demandops.config.load import load
 from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput, OverLimit
-from demandops.evaluator import Evaluator, processor_time
+from demandops.evaluator.process import Evaluator, processor_time
 from demandops.ledger.ledger import Ledger
-from demandops.render.evaluation import SchemaTask, ValuesTask, evaluate
+from demandops.templating.values import SchemaTask, ValuesTask, evaluate
 
 from tests.kit.config import configuration, skeleton
 from tests.kit.goals import perception

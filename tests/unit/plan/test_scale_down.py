@@ -18,6 +18,7 @@ from pydantic import ValidationError
 
 from tests.appdefs.test_scaling import books, demand, fact, release, replicas_by_overrides
 from tests.kit.chance import examples
+from tests.kit.config import state_of
 from tests.kit.memory import NOW, MemoryRepo, ledger_in
 
 PAGE = (Path(__file__).parents[3] / "docs" / "appdef.md").read_text()
@@ -99,7 +100,7 @@ def test_a_person_decides_at_once() -> None:
     ):
         changed = books(scaling)
         other = MemoryRepo(state=changed.state)
-        other.state = type(changed.state).of(changed.config, repo.state.ledger)
+        other.state = state_of(changed.config, repo.state.ledger)
         (found,) = (text for path, text in rendered_files(other.state).items() if "/rec-" in path)
         assert yaml.safe_load(found)["spec"]["values"]["replicas"] == int(left.split()[0])
 

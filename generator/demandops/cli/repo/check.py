@@ -13,7 +13,7 @@ from demandops.cli.json_output import output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.repo import pull_request_comment
 from demandops.cli.views.diff import entry_lines, release_lines
-from demandops.evaluator import processor_time
+from demandops.evaluator.process import processor_time
 from demandops.render.changes.merge_preview import FileChange, MergePreview
 from demandops.staterepo.pull_request import merge_check
 from demandops.staterepo.pull_request.merge_check import CheckResult

@@ -16,7 +16,7 @@ from demandops.config.load import load
 from demandops.config.registry import Image
 from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput, StateRepoError
-from demandops.evaluator import EVALUATE
+from demandops.evaluator.process import EVALUATE
 from demandops.ledger.ledger import Ledger
 from demandops.scaffold import new_application, new_entry, new_image
 from demandops.scaffold.new_application import LIBRARY_FOLDER, ApplicationPlan, ServicePlan

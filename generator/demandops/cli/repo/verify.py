@@ -12,7 +12,7 @@ from demandops.cli.json_output import output_option, show
 from demandops.cli.output import progress
 from demandops.cli.target import state_repo_option
 from demandops.errors import fault
-from demandops.evaluator import processor_time
+from demandops.evaluator.process import processor_time
 from demandops.staterepo import reader
 from demandops.staterepo.audit.verification import Verdict
 

@@ -20,10 +20,10 @@ from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey
 from demandops.quoting import one_line
 from demandops.render import release_file
-from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.render.output_check import check_files
+from demandops.templating.values import Evaluate
 
 Change = Literal["start", "change", "stop"]
 

@@ -21,10 +21,10 @@ from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey, all_keys, keys_of
 from demandops.render.changes.changeset import ReleaseChange, describe_change
-from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import manifests
 from demandops.render.gitops.paths import path_of
 from demandops.strict_yaml import load_all, short_repr
+from demandops.templating.values import Evaluate
 
 _MOST_FACTS = 20
 

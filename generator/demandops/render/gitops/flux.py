@@ -14,7 +14,6 @@ from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
 from demandops.config.registry import ChartSource
 from demandops.plan.release import ServiceRelease
-from demandops.render import engine
 from demandops.render.gitops.bootstrap_digest import with_digest
 from demandops.render.gitops.node_rule import node_rule
 from demandops.render.gitops.paths import (
@@ -24,6 +23,7 @@ from demandops.render.gitops.paths import (
     domains_in_use,
 )
 from demandops.settings import MAIN_BRANCH
+from demandops.templating import engine
 
 
 def render(release: ServiceRelease, values: Mapping[str, Any]) -> str:

@@ -8,9 +8,9 @@ from __future__ import annotations
 from demandops.config.config import Config
 from demandops.plan.release import Release, ServiceRelease
 from demandops.render import connection_client
-from demandops.render.evaluation import Evaluate
 from demandops.render.gitops import argocd, flux
 from demandops.render.helm_values import values_of
+from demandops.templating.values import Evaluate
 
 
 def render(release: Release, config: Config, evaluate: Evaluate) -> str:

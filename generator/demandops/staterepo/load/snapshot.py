@@ -18,7 +18,7 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, try_configuration
 from demandops.demand.claim import Claim
 from demandops.errors import Fault, InvalidInput, OverLimit, fault
-from demandops.evaluator import DEMAND_S, EVALUATE, processor_time
+from demandops.evaluator.process import DEMAND_S, EVALUATE, processor_time
 from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
 from demandops.ledger.claim_changes import ClaimChange
 from demandops.ledger.kept_replicas import Instance, Steps

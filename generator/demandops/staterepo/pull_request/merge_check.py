@@ -21,7 +21,7 @@ from demandops.config.override import format_time
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, faults_of_edit, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
-from demandops.evaluator import EVALUATE
+from demandops.evaluator.process import EVALUATE
 from demandops.field_lines import with_lines
 from demandops.ledger import claim_file, ended_override_file, kept_replicas
 from demandops.ledger.claim_changes import changes_on

@@ -23,11 +23,11 @@ from demandops.decision import State
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes import merge_preview
-from demandops.render.evaluation import SchemaTask
 from demandops.render.gitops.paths import path_of
 from demandops.render.helm_values import values_of
 from demandops.render.trial_render import trial_releases
 from demandops.staterepo.pull_request.helm import HELM_BIN, Helm, Report
+from demandops.templating.values import SchemaTask
 
 MISSING = "helm is missing"
 NO_HELM = (

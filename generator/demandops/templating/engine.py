@@ -2,7 +2,7 @@
 
 ``{{ x }}`` writes one JSON value, so a value cannot change the structure of the YAML. An undefined
 name is an error. Templates of application definitions follow the same rules, in a sandbox and in
-another process (:mod:`demandops.render.evaluation`).
+another process (:mod:`demandops.templating.values`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Computes the values of services in a child process, which can be killed.
 
 Templates, schemas and patterns that people merge may never end, or take all memory. So each is
-evaluated by a child with limits (:mod:`demandops.evaluator_child`) that knows neither the
+evaluated by a child with limits (:mod:`demandops.evaluator.child`) that knows neither the
 environment nor the open files of this process. The kernel ends a child that exceeds its limits;
 the demand is refused, and the next evaluation starts another child.
 
@@ -29,7 +29,7 @@ from typing import Any
 
 from demandops import errors
 from demandops.errors import Fault, InvalidInput, OverLimit
-from demandops.render.evaluation import SchemaTask, ValuesTask
+from demandops.templating.values import SchemaTask, ValuesTask
 
 log = logging.getLogger("demandops")
 
@@ -45,7 +45,7 @@ _LONGEST_ANSWER = 64_000_000
 _LONGEST_WAIT_S = 60
 _START = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[1]); "
-    f"from demandops import evaluator_child; evaluator_child.serve({MEMORY_MIB})"
+    f"from demandops.evaluator import child; child.serve({MEMORY_MIB})"
 )
 
 
@@ -83,7 +83,7 @@ class Evaluator:
         self._idle: list[_Child] = []
 
     def __call__(self, files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:
-        """Return the values of a task (:data:`demandops.render.evaluation.Evaluate`)."""
+        """Return the values of a task (:data:`demandops.templating.values.Evaluate`)."""
         limits = _limits.get(None) or _Limits(2, inf)
         seconds = min(limits.each, limits.left)
         if seconds <= 0:
@@ -150,7 +150,7 @@ class _Child:
     """A process that evaluates, and what this process knows of it."""
 
     def __init__(self) -> None:
-        package = str(Path(__file__).parent.parent)
+        package = str(Path(__file__).parents[2])
         # -S leaves out what packages run at each start; the path has all that it would add
         self._process = subprocess.Popen(
             [sys.executable, "-s", "-S", "-c", _START, json.dumps([package, *sys.path])],

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from demandops.errors import InvalidInput
-from demandops.render.evaluation import SchemaTask, ValuesTask, evaluate
+from demandops.templating.values import SchemaTask, ValuesTask, evaluate
 
 
 def serve(memory_mib: int) -> None:

@@ -23,9 +23,9 @@ from demandops import strict_yaml
 from demandops.charts import chart_files
 from demandops.errors import Fault, InvalidInput, fault, field_path
 from demandops.quoting import quoted
-from demandops.render.engine import FILTERS, OPTIONS, CompiledTemplates
-from demandops.render.template_lines import TemplateLines
-from demandops.render.template_sandbox import Sandbox
+from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
+from demandops.templating.template_lines import TemplateLines
+from demandops.templating.template_sandbox import Sandbox
 
 _MAX_LENGTH = 100_000  # characters of a values template
 _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")

@@ -1,0 +1,1 @@
+"""Evaluates what people wrote in a process with limits, which can be killed."""
