@@ -69,7 +69,7 @@ page: system-page setup  ## Look at the web page in a headless browser: every vi
 
 # The core's tests must not import Git: without_git forbids that, and --confcutdir leaves out
 # tests/conftest.py, which imports it.
-CORE := config decision demand ledger plan render
+CORE := config decision demand ledger plan render templating
 CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden tests/model tests/unit \
   $(addprefix --ignore=tests/unit/,cluster forge service staterepo demand/test_fuzz.py) \
   --ignore-glob='tests/unit/test_[!s]*'

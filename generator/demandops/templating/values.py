@@ -28,6 +28,7 @@ from demandops.templating.template_lines import TemplateLines
 from demandops.templating.template_sandbox import Sandbox
 
 _MAX_LENGTH = 100_000  # characters of a values template
+_MAX_RENDERED = 1_000_000  # characters that it writes; Kubernetes takes objects of 1.5 MB
 _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 
 
@@ -111,7 +112,10 @@ _COMPILED = CompiledTemplates()
 def _rendered(files: Mapping[str, str], task: ValuesTask) -> str:
     sandbox = Sandbox(FILTERS, loader=_FilesLoader(files), bytecode_cache=_COMPILED, **OPTIONS)
     try:
-        return sandbox.get_template(task.template).render(**task.context)
+        text = sandbox.get_template(task.template).render(**task.context)
+        if len(text) <= _MAX_RENDERED:
+            return text
+        problem, line = f"writes {len(text)} characters; at most {_MAX_RENDERED} are allowed", None
     except TemplateNotFound as error:
         problem, line = f"'{error.name}' does not exist", _line(error, task.template)
     except TemplateSyntaxError as error:

@@ -111,6 +111,11 @@ def test_whatever_a_template_does_it_is_told_as_the_templates_fault(text: str) -
     assert found.startswith(f"{TEMPLATE}:")
 
 
+def test_a_text_that_no_cluster_takes_is_the_templates_fault() -> None:
+    (found,) = appended("x: {{ 'a' * 1000001 }}\n")
+    assert "at most 1000000 are allowed" in found
+
+
 @pytest.mark.parametrize(
     "expression",
     [
