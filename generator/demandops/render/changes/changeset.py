@@ -15,6 +15,7 @@ from demandops.errors import Refused, fault
 from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
 from demandops.ledger.claim_changes import Changes
 from demandops.ledger.world import World
+from demandops.plan.checks import name_clash
 from demandops.plan.planner import plan
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
@@ -167,10 +168,12 @@ def render_all(
         current: the generated files in the state repo, which ``hold`` overrides may preserve.
 
     Raises:
-        Refused, InvalidInput: if a release cannot be planned or rendered.
+        Refused, InvalidInput: if a release cannot be planned or rendered, or if two need one name.
     """
     config = world.config
     files = manifests.base_files(config, engine)
+    keys = tuple(keys)
+    name_clash.refuse_shared_names(world, keys)
     for key in keys:
         release = plan(world, key)
         if release is not None:
