@@ -15,9 +15,10 @@ import pytest
 import yaml
 from demandops import naming
 from demandops.config.load import load
+from demandops.config.registry import Chart
 from demandops.connections import ros
 from demandops.decision import Decision, rendered_files
-from demandops.demand.claim import ClaimKey
+from demandops.demand.claim import ClaimKey, demand_id
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file, kept_replicas, waiting
 from demandops.ledger.claim_changes import Changes
@@ -29,6 +30,7 @@ from demandops.plan.release import ServiceKey
 from demandops.subject import Subject, SubjectKind
 from hypothesis import given
 from hypothesis import strategies as st
+from pydantic import ValidationError
 
 from tests.appdefs.test_scaling import books, demand
 from tests.kit.chance import chances, examples, told
@@ -253,3 +255,32 @@ def test_no_two_releases_of_one_name_are_rendered(monkeypatch: pytest.MonkeyPatc
     with pytest.raises(Refused) as refused:
         rendered_files(repo.state)
     assert {fault.code for fault in refused.value.faults} == {"conflict"}
+
+
+@pytest.mark.usefixtures("short_digests")
+def test_two_demands_without_an_id_have_two_digests() -> None:
+    def joining(request: str, requester: str) -> Goal:
+        return goal([application(f"edge/{requester}", who=[requester])], id=request)
+
+    repo, first = alone().copy(), "visit"
+    known = demand_id(first, ["vehicle00"])
+    others = (f"visit-{number}" for number in range(1000))
+    other = next(one for one in others if demand_id(one, ["vehicle01"]) == known)
+    repo.send(joining(first, "vehicle00"))
+    taken = repo.take(joining(other, "vehicle01"))
+    assert isinstance(taken, Refused)
+    assert [fault.code for fault in taken.faults] == ["conflict"]
+    assert repo.send(joining(first, "vehicle00")).outcome == "unchanged"
+    repo.send(joining(first, "vehicle00") | {"shutdown": True})
+    assert repo.send(joining(other, "vehicle01")).outcome == "booked"
+
+
+def test_versions_of_a_chart_differ_in_more_than_capitals() -> None:
+    with pytest.raises(ValidationError, match="the same version"):
+        Chart.model_validate(
+            {
+                "version": "1.0.0-rC",
+                "oci": "oci://registry.example/x",
+                "channels": {"next": {"version": "1.0.0-Rc", "oci": "oci://registry.example/x"}},
+            }
+        )
