@@ -52,11 +52,8 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
 def _of_another_demand(
     one: Demanded, request: Join, demand: str, ledger: Ledger
 ) -> Iterator[Fault]:
-    for claim in ledger.claims_of_demand(demand):
-        # some of the requesters may have left
-        if claim.request != request.id or not {*claim.requesters} <= {*one.requesters}:
-            owners = ", ".join(claim.requesters)
-            message = f"gives the demand id {demand}, which belongs to a demand of {owners} by "
-            message += f"request '{claim.request}'; use another id"
-            yield fault("id", message, code="conflict")
-            return
+    owners = {who for claim in ledger.claims_of_demand(demand) for who in claim.requesters}
+    if owners and owners.isdisjoint(one.requesters):
+        message = f"gives the demand id {demand}, which belongs to a demand of "
+        message += f"{', '.join(sorted(owners))}; use another id"
+        yield fault("id", message, code="conflict")

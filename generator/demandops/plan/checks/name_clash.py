@@ -105,12 +105,16 @@ def faults(
             if not others or not is_needed(after, key) or is_needed(before, key):
                 continue
             for other in (one for one in others if is_needed(after, one)):
+                subjects = {change.key.subject: change.key for change in changes.claims}
                 claim = next(
-                    change.after
-                    for change in changes.claims
-                    if change.after and key in keys_of_claims(after, [change.after])
+                    (
+                        subjects[subject]
+                        for subject in subjects
+                        if key in keys_of_claims(after, after.ledger.claims_on(subject))
+                    ),
+                    None,
                 )
-                yield _located(_message(key, name, other), request, claim.key)
+                yield _located(_message(key, name, other), request, claim)
                 break
 
 
@@ -159,9 +163,10 @@ def _message(key: ReleaseKey, name: Name, other: ReleaseKey) -> str:
 _REMEDY = "use another id, or wait until the other is released"
 
 
-def _located(message: str, request: DemandRequest, key: ClaimKey) -> Fault:
+def _located(message: str, request: DemandRequest, claim: ClaimKey | None) -> Fault:
     """Return a fault at the item of the request that needs a claim, or in the claim's file."""
     for one in request.demanded:
-        if one.held.subject == key.subject:
+        if claim and one.held.subject == claim.subject:
             return one.fault("id", message, code="conflict")
-    return fault("", message, code="conflict").within(claim_file.path_of(key))
+    found = fault("", message, code="conflict")
+    return found.within(claim_file.path_of(claim)) if claim else found
