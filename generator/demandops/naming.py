@@ -1,9 +1,11 @@
-"""Names of Kubernetes objects and of derived topics.
+"""Names of Kubernetes objects, files, branches and derived topics.
 
-A name depends only on the ids that it is made from. Two different ids never give the same object
-name: if an id must be shortened or changed to fit, a hash of the exact id is appended. Object names
-follow DNS-1123 and have at most 53 characters, Helm's limit for a release name. Topic names are
-made as the reference makes them, so the ids ``a/b`` and ``a-b`` both give ``a_b`` in a topic name.
+A name depends only on the ids that it is made from. If an id must be shortened or changed to fit, a
+hash of the exact id is appended. The hash is short, because people read names. So two ids have the
+same name only if somebody searched for them, and then the second is refused
+(:mod:`demandops.plan.checks.name_clash`). Object names follow DNS-1123 and have at most 53
+characters, Helm's limit for a release name. Topic names are made as the reference makes them, so
+the ids ``a/b`` and ``a-b`` both give ``a_b`` in a topic name.
 """
 
 from __future__ import annotations
@@ -21,11 +23,29 @@ _LOOKS_HASHED = re.compile(rf"(^|.*[-_])[0-9a-f]{{{_HASH}}}")
 _TOPIC_TOKEN = re.compile(r"(?=_*[A-Za-z0-9])[A-Za-z_][A-Za-z0-9_]*")
 _MAX_TOKEN = 120
 
+# tests set it lower, so that ids that nobody crafted have the same hash
+MOST_DIGITS = 64
+
+
+def hash_of(exact: str, digits: int) -> str:
+    """Return the first hexadecimal digits of the SHA-256 of a text."""
+    # only a trailer of a forged commit may have half a character
+    data = exact.encode(errors="surrogatepass")
+    return hashlib.sha256(data).hexdigest()[: min(digits, MOST_DIGITS)]
+
+
+def slug_with_hash(words: str, exact: str, digits: int) -> str:
+    """Return up to 40 characters of ``words``, safe in a path or branch, and a hash of ``exact``.
+
+    If ``words`` has no ASCII letter or digit, only the hash is returned.
+    """
+    slug = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:40].rstrip("-")
+    return f"{slug}-{hash_of(exact, digits)}" if slug else hash_of(exact, digits)
+
 
 def digest(*ids: str) -> str:
     """Return a hash of a list of ids; the lists ``a-b, c`` and ``a, b-c`` have different hashes."""
-    exact = json.dumps(ids, ensure_ascii=True)
-    return hashlib.sha256(exact.encode()).hexdigest()[:_HASH]
+    return hash_of(json.dumps(ids, ensure_ascii=True), _HASH)
 
 
 def object_name(prefix: str, *ids: str) -> str:

@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 import yaml
+from demandops import naming
+from demandops.cli.actions.suspend import name_of
 
 from tests.kit.cli import Ran, Run
 from tests.kit.dialogue import CTRL_C, Dialogue
@@ -168,6 +170,20 @@ class TestSuspend:
         assert demandops("resume", "--requester", "vehicle00", *where).code == 0
         carried_out(joined)
         assert joined.manifests() == files
+
+    def test_a_resume_ends_no_suspension_of_another_selection_with_the_same_name(
+        self, demandops: Run, joined: GitRepo, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(naming, "MOST_DIGITS", 1)
+        where, name = ("--state-repo", joined.path), name_of({"requesters": ("vehicle00",)})
+        patterns = ("vehicle00" + "*" * number for number in range(100))
+        rival = next(one for one in patterns if name_of({"nodes": (one,)}) == name)
+        assert demandops("suspend", "--requester", "vehicle00", "-m", "Sold", *where).code == 0
+        before = joined.tip
+        assert demandops("suspend", "--node", rival, "-m", "Sold", *where).code != 0
+        assert demandops("resume", "--node", rival, *where).code != 0
+        assert joined.tip == before
+        assert demandops("resume", "--requester", "vehicle00", *where).code == 0
 
     def test_a_lock_that_a_killed_program_left_is_told_with_the_remedy(
         self, demandops: Run, joined: GitRepo

@@ -73,13 +73,13 @@ class Chart(ChartSource):
 
     @model_validator(mode="after")
     def _distinct(self) -> Chart:
-        seen = {self.version: "the default"}
+        seen = {self.version.lower(): "the default"}
         for name, source in self.channels.items():
-            other = seen.setdefault(source.version, f"channel '{name}'")
+            other = seen.setdefault(source.version.lower(), f"channel '{name}'")
             if other != f"channel '{name}'":
                 raise ValueError(
                     f"channels.{name} and {other} have the same version, {source.version}; give "
-                    "each its own version, because a version names one chart"
+                    "each its own, because a version names one chart, in capitals or not"
                 )
         return self
 

@@ -41,6 +41,11 @@ class ClientKey:
     id: str
     side: Side | None = None
 
+    @property
+    def name(self) -> str:
+        """The name of the client's release."""
+        return naming.object_name(self.type.word, self.id, *filter(None, [self.side]))
+
 
 @dataclass(frozen=True, slots=True)
 class Client(ABC):
@@ -242,6 +247,10 @@ class ConnectionType(ABC):
         """Return the keys of the clients that a connection needs. By default, each end has one."""
         return ClientKey(self, connection, "source"), ClientKey(self, connection, "target")
 
+    def names(self, key: ClientKey) -> Iterator[tuple[str, str]]:
+        """Yield (what it names, name) for each name that only the client at ``key`` may have."""
+        yield "release", key.name
+
     @abstractmethod
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:
         """Return the client that ``key`` identifies, or ``None`` if the client carries no topic.
@@ -272,7 +281,7 @@ def make_end(
     node, domain = config.node_and_domain(own)
     return end(
         type=key.type,
-        name=naming.object_name(key.type.word, connection.id, str(key.side)),
+        name=key.name,
         node=node,
         domain=domain,
         connections=(connection.id,),

@@ -108,6 +108,12 @@ class Mqtt(ConnectionType):
         broker = choose_broker(connection, config)
         return [("brokers", broker.node)] if broker else []
 
+    def names(self, key: ClientKey) -> Iterator[tuple[str, str]]:
+        """Yield the names of :meth:`ConnectionType.names`, and the channel that both ends share."""
+        yield from ConnectionType.names(self, key)
+        if key.side == "source":
+            yield "MQTT channel", naming.object_name(self.word, key.id)
+
     def client(self, key: ClientKey, connections: Connections, config: Config) -> MqttEnd | None:
         """Return the end that ``key`` identifies; ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)

@@ -114,7 +114,7 @@ class Zenoh(ConnectionType):
         node, domain = config.node_and_domain(key.id)
         return Bridge(
             type=self,
-            name=naming.object_name(self.word, key.id),
+            name=key.name,
             node=node,
             domain=domain,
             connections=tuple(peers),

@@ -18,9 +18,9 @@ from demandops.ledger.claim_changes import Changes, ClaimChange, changes_on
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations import restoration
 from demandops.ledger.world import World
-from demandops.plan.checks import quota, topic_clash
+from demandops.plan.checks import name_clash, quota, topic_clash
 from demandops.plan.nodes import capacity
-from demandops.plan.release_keys import affected_keys
+from demandops.plan.release_keys import affected_keys, keys_of_claims
 from demandops.render.changes import changeset
 from demandops.render.changes.changeset import FileReader
 from demandops.subject import Subject
@@ -44,7 +44,8 @@ def changeset_of_edit(
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
     """Yield the faults of claims that a person wrote, each located in the claim's file.
 
-    A claim must be valid, permitted, within the quotas and capacities, and without a topic clash.
+    A claim must be valid, permitted, within the quotas and capacities, and without a clash of
+    topics or names.
     The permission and the quotas of a claim that is not valid are not checked. An edit that only
     takes requesters away is always allowed, because it has the effect of a release.
 
@@ -64,7 +65,9 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
         for each in malformed or allowed:
             yield each.within(claim_file.path_of(claim.key))
         yield from topic_clash.faults_of_claim(claim, before, after)
-        for each in _above_capacity(change, after):
+        keys, changed = keys_of_claims(after, [claim]), Changes((change,))
+        clashes = name_clash.faults(wanted, before, after, keys, changed, after.names())
+        for each in (*clashes, *_above_capacity(change, after)):
             yield each.within(claim_file.path_of(claim.key))
 
 

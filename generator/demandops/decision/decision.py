@@ -41,7 +41,7 @@ from demandops.ledger.operations.restoration import Restoration
 from demandops.ledger.waiting import Wait
 from demandops.plan import implied_connections
 from demandops.plan import scale_down as scale_downs
-from demandops.plan.checks import denial, quota, topic_clash, version_difference
+from demandops.plan.checks import denial, name_clash, quota, topic_clash, version_difference
 from demandops.plan.nodes import capacity, relocation
 from demandops.plan.overrides.claim_overrides import (
     with_kept_claims,
@@ -209,6 +209,8 @@ def _decided(
     on_stage("admitted")
     after, changes, keys = _booked(state, request, now)
     ledger = after.ledger
+    if taken := list(name_clash.faults_in_files(request, changes, read)):
+        raise Refused(taken)
     rendered = changeset.build_changeset(
         state, after, changes, keys, state.evaluate, read, state.plans
     )
@@ -254,7 +256,8 @@ def _booked(
     """Return the state with a request booked, the changes, and the releases that may change.
 
     Raises:
-        Refused: if existing claims, an override, a quota or a topic clash forbid the booking.
+        Refused: if existing claims, an override, a quota or a clash of topics or names forbid the
+            booking.
     """
     ledger, changes = _book(state, request, now)
     after = replace(state, ledger=ledger)
@@ -262,6 +265,7 @@ def _booked(
     ledger, kept = scale_downs.with_kept_replicas(state, after, keys, now)
     after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
     clashes = list(topic_clash.faults(request, state, after, keys))
+    clashes += name_clash.faults(request, state, after, keys, changes, state.names())
     for change in changes.claims if isinstance(request, Restoration) else ():
         clashes += topic_clash.faults_of_claim(change.after, state, after) if change.after else ()
     if clashes:

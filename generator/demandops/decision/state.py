@@ -13,10 +13,12 @@ from demandops.errors import Refused
 from demandops.ledger.claim_changes import ClaimChange
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
+from demandops.plan.checks import name_clash
+from demandops.plan.checks.name_clash import Names
 from demandops.plan.nodes import capacity
 from demandops.plan.nodes.capacity import Usage
 from demandops.plan.release import Release
-from demandops.plan.release_keys import ReleaseKey, all_keys
+from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, is_needed
 from demandops.render import trial_render
 from demandops.render.changes import changeset
 from demandops.templating.values import Evaluate
@@ -35,6 +37,7 @@ class State(World):
         default_factory=HashTrieMap, init=False, compare=False, repr=False
     )
     _usage: Usage | None = field(default=None, init=False, compare=False, repr=False)
+    _names: Names | None = field(default=None, init=False, compare=False, repr=False)
 
     def usage(self) -> Usage:
         """Return, for each node and resource, how much the services request.
@@ -45,6 +48,13 @@ class State(World):
             object.__setattr__(self, "_usage", capacity.whole_usage(self))
         assert self._usage is not None  # noqa: S101 - set above
         return self._usage
+
+    def names(self) -> Names:
+        """Return the names of all releases; only the first call looks at all releases."""
+        if self._names is None:
+            object.__setattr__(self, "_names", name_clash.all_names(self))
+        assert self._names is not None  # noqa: S101 - set above
+        return self._names
 
     def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
         """Return the state after a decision, with the releases that the decision planned.
@@ -57,19 +67,33 @@ class State(World):
         state = replace(self, ledger=ledger)
         object.__setattr__(state, "plans", known)
         object.__setattr__(state, "_usage", usage)
+        state._follow_names(self, rendered.plans)
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
         """Return the state with another ledger, whose claims differ by ``changes``.
 
-        If the usage of nodes is known, only the changed claims are counted again.
+        If the usage of nodes and the names are known, they are kept up to date with the changes.
         """
-        state = replace(self, ledger=ledger)
+        state, changes = replace(self, ledger=ledger), tuple(changes)
+        with suppress(Refused):  # if a definition is gone; then ``names`` looks at all releases
+            state._follow_names(self, dict.fromkeys(affected_keys(self, state, changes)))
         if self._usage is not None:
             with suppress(Refused):  # if a definition is gone; then ``usage`` counts all services
                 usage = self._usage.plus(capacity.growth_by(self, state, changes))
                 object.__setattr__(state, "_usage", usage)
         return state
+
+    def _follow_names(self, before: State, plans: Mapping[ReleaseKey, Release | None]) -> None:
+        """Take over the names of ``before``, from which only the releases of ``plans`` differ.
+
+        A release that is not planned, because an override denies it, needs its name all the same.
+        """
+        if before._names is None:
+            return
+        names = name_clash.without_keys(before._names, before, plans)
+        needed = (key for key, planned in plans.items() if planned or is_needed(self, key))
+        object.__setattr__(self, "_names", name_clash.with_keys(names, self, needed))
 
 
 def rendered_files(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 
+from demandops import naming
 from demandops.connections.connection import Connection
 from demandops.demand.application import Application
 from demandops.demand.lease import Lease
@@ -172,4 +172,4 @@ def demand_id(request: str, requesters: Iterable[str]) -> str:
     same demand id.
     """
     exact = json.dumps([request, sorted(set(requesters))], ensure_ascii=True)
-    return hashlib.sha256(exact.encode()).hexdigest()[:20]
+    return naming.hash_of(exact, 20)

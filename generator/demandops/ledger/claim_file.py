@@ -3,12 +3,12 @@
 The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. The subjects are
 spread over many folders ``hh``, because a Git tree with 100,000 entries adds 100 ms to each commit.
 ``subject`` and ``demand`` are slugs with a hash of the exact id. The file contains the exact ids,
-so a file that was moved to another path is noticed.
+so a file that was moved to another path is noticed. A demand is refused if the path of its claim is
+that of another claim's file (:mod:`demandops.plan.checks.name_clash`).
 """
 
 from __future__ import annotations
 
-import hashlib
 import re
 from collections.abc import Iterator
 from datetime import datetime, timezone
@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, BeforeValidator, Field
 
-from demandops import strict_yaml
+from demandops import naming, strict_yaml
 from demandops.config.base_model import FrozenModel, parse
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
@@ -40,11 +40,8 @@ _VERSION = re.compile(r"^demandops\.ledger/v([0-9]{1,9})$")
 
 
 def segment(exact: str) -> str:
-    """Return a path segment for an id: readable, safe on every file system, and unique."""
-    # only a trailer of a forged commit may have half a character
-    digest = hashlib.sha256(exact.encode(errors="surrogatepass")).hexdigest()[:16]
-    slug = re.sub(r"[^a-z0-9]+", "-", exact.lower()).strip("-")[:40].rstrip("-")
-    return f"{slug}-{digest}" if slug else digest
+    """Return a path segment for an id: readable, and safe on every file system."""
+    return naming.slug_with_hash(exact, exact, 16)
 
 
 def path_of(key: ClaimKey) -> str:
@@ -54,7 +51,7 @@ def path_of(key: ClaimKey) -> str:
 
 def folder_of(subject: Subject) -> str:
     """Return the folder of all claims on an application or a connection."""
-    fan = hashlib.sha256(subject.id.encode()).hexdigest()[:2]
+    fan = naming.hash_of(subject.id, 2)
     return f"{LEDGER_ROOT}/{subject.kind.value}/{fan}/{segment(subject.id)}"
 
 

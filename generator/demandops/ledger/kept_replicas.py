@@ -11,7 +11,6 @@ bytes again.
 
 from __future__ import annotations
 
-import hashlib
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -22,7 +21,7 @@ from typing import Literal, NamedTuple, TypeAlias
 from pydantic import Field
 from rpds import HashTrieMap, HashTrieSet
 
-from demandops import strict_yaml
+from demandops import naming, strict_yaml
 from demandops.config.base_model import FrozenModel, parse_file
 from demandops.errors import InvalidInput
 from demandops.ledger.claim_file import (
@@ -132,8 +131,7 @@ class KeptReplicas:
 def path_of(instance: Instance) -> str:
     """Return the path of a service instance's record."""
     exact = json.dumps(instance[1:], ensure_ascii=True)
-    fan = hashlib.sha256(exact.encode()).hexdigest()[:2]
-    return f"{REPLICAS_ROOT}/{fan}/{segment(exact)}.yaml"
+    return f"{REPLICAS_ROOT}/{naming.hash_of(exact, 2)}/{segment(exact)}.yaml"
 
 
 def text_of(instance: Instance, steps: Steps) -> str:

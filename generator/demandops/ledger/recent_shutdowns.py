@@ -13,7 +13,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timedelta, timezone
 from itertools import islice
 from typing import Literal, TypeAlias
@@ -88,11 +88,12 @@ class RecentShutdowns:
     def earlier(self, shutdown: RecentShutdown) -> RecentShutdown | None:
         """Return the record of the shutdown that ``shutdown`` repeats, or ``None``.
 
-        A shutdown repeats another one if both have the same digest and are at most 15 minutes
-        apart.
+        A shutdown repeats another one if both have the same digest, request id and requesters, and
+        are at most 15 minutes apart.
         """
         known = self.by_digest.get(shutdown.digest)
-        return known if known and abs(shutdown.at - known.at) <= REMEMBERED else None
+        same = known is not None and replace(known, at=shutdown.at) == shutdown
+        return known if known and same and abs(shutdown.at - known.at) <= REMEMBERED else None
 
     def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
         """Return all records, with the one at ``digest`` replaced; ``None`` removes the record."""

@@ -9,7 +9,6 @@ Each waiting demand is one file: ``ledger/waiting/<hh>/<demand>.yaml``.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from datetime import datetime
@@ -18,7 +17,7 @@ from typing import Any, Literal, TypeAlias
 from pydantic import Field
 from rpds import HashTrieMap
 
-from demandops import strict_yaml
+from demandops import naming, strict_yaml
 from demandops.config.base_model import FrozenModel, parse_file
 from demandops.demand import demand_goal
 from demandops.demand.demand_request import DemandRequest, Put
@@ -77,8 +76,7 @@ def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
 
 def path_of(demand: str) -> str:
     """Return the path of a waiting demand's file."""
-    fan = hashlib.sha256(demand.encode()).hexdigest()[:2]
-    return f"{WAITING_ROOT}/{fan}/{segment(demand)}.yaml"
+    return f"{WAITING_ROOT}/{naming.hash_of(demand, 2)}/{segment(demand)}.yaml"
 
 
 def text_of(waiting: WaitingDemand) -> str:

@@ -97,11 +97,16 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
     )
 
 
-def is_needed(world: World, key: ServiceKey) -> bool:
-    """Return whether a claim needs a service instance.
+def is_needed(world: World, key: ReleaseKey) -> bool:
+    """Return whether a claim needs a service instance or a client.
 
     Callers pass a world without suspended claims if these must not count.
     """
+    if isinstance(key, ClientKey):
+        if key.side is None:
+            return bool(world.ledger.connections_at(key.type, key.id))
+        connection = world.ledger.connection(key.id)
+        return connection is not None and connection.type is key.type
     if key.application is not None:
         return _service(world, key.application, key) is not None
     if key.scope in ("node", "cluster"):

@@ -13,8 +13,9 @@ from demandops.cli.actions.person_change import (
     selector,
     writable,
 )
-from demandops.cli.actions.suspend import described, name_of
+from demandops.cli.actions.suspend import described, name_of, selects
 from demandops.cli.name_completion import names_of
+from demandops.errors import InvalidInput
 
 
 @click.command()
@@ -37,5 +38,10 @@ def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) 
             "give either the options of `demandops suspend`, or the override's name"
         )
     summary = f"Resume {name or described(selected)}"
+    edit = Edit(name or name_of(selected), None, summary, options.reason)
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
-        end_override(repo, Edit(name or name_of(selected), None, summary, options.reason), options)
+        known = repo.last_valid_snapshot(repo.commit()).state.config.overrides.get(edit.name)
+        if known and not name and not selects(known, selected):
+            message = f"selects something else; to end it, run: demandops resume {edit.name}"
+            raise InvalidInput.at("select", message, file=edit.path)
+        end_override(repo, edit, options)

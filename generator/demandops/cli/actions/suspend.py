@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
-
 import click
 
+from demandops import naming
 from demandops.cli.actions.override import create_override, ends_at, new_override
 from demandops.cli.actions.person_change import (
     Edit,
@@ -16,17 +14,22 @@ from demandops.cli.actions.person_change import (
     selector,
     writable,
 )
-
-_LONGEST = 40
+from demandops.config.override import Override
 
 
 def name_of(selected: dict[str, tuple[str, ...]]) -> str:
     """Return the name of the override for a selection; equal selections get the same name."""
     chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
     words = "-".join(value for _, values in chosen for value in values)
-    slug = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:_LONGEST].rstrip("-")
-    digest = hashlib.sha256(repr(chosen).encode()).hexdigest()[:6]
-    return f"suspend-{slug}-{digest}" if slug else f"suspend-{digest}"
+    return "suspend-" + naming.slug_with_hash(words, repr(chosen), 6)
+
+
+def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
+    """Return whether an override has this selection, and no other one with the same name."""
+    known = [one.model_dump(exclude_none=True) for one in override.select]
+    return [{kind: {*values} for kind, values in one.items()} for one in known] == [
+        {kind: {*values} for kind, values in selector(selected).items()}
+    ]
 
 
 @click.command()

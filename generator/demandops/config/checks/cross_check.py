@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from demandops import strict_yaml
+from demandops import naming, strict_yaml
 from demandops.charts import chart_files
 from demandops.config.appdef import Deployed, ServiceDefinition
 from demandops.config.checks.override_conflicts import check_override_conflicts
@@ -52,8 +52,13 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
 
 def _check_inventory(config: Config, reader: ConfigReader) -> None:
     roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
+    folders: dict[str, str] = {}
     for node in config.nodes.values():
         file, place = reader.place_of(NODES_FILE, node.id)
+        other = folders.setdefault(folder := naming.object_name("", node.id), node.id)
+        if other != node.id:
+            message = f"'{other}' has the folder {folder} too; choose another id"
+            reader.add_fault(file, f"{place}.id", message)
         reader.check_reference(file, f"{place}.cluster", node.cluster, CLUSTERS_FILE)
         for peer in node.bridged:
             reader.check_reference(file, f"{place}.bridged.{peer}", peer, NODES_FILE)

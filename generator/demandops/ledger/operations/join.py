@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from datetime import datetime
 
 from demandops.demand.claim import ClaimKey, demand_id
-from demandops.demand.demand_request import Join
-from demandops.errors import Fault, Refused
+from demandops.demand.demand_request import Demanded, Join
+from demandops.errors import Fault, Refused, fault
 from demandops.ledger.claim_changes import Changes, claim_changes
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.booking import book
@@ -19,7 +20,8 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     """Return the ledger with the request's items added to what its demand holds, and the changes.
 
     Raises:
-        Refused: with every conflict with an existing claim, or between items of the request.
+        Refused: with every conflict with an existing claim, or between items of the request, or if
+            the demand's id, which is a digest, is that of another demand.
     """
     faults: list[Fault] = []
     start = ledger
@@ -32,6 +34,7 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
         faults += [*found, *(each for each in above if each.field not in known)]
         listed.add(one.held.subject)
         key = ClaimKey(one.held.subject, demand_id(request.id, one.requesters))
+        faults += _of_another_demand(one, request, key.demand, start)
         ledger = book(ledger, one, request.id, key, ledger.get(key), now, joined=True)
         keys.append(key)
     if faults:
@@ -44,3 +47,13 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     adds = not all(change.only_renews for change in changes)
     shutdowns, forgotten = start.shutdowns.forget(now, request.requesters() if adds else ())
     return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)
+
+
+def _of_another_demand(
+    one: Demanded, request: Join, demand: str, ledger: Ledger
+) -> Iterator[Fault]:
+    owners = {who for claim in ledger.claims_of_demand(demand) for who in claim.requesters}
+    if owners and owners.isdisjoint(one.requesters):
+        message = f"gives the demand id {demand}, which belongs to a demand of "
+        message += f"{', '.join(sorted(owners))}; use another id"
+        yield fault("id", message, code="conflict")

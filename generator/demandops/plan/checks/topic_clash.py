@@ -15,6 +15,7 @@ from demandops import naming
 from demandops.config.appdef import Service
 from demandops.config.config import NODES_FILE, Config
 from demandops.connections.connection import Connection
+from demandops.connections.connection_type import ClientKey
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Demanded, DemandRequest
@@ -93,7 +94,7 @@ def _clashes(
     message. A clash is, for example, ``connection 'a' already brings this topic to``.
     """
     for other in _publishers(world, key.node, topic, excluded=key):
-        clash = f"{_words(other)} already publishes this topic on"
+        clash = f"{words(other)} already publishes this topic on"
         yield clash, _remedy(key, other, service, output, world.config)
     for id in world.ledger.connections_bringing(key.node, topic):
         clash = f"connection '{id}' already brings this topic to"
@@ -118,7 +119,7 @@ def _of_connection(
             yield one.fault(
                 f"topics[{index}].{'source' if route.reverse else 'target'}",
                 f"connection '{connection.id}' brings {topic} to '{node}', where "
-                f"{_words(other)} already publishes this topic; use a connection that brings the "
+                f"{words(other)} already publishes this topic; use a connection that brings the "
                 "topic under another name",
                 code="conflict",
             )
@@ -246,7 +247,10 @@ def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
                 yield key
 
 
-def _words(key: ServiceKey) -> str:
+def words(key: ReleaseKey) -> str:
+    """Return what a release is, in words for a message."""
+    if isinstance(key, ClientKey):
+        return f"connection '{key.id}'" if key.side else f"the {key.type.name} client of '{key.id}'"
     if key.application is not None:
         return f"application '{key.application}'"
     if key.scope in ("node", "cluster"):

@@ -15,6 +15,7 @@ from demandops.errors import OverLimit, Refused, fault
 from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
 from demandops.ledger.claim_changes import Changes
 from demandops.ledger.world import World
+from demandops.plan.checks import name_clash
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
 from demandops.plan.release_keys import ReleaseKey
@@ -183,11 +184,13 @@ def render_all(
             of OverLimit.
 
     Raises:
-        Refused, InvalidInput: if a release cannot be planned or rendered.
+        Refused, InvalidInput: if a release cannot be planned or rendered, or if two need one name.
     """
     config = world.config
     files = manifests.base_files(config)
     late = set[str]()  # the templates that took too long for a release; no other waits for them
+    keys = tuple(keys)
+    name_clash.refuse_shared_names(world, keys)
     for key in keys:
         release = plan(world, key)
         if release is None:

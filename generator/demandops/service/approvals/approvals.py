@@ -274,6 +274,13 @@ class Approvals:
         objects, tip = self._repository.objects, str(snapshot.commit)
         on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
         head, added = heads.branches.get(proposal.branch, ""), set[ClaimKey]()
+        if head and not proposal.record.commits:  # a digest of two operation ids is the same
+            message = f"needs the branch {proposal.branch}, which belongs to another proposal; "
+            message += "send the demand again with another operation id"
+            refusal = Refused([fault("", message, code="conflict")])
+            self._demands.fail(proposal.tickets, refusal)
+            self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
+            return
         if proposal.record.pushed and head not in proposal.record.commits:
             added = ledger_files.added_by_people(objects, proposal.searched_to, snapshot.commit)
         proposal.searched_to = tip
@@ -404,7 +411,7 @@ class Approvals:
 
     def _delete_branch(self, proposal: Proposal, heads: BranchHeads) -> None:
         head = heads.branches.get(proposal.branch)
-        if head:
+        if head and proposal.record.commits:
             self._branches.remove(proposal.branch, head)
 
     # ---- the end ----

@@ -11,7 +11,7 @@ from pygit2 import Oid, Repository, Tree
 from demandops import naming
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import Lease
-from demandops.errors import Fault, InvalidInput
+from demandops.errors import Fault, InvalidInput, fault
 from demandops.ledger import claim_file
 from demandops.ledger.claim_changes import ClaimChange
 from demandops.ledger.ledger import Ledger
@@ -78,6 +78,20 @@ def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
     if claim_file.kind_of(path) is None:
         return None
     return next((one.key for one in ledger if claim_file.path_of(one.key) == path), None)
+
+
+def owner_faults(claim: Claim | None, path: str, ledger: Ledger) -> Iterator[Fault]:
+    """Yield a fault if the file at ``path`` belonged to another claim before, that of ``ledger``.
+
+    The generator books no such claim, but a person or an earlier version may replace the file.
+    """
+    owner = key_of(path, ledger) if claim and not ledger.get(claim.key) else None
+    if claim is not None and owner is not None:
+        message = (
+            f"the file belongs to {owner.subject} of demand '{owner.demand}', but has a claim on "
+            f"{claim.subject} of demand '{claim.demand}'; restore the file, and use other ids"
+        )
+        yield fault("", message, code="conflict").within(path)
 
 
 def last_valid_claims(

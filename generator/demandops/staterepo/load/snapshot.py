@@ -164,7 +164,12 @@ def advance(
     problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
     for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
         try:
-            claims[path] = ledger_files.claim_at(new, path)
+            claims[path] = claim = ledger_files.claim_at(new, path)
+            # the owner of a path is sought in the whole ledger, and only of a replaced file
+            if trees.entry(old, path) and (
+                faults := list(ledger_files.owner_faults(claim, path, state.ledger))
+            ):
+                raise InvalidInput(faults)
         except InvalidInput as error:
             problems += error.faults
             invalid.append(path)

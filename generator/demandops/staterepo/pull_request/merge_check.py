@@ -277,10 +277,13 @@ class _Edit:
         old = self.start.state if self.start else None
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
-            changes = changes_on(old.ledger, state.ledger, subjects)
-            yield from faults_of_edit(
-                old, state, [one for one in changes if claim_file.path_of(one.key) in self.files]
-            )
+            found = changes_on(old.ledger, state.ledger, subjects)
+            paths = {claim_file.path_of(one.key): one for one in found if one.after}
+            written = {path: one for path, one in paths.items() if path in self.files}
+            for path, change in written.items():
+                if path in self.before:
+                    yield from ledger_files.owner_faults(change.after, path, old.ledger)
+            yield from faults_of_edit(old, state, written.values())
 
     def rendered(self, state: State) -> dict[str, str]:
         """Return every generated file as path → text, or raise InvalidInput with all faults."""

@@ -8,7 +8,6 @@ link that GitLab prints.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -20,6 +19,7 @@ import git
 import pygit2
 from pygit2 import GitError, Oid, Repository
 
+from demandops import naming
 from demandops.errors import StateRepoError
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
@@ -34,7 +34,6 @@ PREFIX = "demand/"
 _HEADS = "refs/heads/"
 _NO_OPTIONS = re.compile(r"does not support push options")
 _LINK = re.compile(r"https?://\S+")
-_MAX_SLUG = 40
 
 
 class BranchMoved(StateRepoError):
@@ -45,14 +44,8 @@ class BranchMoved(StateRepoError):
 
 
 def branch_name(name: str, operation: str) -> str:
-    """Return the branch name for a demand: a slug of ``name``, and a digest of the operation id.
-
-    Because of the digest, no other accepted goal gets the same branch name. The slug is left out
-    if ``name`` has no ASCII letter or digit.
-    """
-    slug = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-")[:_MAX_SLUG].rstrip("-")
-    digest = hashlib.sha256(operation.encode()).hexdigest()[:12]
-    return f"{PREFIX}{slug}-{digest}" if slug else f"{PREFIX}{digest}"
+    """Return the branch name for a demand: a slug of ``name``, and a hash of the operation id."""
+    return PREFIX + naming.slug_with_hash(name, operation, 12)
 
 
 @dataclass(frozen=True, slots=True)

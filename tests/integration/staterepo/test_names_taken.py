@@ -1,0 +1,155 @@
+"""What belongs to one claim, release or proposal is not taken by another, whoever writes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from itertools import count
+from pathlib import Path
+
+import pytest
+import yaml
+from demandops import naming
+from demandops.cli.main import run
+from demandops.demand.claim import ClaimKey
+from demandops.errors import Refused
+from demandops.ledger import claim_file
+from demandops.service import Ticket
+from demandops.staterepo import reader
+from demandops.staterepo.load import problem_report
+from demandops.staterepo.pull_request import merge_check
+from demandops.staterepo.write.proposal_branch import branch_name
+from demandops.subject import Subject, SubjectKind
+
+from tests.kit import rig
+from tests.kit.generator import Proposed
+from tests.kit.goals import Goal, application, goal
+from tests.kit.repo import Person, branches, read
+
+LONG = "edge/fusion-of-the-long-corridor-in-the-north-"
+PAIR = f"{LONG}4123757", f"{LONG}28067786"
+"""Two ids that were searched for: their releases have one name, with all 48 bits of its digest."""
+
+
+def joining(id: str, node: str = "edge") -> Goal:
+    return goal([application(id, node=node, who=[id[-5:]])], id=f"request {id[-5:]}")
+
+
+@pytest.fixture
+def short_digests(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(naming, "MOST_DIGITS", 1)
+
+
+def rival(id: str, name_of: Callable[[str], str]) -> str:
+    """Return another id with the same name."""
+    others = (f"{id}/{'-' * number}" for number in count(1))
+    return next(other for other in others if name_of(other) == name_of(id))
+
+
+def claims(bare: Path) -> set[str]:
+    with reader.opened(str(bare)) as repo:
+        return {claim.subject.id for claim in repo.snapshot().state.ledger}
+
+
+def outcome(ticket: Ticket) -> str:
+    try:
+        return rig.receipt(ticket).outcome
+    except Refused as refused:
+        return refused.faults[0].code
+
+
+@pytest.mark.parametrize("node", ["edge", "cloud"])
+def test_the_second_of_two_crafted_ids_is_refused_until_the_first_is_released(
+    bare: Path,
+    data_home: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+    node: str,
+) -> None:
+    def request(made: Goal) -> int:
+        file = tmp_path / "demand.yaml"
+        file.write_text(yaml.safe_dump(made))
+        return run(["request", str(file), "--state-repo", str(bare)])
+
+    first, second = joining(PAIR[0]), joining(PAIR[1], node)
+    assert request(first) == 0
+    before = rig.tip(bare)
+    assert request(second) != 0
+    told = capfd.readouterr().err
+    assert all(id in told for id in PAIR)
+    assert (rig.tip(bare), claims(bare)) == (before, {PAIR[0]})
+    assert request(first | {"shutdown": True}) == 0
+    assert request(second) == 0
+    assert claims(bare) == {PAIR[1]}
+    rig.assert_sound(bare, verify_last=5)
+
+
+def test_of_two_generators_one_books(bare: Path, tmp_path: Path) -> None:
+    url = bare.as_uri()
+    with rig.running(url) as one, rig.running(url, data=tmp_path / "other") as other:
+        tickets = [one.submit(joining(PAIR[0])), other.submit(joining(PAIR[1], "cloud"))]
+        assert sorted(map(outcome, tickets)) == ["booked", "conflict"]
+    assert len(claims(bare)) == 1
+    rig.assert_sound(bare, verify_last=5)
+
+
+def test_a_claim_by_hand_whose_release_has_the_name_of_another_is_held_back(
+    bare: Path, person: Person
+) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, joining(PAIR[0]))
+        (path,) = rig.claims(bare)
+        data = yaml.safe_load(read(bare, path)) | {"application": PAIR[1], "node": "cloud"}
+        key = ClaimKey(Subject(SubjectKind.APPLICATION, PAIR[1]), data["demand"])
+        held_back = {claim_file.path_of(key): yaml.safe_dump(data)}
+        person.change(held_back)
+        rig.book(generator, joining("edge/other"))
+        assert claims(bare) == {PAIR[0], "edge/other"}
+        problems = yaml.safe_load(read(bare, problem_report.PATH))["problems"]
+        assert {problem["file"] for problem in problems} == {*held_back}
+    person.fetch()
+    faults = merge_check.check(person.folder).faults
+    assert "conflict" in {fault.code for fault in faults}
+
+
+@pytest.mark.usefixtures("short_digests")
+def test_a_claim_by_hand_in_the_file_of_another_is_held_back(bare: Path, person: Person) -> None:
+    def path_of(id: str) -> str:
+        return claim_file.folder_of(Subject(SubjectKind.APPLICATION, id))
+
+    first, other = "edge/a", rival("edge/a", path_of)
+    with rig.running(bare) as generator:
+        rig.book(generator, joining(first))
+        (path,) = rig.claims(bare)
+        text = yaml.safe_dump(yaml.safe_load(read(bare, path)) | {"application": other})
+        person.fetch()
+        (person.folder / path).write_text(text)
+        faults = merge_check.check(person.folder).faults
+        assert ("conflict", path) in {(fault.code, fault.file) for fault in faults}
+        person.change({path: text})
+        rig.book(generator, joining("edge/b"))
+        assert claims(bare) == {first, "edge/b"}
+        assert path in read(bare, problem_report.PATH)
+    with rig.running(bare) as generator:  # the same after a restart
+        rig.book(generator, joining("edge/c"))
+        assert claims(bare) == {first, "edge/b", "edge/c"}
+
+
+@pytest.mark.usefixtures("short_digests")
+def test_a_proposal_leaves_the_branch_of_another_alone(bare: Path, petra: Person) -> None:
+    operation = rival("op", lambda id: branch_name("d", id.replace("/", ".")))
+    with rig.running(bare) as generator:
+        first = Proposed(generator, goal([application("edge/a")], id="d"), "op")
+        branch, before = first.branch, rig.tip(bare)
+        commit = rig.git(bare, "rev-parse", branch)
+        second = Proposed(
+            generator, goal([application("edge/b")], id="D"), operation.replace("/", ".")
+        )
+        with pytest.raises(Refused) as refused:
+            rig.receipt(second.ticket)
+        assert refused.value.faults[0].code == "conflict"
+        assert branches(bare) == [branch]
+        assert rig.git(bare, "rev-parse", branch) == commit
+        assert rig.tip(bare) == before
+        petra.merge(branch, "--ff-only")
+        assert first.outcome() == "booked"
+    assert claims(bare) == {"edge/a"}

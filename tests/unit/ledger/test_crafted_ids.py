@@ -1,0 +1,286 @@
+"""Ids with the same digests: the second is refused, and nothing of the first is touched.
+
+The tests shorten digests to one digit, so that all kinds of names are the same by chance.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from functools import lru_cache
+from random import Random
+
+import pytest
+import yaml
+from demandops import naming
+from demandops.config.load import load
+from demandops.config.registry import Chart
+from demandops.connections import ros
+from demandops.decision import Decision, rendered_files
+from demandops.demand.claim import ClaimKey, demand_id
+from demandops.errors import InvalidInput, Refused
+from demandops.ledger import claim_file, kept_replicas, waiting
+from demandops.ledger.claim_changes import Changes
+from demandops.ledger.recent_shutdowns import RecentShutdown, RecentShutdowns
+from demandops.ledger.waiting import Wait, WaitingDemand
+from demandops.plan import output_topics
+from demandops.plan.checks import name_clash
+from demandops.plan.release import ServiceKey
+from demandops.subject import Subject, SubjectKind
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import ValidationError
+
+from tests.appdefs.test_scaling import books, demand
+from tests.kit.chance import chances, examples, told
+from tests.kit.config import configuration, skeleton
+from tests.kit.goals import CLOUD, Goal, application, connection, goal, put
+from tests.kit.memory import NOW, MemoryRepo, ledger_in
+from tests.kit.plain_yaml import FAST
+
+NODES = "inventory/nodes.yaml"
+
+
+@pytest.fixture
+def short_digests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    caches = (naming.topic_part, output_topics.published_topic, ros._number)
+    monkeypatch.setattr(naming, "MOST_DIGITS", 1)
+    for cached in caches:
+        cached.cache_clear()
+    yield
+    for cached in caches:
+        cached.cache_clear()
+
+
+alike = st.builds(
+    "{}{}{}".format,
+    st.sampled_from(["a", "A"]),
+    st.sampled_from(["/", "//", "-", "_/", "/-", "_", "/_", "-/"]),
+    st.sampled_from(["b", "B", "b/", "b_"]),
+)
+"""Ids with one slug; a name that is made from them differs in the digest only."""
+
+who = st.sampled_from(["vehicle00", "vehicle01"])
+nodes = st.sampled_from(["edge", "cloud"])
+clouds = st.lists(
+    st.sampled_from([CLOUD[0], "/a_b", "/a/b", "/a__b", "/A/b"]), min_size=1, max_size=2
+)
+# every item has another target topic, because a second source of a topic is refused too
+joins = st.builds(
+    lambda request, app, node, link, ends, who, topics, target: goal(
+        [application(app, node=node, who=[who], clouds=[(one, CLOUD[1]) for one in topics])],
+        [connection(link, who=[who], ends=ends, topics=["/x"], targets=[target])],
+        id=request,
+    ),
+    alike,
+    alike,
+    nodes,
+    alike,
+    st.sampled_from([("vehicle00", "edge"), ("vehicle01", "cloud")]),
+    who,
+    clouds,
+    st.integers(0, 99).map("/t{}".format),
+)
+links = st.builds(
+    lambda link, ends, target: goal([], [connection(link, ends=ends, targets=[target])], id=link),
+    alike,
+    st.sampled_from([("vehicle00", "edge"), ("vehicle01", "cloud")]),
+    st.integers(0, 99).map("/t{}".format),
+)
+puts = st.builds(
+    lambda demand, app, node, who, topics: {
+        "kind": "Demand",
+        "demand": demand,
+        "requesters": [who],
+        "applications": [
+            {
+                "id": app,
+                "type": "object-detection-fusion",
+                "node": node,
+                "connect": "none",
+                "inputs": {"point_cloud": [{"topic": one, "source": CLOUD[1]} for one in topics]},
+            }
+        ],
+    },
+    alike,
+    alike,
+    nodes,
+    who,
+    clouds,
+)
+
+
+def end_of(request: Goal) -> Goal:
+    if "demand" in request:
+        return request | {"operation": "release", "applications": []}
+    return request | {"shutdown": True}
+
+
+def assert_apart(repo: MemoryRepo) -> None:
+    """Check that each file is whole, and that each name belongs to one release."""
+    assert ledger_in(repo.files) == repo.state.ledger
+    again = rendered_files(repo.state)
+    assert {path: repo.files[path] for path in again} == again
+    assert repo.rendered().keys() == again.keys() - repo._initial.keys()
+    texts = repo.rendered().values()
+    documents = [one for text in texts for one in yaml.load_all(text, Loader=FAST)]
+    named = [(one["kind"], one["metadata"]["name"]) for one in documents]
+    assert len(set(named)) == len(named), "two objects of one domain have one name"
+    for pattern in (r"nodeName: (\S+)", r"node_name:=(\S+?)\"", r" id: (\S+)"):
+        names = [name for text in texts for name in re.findall(pattern, text)]
+        assert len(set(names)) == len(names), pattern
+    links = repo.state.ledger.subjects(SubjectKind.CONNECTION)
+    channels = {naming.object_name("mqtt", id) for id in links}
+    assert len(channels) == len(links), "two connections have one channel"
+
+
+@lru_cache(maxsize=1)
+def alone() -> MemoryRepo:
+    return MemoryRepo()
+
+
+@pytest.mark.usefixtures("short_digests")
+@given(st.lists(st.one_of(joins, links, puts), min_size=2, max_size=14), chances)
+@examples(60)
+def test_whatever_the_ids_each_has_its_own_names_and_files_or_is_refused(
+    requests: list[Goal], random: Random
+) -> None:
+    repo, refused, taken = alone().copy(), [], []
+    for request in told(requests):
+        result = repo.take(request)  # checks that a refused request changes nothing
+        if isinstance(result, Refused):
+            assert {fault.code for fault in result.faults} <= {"conflict", "not-yours"}
+            refused.append(request)
+        else:
+            taken.append(request)
+        if random.random() < 0.3:
+            repo.take(end_of(random.choice(requests)))
+        assert_apart(repo)
+    for request in taken:
+        repo.take(end_of(request))
+        repo.forget_shutdowns()
+        assert_apart(repo)
+    assert not repo.rendered()
+    for request in refused:
+        expected = alone().copy().take(request)
+        result = repo.take(request)
+        assert isinstance(result, Decision) is isinstance(expected, Decision)
+        if isinstance(result, Decision):
+            repo.take(end_of(request))
+            repo.forget_shutdowns()
+
+
+def rival(id: str, name_of: Callable[[str], str]) -> str:
+    """Return another id with the same name."""
+    others = (f"{id}/{'-' * number}" for number in range(1, 1000))
+    return next(other for other in others if name_of(other) == name_of(id))
+
+
+@pytest.mark.usefixtures("short_digests")
+def test_two_nodes_have_two_folders() -> None:
+    other = rival("Van", lambda id: naming.object_name("", id))
+    nodes = skeleton()[NODES] + "".join(
+        f"  - id: {id}\n    type: vehicle\n    cluster: c-its\n    selector: {{van: a}}\n"
+        for id in ("Van", other)
+    )
+    with pytest.raises(InvalidInput) as refused:
+        load(configuration({NODES: nodes}))
+    (fault,) = refused.value.faults
+    assert (fault.file, fault.field.split(".")[-1]) == (NODES, "id")
+    assert "'Van'" in fault.message
+
+
+@pytest.mark.usefixtures("short_digests")
+def test_two_waiting_demands_have_two_files() -> None:
+    first = "Van"
+    other = rival(first, waiting.path_of)
+    goals = [put(demand) for demand in (first, other)]
+    (one, two) = (WaitingDemand(goal["demand"], "", ("vehicle00",), NOW, 0, goal) for goal in goals)
+    path = waiting.path_of(first)
+    changes = Changes(waiting=(other,))
+    request = Wait(id="", demand=other, waiting=two)
+
+    def faults(text: str | None) -> list[str]:
+        found = name_clash.faults_in_files(request, changes, {path: text}.get)
+        return [fault.code for fault in found]
+
+    assert faults(None) == faults(waiting.text_of(two)) == []
+    assert faults(waiting.text_of(one)) == ["conflict"]
+
+
+def test_a_shutdown_repeats_only_one_by_the_same_requesters() -> None:
+    known = RecentShutdown("0" * 20, "leave", ("vehicle00",), NOW)
+    shutdowns = RecentShutdowns().replace(known.digest, known)
+    assert shutdowns.earlier(known) == known
+    assert shutdowns.earlier(replace(known, requesters=("vehicle01",))) is None
+    assert shutdowns.earlier(replace(known, request="other")) is None
+
+
+@pytest.mark.usefixtures("short_digests")
+def test_two_service_instances_keep_replicas_in_two_files() -> None:
+    repo = books("{max: 9, per: {topics: 1}, downAfter: 10m}")
+
+    def record(id: str) -> str:
+        return kept_replicas.path_of(ServiceKey("recorder", "edge", id).instance)
+
+    def recording(id: str) -> Goal:
+        item = demand()["applications"][0] | {"id": id}
+        return demand(id) | {"applications": [item]}
+
+    first = "rec/x"
+    other = next(
+        id
+        for id in (f"rec/{'-' * number}x" for number in range(1, 1000))
+        if record(id) == record(first)
+        and naming.object_name("rec", id) != naming.object_name("rec", first)
+        and claim_file.path_of(key_of(id)) != claim_file.path_of(key_of(first))
+    )
+    repo.send(recording(first))
+    taken = repo.take(recording(other))
+    assert isinstance(taken, Refused)
+    assert [fault.code for fault in taken.faults] == ["conflict"]
+    assert "replicas" in taken.faults[0].message
+
+
+def key_of(id: str) -> ClaimKey:
+    return ClaimKey(Subject(SubjectKind.APPLICATION, id), id)
+
+
+def test_no_two_releases_of_one_name_are_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+    repo = alone().copy()
+    for topic in ("/points/a", "/points_a"):
+        repo.send(goal([application("edge/a", clouds=[(topic, CLOUD[1])])], id=topic))
+    monkeypatch.setattr(naming, "MOST_DIGITS", 0)
+    with pytest.raises(Refused) as refused:
+        rendered_files(repo.state)
+    assert {fault.code for fault in refused.value.faults} == {"conflict"}
+
+
+@pytest.mark.usefixtures("short_digests")
+def test_two_demands_without_an_id_have_two_digests() -> None:
+    def joining(request: str, requester: str) -> Goal:
+        return goal([application(f"edge/{requester}", who=[requester])], id=request)
+
+    repo, first = alone().copy(), "visit"
+    known = demand_id(first, ["vehicle00"])
+    others = (f"visit-{number}" for number in range(1000))
+    other = next(one for one in others if demand_id(one, ["vehicle01"]) == known)
+    repo.send(joining(first, "vehicle00"))
+    taken = repo.take(joining(other, "vehicle01"))
+    assert isinstance(taken, Refused)
+    assert [fault.code for fault in taken.faults] == ["conflict"]
+    assert repo.send(joining(first, "vehicle00")).outcome == "unchanged"
+    repo.send(joining(first, "vehicle00") | {"shutdown": True})
+    assert repo.send(joining(other, "vehicle01")).outcome == "booked"
+
+
+def test_versions_of_a_chart_differ_in_more_than_capitals() -> None:
+    with pytest.raises(ValidationError, match="the same version"):
+        Chart.model_validate(
+            {
+                "version": "1.0.0-rC",
+                "oci": "oci://registry.example/x",
+                "channels": {"next": {"version": "1.0.0-Rc", "oci": "oci://registry.example/x"}},
+            }
+        )
