@@ -21,7 +21,6 @@ from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.repository import (
-    ENVIRONMENT,
     MAIN,
     TIMEOUT_S,
     DiskFull,
@@ -31,6 +30,7 @@ from demandops.staterepo.git.repository import (
     StateRepository,
     Unavailable,
     access_error,
+    git_environment,
     missing_main,
 )
 from demandops.staterepo.git.slow_git import SlowGit
@@ -384,7 +384,7 @@ class RemoteRepository(StateRepository):
     ) -> tuple[str, str]:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
-        with repo.git.custom_environment(**ENVIRONMENT):
+        with repo.git.custom_environment(**git_environment()):
             guard = repo.git.execute(  # keep the guard: its garbage collection ends the process
                 [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
                 as_process=True,
