@@ -398,7 +398,7 @@ class RemoteRepository(StateRepository):
         slow = SlowGit(f"{_DOING.get(command[0], 'asking')} {self.address}")
         began = REAL.monotonic()
         try:
-            out, err = _wait_for(process, urgent, timeout, slow)
+            out, err = _wait_for(process, urgent, timeout, slow, self.while_waiting)
         finally:
             self._process = None
             slow.ends()
@@ -420,11 +420,16 @@ class RemoteRepository(StateRepository):
 
 
 def _wait_for(
-    process: subprocess.Popen[bytes], urgent: Callable[[], bool], timeout: float, slow: SlowGit
+    process: subprocess.Popen[bytes],
+    urgent: Callable[[], bool],
+    timeout: float,
+    slow: SlowGit,
+    meanwhile: Callable[[], object],
 ) -> tuple[bytes, bytes]:
     """Return git's standard output and error output; end git after ``timeout`` seconds.
 
-    If ``urgent`` returns true before that, end git and raise FetchInterrupted.
+    Until then, call ``meanwhile`` again and again. If ``urgent`` returns true before that, end git
+    and raise FetchInterrupted.
     """
     start = REAL.monotonic()
     end = start + timeout
@@ -433,6 +438,7 @@ def _wait_for(
             return process.communicate(timeout=_POLL_S)
         except subprocess.TimeoutExpired:
             slow.lasts(REAL.monotonic() - start)
+            meanwhile()
             hurry = urgent()
             if not hurry and REAL.monotonic() < end:
                 continue

@@ -150,6 +150,8 @@ class StateRepository(ABC):
     """Signs the commits that this process makes. If None, the commits are not signed."""
     runtime: Runtime = REAL
     """The clock, randomness and threads of the code that writes to the state repo."""
+    while_waiting: Callable[[], object] = staticmethod(lambda: None)
+    """Called again and again while this waits for git."""
     always_current: bool
     """Whether :meth:`tip` needs no fetch, as in a repository on this disk."""
     _tidying: subprocess.Popen[bytes] | None = None
