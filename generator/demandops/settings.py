@@ -95,6 +95,12 @@ def forge_token_file() -> Path | None:
     return Path(named).expanduser() if named else None
 
 
+def alive_file() -> Path | None:
+    """Return the file that ``DEMANDOPS_ALIVE_FILE`` names, or None; a generator touches it."""
+    named = os.environ.get("DEMANDOPS_ALIVE_FILE")
+    return Path(named).expanduser() if named else None
+
+
 def data_home(state_repo: str) -> Path:
     """Return the folder of the generator's journal and clone for one state repo.
 

@@ -732,7 +732,8 @@ class TestStateRepo:
 
     def test_a_newer_generators_state_repo_is_refused(self, demandops: Run, state: Any) -> None:
         root = state.files()["demandops.yaml"].replace("renderVersion: 2", "renderVersion: 99")
-        state.commit({"demandops.yaml": root}, "Newer\n\nRender-Version: 99\n")
+        newer = ("DemandOps generator", "generator@demandops.invalid", 1_770_000_000)
+        state.commit({"demandops.yaml": root}, "Newer\n\nRender-Version: 99\n", newer)
         before = state.tip
         ran = demandops("request", "-", "--state-repo", state.path, stdin=text(perception()))
         assert (ran.code, state.tip) == (1, before)

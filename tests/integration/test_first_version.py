@@ -121,14 +121,3 @@ def test_demands_of_before_are_given_up_and_restored_after_the_upgrade(
 
 def claims(state: GitRepo) -> list[Any]:
     return [file for file in ledger(state).values() if file["kind"].endswith("Claim")]
-
-
-def test_a_folder_that_only_a_newer_version_writes_stops_demands(run: Run, state: GitRepo) -> None:
-    folder = "ledger/placements"
-    assert run("upgrade").code == 0
-    tip = state.commit({f"{folder}/aa/some.yaml": "kind: Unknown\n"})
-    ran = run("request", EXPERIMENT / "6-vehicle01-leaves.yaml")
-    assert ran.err == (
-        f"error: {folder}: only a newer generator writes this folder; update the generator\n"
-    )
-    assert state.tip == tip

@@ -10,8 +10,7 @@ import shutil
 import stat
 import subprocess
 import sys
-import textwrap
-from collections.abc import Iterator
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -22,16 +21,23 @@ from click.testing import CliRunner
 from demandops.cli.repo.pull_request_comment import MARK
 
 from tests.kit.config import skeleton
-from tests.kit.http import Answer, Call, serving
 from tests.kit.repo import git
 
 GITHUB, GITLAB = ".github/workflows/demandops.yml", ".gitlab-ci.yml"
+COMMENT = ".github/workflows/demandops-comment.yml"
+IMAGES = Path(__file__).parents[2] / "templates" / "scaffold" / "image"
 BASH = shutil.which("bash") or "bash"
 
 
 @pytest.fixture(scope="module")
 def github() -> dict[str, Any]:
     data: dict[str, Any] = yaml.safe_load(skeleton()[GITHUB])
+    return data
+
+
+@pytest.fixture(scope="module")
+def comment() -> dict[str, Any]:
+    data: dict[str, Any] = yaml.safe_load(skeleton()[COMMENT])
     return data
 
 
@@ -45,25 +51,71 @@ def gitlab() -> dict[str, Any]:
     ("path", "options"),
     [
         (GITHUB, ["--builtin-schema", "vendor.github-workflows"]),
+        (COMMENT, ["--builtin-schema", "vendor.github-workflows"]),
         (GITLAB, ["--builtin-schema", "vendor.gitlab-ci", "--data-transform", "gitlab-ci"]),
     ],
-    ids=["github", "gitlab"],
+    ids=["github", "github-comment", "gitlab"],
 )
 def test_a_pipeline_is_valid_by_its_schema(checkout: Path, path: str, options: list[str]) -> None:
     ran = CliRunner().invoke(check_jsonschema.main, [*options, str(checkout / path)])
     assert ran.exit_code == 0, ran.output
 
 
-def test_who_may_write_runs_nothing_of_the_pull_request(github: dict[str, Any]) -> None:
-    assert github["permissions"] == {}
-    check, comment = github["jobs"]["check"], github["jobs"]["comment"]
-    assert check["permissions"] == {"contents": "read"}
-    assert comment["permissions"] == {"pull-requests": "write"}
-    uses = [step.get("uses", "") for step in comment["steps"]]
-    assert not [one for one in uses if one.startswith("actions/checkout")]
-    checkout = check["steps"][0]["with"]
+def test_what_pipelines_run_is_named_by_its_digest() -> None:
+    """Also in the pipelines of `demandops new image`. A tag may be moved; a digest may not."""
+    texts = [skeleton()[path] for path in (GITHUB, COMMENT, GITLAB)]
+    texts += [path.read_text() for path in IMAGES.glob("*.yml")]
+    lines = [line for text in texts for line in text.splitlines()]
+    uses = [line for line in lines if re.search(r"\buses:", line)]
+    images = [line for line in lines if re.search(r"\b(image|name): [\w./-]+[:@]", line)]
+    assert len(uses) == 11
+    assert len(images) == 4
+    action = re.compile(r" uses: [\w-]+/[\w-]+@[0-9a-f]{40}  # v\d+\.\d+\.\d+$")
+    assert not [line for line in uses if not action.search(line)]
+    image = re.compile(r": \w+:[\d.]+-[a-z]+@sha256:[0-9a-f]{64}$")
+    assert not [line for line in images if not image.search(line)]
+    assert not [line for line in lines if "latest" in line]
+
+
+def test_no_token_is_where_a_branch_may_change_the_pipeline(
+    github: dict[str, Any], comment: dict[str, Any], gitlab: dict[str, Any]
+) -> None:
+    # a branch may change these two for its own pull request
+    assert github["permissions"] == {"contents": "read"}
+    assert not [job for job in github["jobs"].values() if "permissions" in job]
+    assert "secrets" not in json.dumps(github)
+    assert "github.token" not in json.dumps(github)
+    assert "TOKEN" not in json.dumps(gitlab)
+    # GitHub runs this one as main has it
+    assert comment[True] == {"workflow_run": {"workflows": ["demandops"], "types": ["completed"]}}
+    assert comment["permissions"] == {}
+    (job,) = comment["jobs"].values()
+    assert job["permissions"] == {"actions": "read", "pull-requests": "write"}
+    assert "head_repository.full_name == github.repository" in job["if"]
+    # it runs no action and nothing of the pull request
+    assert not [step for step in job["steps"] if "uses" in step]
+
+
+def test_the_token_for_the_state_repo_is_only_where_a_protected_tag_runs() -> None:
+    workflow = yaml.safe_load(
+        re.sub("@[A-Z_]+@", "x", (IMAGES / "github-workflow.yml").read_text())
+    )
+    with_token = [job for job in workflow["jobs"].values() if "secrets." in json.dumps(job)]
+    assert [job.get("environment") for job in with_token] == ["state-repo"]
+    propose = yaml.safe_load((IMAGES / "gitlab-ci.yml").read_text().replace("@", "x"))["propose"]
+    assert [rule["if"] for rule in propose["rules"]] == [
+        '$CI_COMMIT_TAG && $CI_COMMIT_REF_PROTECTED == "true"'
+    ]
+
+
+def test_no_text_of_a_pull_request_reaches_a_shell(
+    github: dict[str, Any], comment: dict[str, Any]
+) -> None:
+    checkout = github["jobs"]["check"]["steps"][0]["with"]
     assert (checkout["persist-credentials"], checkout["fetch-depth"]) == (False, 0)
-    scripts = [step["run"] for job in (check, comment) for step in job["steps"] if "run" in step]
+    jobs = [*github["jobs"].values(), *comment["jobs"].values()]
+    scripts = [step["run"] for job in jobs for step in job["steps"] if "run" in step]
+    assert len(scripts) == 4
     # no script contains names from a pull request, like a branch or a title, as text
     assert not [script for script in scripts if "${{" in script]
     for script in scripts:
@@ -99,9 +151,8 @@ def installing(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, dic
     if request.param == "github":
         (script,) = [one["run"] for one in pipeline["jobs"]["check"]["steps"] if "pip" in str(one)]
     else:
-        lines = pipeline["demandops"]["script"]
-        until = next(number for number, line in enumerate(lines) if line.startswith("archive="))
-        script = "\n".join(lines[:until]).replace("/tmp/demandops", '"$RUNNER_TEMP/demandops"')
+        (script,) = [line for line in pipeline["demandops"]["script"] if "pip" in line]
+        script = script.replace("/tmp/demandops", "$RUNNER_TEMP/demandops")
     pip, python = tmp_path / "demandops" / "bin" / "pip", tmp_path / "path" / "python"
     for program, text in ((pip, 'echo "pip $*"'), (python, 'echo "python $1 $2"')):
         program.parent.mkdir(parents=True)
@@ -122,7 +173,12 @@ def test_a_pipeline_installs_what_the_variable_names(
         text=True,
         check=True,
     )
-    assert done.stdout == f"python -m venv\npip install --quiet {package}\n"
+    constraints = f"{environ['RUNNER_TEMP']}/demandops/share/demandops/constraints.txt"
+    assert done.stdout.splitlines() == [
+        "python -m venv",
+        f"pip install --quiet --no-deps {package}",
+        f"pip install --quiet --constraint {constraints} demandops",
+    ]
 
 
 def test_a_pipeline_that_knows_no_package_says_which_variable_to_set(
@@ -195,23 +251,29 @@ def test_gitlab_checks_and_reports(
 
 
 @pytest.mark.parametrize("sound", [True, False], ids=["sound", "altered"])
-def test_gitlab_brings_helm_as_its_digest_says(
-    tmp_path: Path, gitlab: dict[str, Any], sound: bool
+@pytest.mark.parametrize("forge", ["github", "gitlab"])
+def test_helm_is_brought_as_its_digest_says(
+    request: pytest.FixtureRequest, tmp_path: Path, forge: str, sound: bool
 ) -> None:
-    (script,) = [line for line in gitlab["demandops"]["script"] if line.startswith("archive=")]
-    names = {"amd64": "x86_64", "arm64": "aarch64"}
-    archive = f"helm-v4.2.4-linux-{next(k for k, v in names.items() if v == os.uname().machine)}"
-    tree = tmp_path / "linux" / "helm"
-    tree.parent.mkdir()
-    tree.write_text("a program")
-    packed = tmp_path / f"{archive}.tar.gz"
+    pipeline = request.getfixturevalue(forge)
+    if forge == "github":
+        scripts = [step.get("run", "") for step in pipeline["jobs"]["check"]["steps"]]
+    else:
+        scripts = pipeline["demandops"]["script"]
+    (script,) = [each for each in scripts if "curl" in each]
+    name = re.findall(rf"{os.uname().machine}\) name=(\S+)", script)[0]
+    program = tmp_path / "linux" / "helm"
+    program.parent.mkdir()
+    program.write_text("a program")
+    packed = tmp_path / name
     subprocess.run(["tar", "-czf", str(packed), "-C", str(tmp_path), "linux/helm"], check=True)
     digest = hashlib.sha256(packed.read_bytes() + b"!" * (not sound)).hexdigest()
-    (tmp_path / f"{packed.name}.sha256sum").write_text(f"{digest}  {packed.name}\n")
-    source = {"HELM_VERSION": "v4.2.4", "HELM_SOURCE": tmp_path.as_uri()}
+    assert len(re.findall(r"digest=[0-9a-f]{64} ", script)) == 2
+    script = re.sub("digest=[0-9a-f]+", f"digest={digest}", script)
+    more = {"RUNNER_TEMP": str(tmp_path / "brought"), "HELM_SOURCE": tmp_path.as_uri()}
     done = subprocess.run(
-        [BASH, "-e", "-c", script.replace("/tmp/demandops", str(tmp_path / "brought"))],
-        env=environment(tmp_path, CI_PROJECT_DIR=str(tmp_path), **source),
+        [BASH, "-e", "-c", script.replace("/tmp/helm", str(tmp_path / "brought" / "helm"))],
+        env=environment(tmp_path, CI_PROJECT_DIR=str(tmp_path), **more),
         capture_output=True,
         check=False,
     )
@@ -219,68 +281,131 @@ def test_gitlab_brings_helm_as_its_digest_says(
     assert (tmp_path / "brought" / "helm" / "helm").exists() == sound
 
 
-class Notes:
-    """A stand-in for GitLab's API: the caller's own id, and the notes of one merge request."""
+GH = """
+import json, subprocess, sys
+from pathlib import Path
+here, (_, path, *options) = Path(sys.argv[0]).parent, [a for a in sys.argv[1:] if a != "--paginate"]
+if path.endswith("/zip"):
+    sys.stdout.buffer.write((here / "artifact.zip").read_bytes())
+elif options[0] == "--jq":
+    name = "artifacts.json" if "artifacts" in path else "comments.json"
+    subprocess.run(["jq", "-r", options[1], str(here / name)], check=True)
+else:
+    with (here / "written").open("a") as written:
+        print(path, *options, file=written)
+"""
+EVENT = {
+    "repository": {"id": 1},
+    "workflow_run": {
+        "head_sha": "newest",
+        "pull_requests": [
+            {"number": 1, "head": {"sha": "newest"}, "base": {"ref": "other", "repo": {"id": 1}}},
+            {"number": 2, "head": {"sha": "newest"}, "base": {"ref": "main", "repo": {"id": 2}}},
+            {"number": 3, "head": {"sha": "newest"}, "base": {"ref": "main", "repo": {"id": 1}}},
+        ],
+    },
+}
+ROBOT, PERSON = {"type": "Bot"}, {"type": "User"}
 
-    def __init__(self) -> None:
-        self.url = ""
-        self.notes: list[dict[str, Any]] = [
-            {"id": number, "body": f"{MARK}\nby somebody else", "author": {"id": 1}}
-            for number in range(120)
-        ]
 
-    def answer(self, call: Call) -> Answer:
-        assert call.headers["PRIVATE-TOKEN"] == "token"
-        if call.method == "POST":
-            self.notes.append({"id": 500, "body": call.json()["body"], "author": {"id": 7}})
-            return Answer.json(self.notes[-1])
-        if call.method == "PUT":
-            (note,) = [one for one in self.notes if call.path.endswith(f"/notes/{one['id']}")]
-            note["body"] = call.json()["body"]
-            return Answer.json(note)
-        if call.path == "/api/user":
-            return Answer.json({"id": 7})
-        assert call.path.startswith("/api/projects/5/merge_requests/3/notes?per_page=100&page=")
-        page = int(call.path.rsplit("=", 1)[1])
-        more = len(self.notes) > 100 * page
-        found = Answer.json(self.notes[100 * (page - 1) : 100 * page])
-        found.headers["X-Next-Page"] = str(page + 1) if more else ""
-        return found
+class Commenting:
+    """The script of the job that comments, with a stand-in for GitHub's program `gh`."""
+
+    def __init__(self, folder: Path, script: str) -> None:
+        self._folder, self._script = folder, script
+        (folder / "gh").write_text(f"#!{sys.executable}\n{GH}")
+        (folder / "gh").chmod(0o755)
+        self.size = 1000
+        self.event: dict[str, Any] = EVENT
+        self.comments: list[dict[str, Any]] = []
+
+    def run(self, entries: dict[str | zipfile.ZipInfo, str]) -> tuple[int, str]:
+        """Run it with an artifact of these files; return the exit code and what it wrote."""
+        with zipfile.ZipFile(self._folder / "artifact.zip", "w") as packed:
+            for name, text in entries.items():
+                packed.writestr(name, text)
+        artifacts = [{"id": 5, "size_in_bytes": self.size}]
+        for name, data in (
+            ("event.json", self.event),
+            ("artifacts.json", {"artifacts": artifacts}),
+            ("comments.json", self.comments),
+        ):
+            (self._folder / name).write_text(json.dumps(data))
+        more = {
+            "PATH": f"{self._folder}:{os.environ['PATH']}",
+            "GITHUB_EVENT_PATH": str(self._folder / "event.json"),
+            "REPO": "its/fleet",
+            "RUN": "7",
+        }
+        work = self._folder / "work"
+        work.mkdir()
+        done = subprocess.run(
+            [BASH, "-e", "-c", self._script],
+            cwd=work,
+            env=environment(self._folder, **more),
+            check=False,
+        )
+        written = self._folder / "written"
+        assert {path.name for path in work.iterdir()} <= {"report.md", "report.zip"}
+        return done.returncode, written.read_text() if written.exists() else ""
 
 
 @pytest.fixture
-def notes() -> Iterator[Notes]:
-    made = Notes()
-    with serving(made.answer) as server:
-        made.url = server.url
-        yield made
+def commenting(tmp_path: Path, comment: dict[str, Any]) -> Commenting:
+    return Commenting(tmp_path, comment["jobs"]["comment"]["steps"][0]["run"])
 
 
-def test_gitlabs_note_is_written_once_and_then_changed(
-    tmp_path: Path, gitlab: dict[str, Any], notes: Notes
+REPORT = f"{MARK}\n## DemandOps: valid\n"
+
+
+def test_the_report_becomes_a_comment_of_the_pull_request(commenting: Commenting) -> None:
+    commenting.comments = [{"id": 1, "user": PERSON, "body": REPORT}]
+    assert commenting.run({"report.md": REPORT}) == (
+        0,
+        "--silent repos/its/fleet/issues/3/comments -F body=@report.md\n",
+    )
+
+
+def test_an_earlier_comment_is_changed(commenting: Commenting) -> None:
+    commenting.comments = [
+        {"id": 1, "user": PERSON, "body": REPORT},
+        {"id": 2, "user": ROBOT, "body": "something else"},
+        {"id": 3, "user": ROBOT, "body": REPORT},
+    ]
+    code, written = commenting.run({"report.md": REPORT})
+    assert (code, "PATCH repos/its/fleet/issues/comments/3 " in written) == (0, True)
+
+
+def test_a_report_of_older_commits_is_not_shown(commenting: Commenting) -> None:
+    commenting.event = {**EVENT, "workflow_run": EVENT["workflow_run"] | {"head_sha": "older"}}
+    assert commenting.run({"report.md": REPORT}) == (0, "")
+
+
+def _link() -> zipfile.ZipInfo:
+    link = zipfile.ZipInfo("report.md")
+    link.external_attr = (stat.S_IFLNK | 0o777) << 16
+    return link
+
+
+@pytest.mark.parametrize(
+    "entries",
+    [
+        {"report.md": "something else"},
+        {"report.md": REPORT + 300_000 * "x"},
+        {"../report.md": REPORT},
+        {"/report.md": REPORT},
+        {"a/report.md": REPORT},
+        {_link(): "/etc/passwd"},
+        {},
+    ],
+    ids=["other text", "long", "above", "absolute", "in a folder", "link", "empty"],
+)
+def test_an_artifact_that_is_no_report_is_refused(
+    commenting: Commenting, entries: dict[str | zipfile.ZipInfo, str]
 ) -> None:
-    script = textwrap.dedent("\n".join(gitlab["demandops-note"]["script"]))
-    script = script.replace("python note.py", f"{sys.executable} note.py")
-    more = {
-        "CI_API_V4_URL": f"{notes.url}/api",
-        "CI_PROJECT_ID": "5",
-        "CI_MERGE_REQUEST_IID": "3",
-        "DEMANDOPS_NOTE_TOKEN": "token",
-    }
-    for text in ("first", "second"):
-        (tmp_path / "report.md").write_text(f"{MARK}\n{text} →\n")
-        subprocess.run(
-            [BASH, "-e", "-c", script], cwd=tmp_path, env=environment(tmp_path, **more), check=True
-        )
-        mine = [one["body"] for one in notes.notes if one["author"]["id"] == 7]
-        assert mine == [f"{MARK}\n{text} →\n"]
-    assert {one["body"] for one in notes.notes if one["author"]["id"] == 1} == {
-        f"{MARK}\nby somebody else"
-    }
+    assert commenting.run(entries) == (1, "")
 
 
-def test_the_token_is_only_where_nothing_of_the_merge_request_runs(gitlab: dict[str, Any]) -> None:
-    assert "TOKEN" not in json.dumps(gitlab["demandops"])
-    note = gitlab["demandops-note"]
-    assert note["variables"] == {"GIT_STRATEGY": "none"}
-    assert "DEMANDOPS_NOTE_TOKEN" in note["rules"][0]["if"]
+def test_a_large_artifact_is_not_downloaded(commenting: Commenting) -> None:
+    commenting.size = 10**9
+    assert commenting.run({"report.md": REPORT}) == (0, "")

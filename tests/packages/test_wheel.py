@@ -59,6 +59,14 @@ def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
     assert not [name for name in names if name.startswith(("tests/", "examples/", "docs/"))]
 
 
+def test_the_wheel_installs_the_versions_that_it_was_tested_with(wheel: Path) -> None:
+    """The pipelines of a state repo give pip this file (tests/integration/test_pipelines.py)."""
+    packed = zipfile.ZipFile(wheel)
+    (name,) = [name for name in packed.namelist() if name.endswith("constraints.txt")]
+    assert name.partition(".data/")[2] == "data/share/demandops/constraints.txt"
+    assert packed.read(name) == (ROOT / "constraints.txt").read_bytes()
+
+
 def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_path: Path) -> None:
     """PyPI has neither `ros2 run` nor `ros2 launch`, so the test only looks up what they need."""
     packages = pytest.importorskip("ament_index_python.packages")

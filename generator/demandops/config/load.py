@@ -87,7 +87,8 @@ def load(files: Mapping[str, str]) -> Config:
             ROOT_FILE,
             "renderVersion",
             f"is {repository.render_version}, but this generator renders version "
-            f"{RENDER_VERSION}; update the generator",
+            f"{RENDER_VERSION}; write {RENDER_VERSION}, or update the generator if `demandops "
+            "upgrade` of a newer one wrote this",
         )
     if repository and getattr(repository, repository.gitops) is None:
         reader.add_fault(

@@ -32,9 +32,6 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 LEDGER_ROOT = "ledger"
 
-RESERVED_FOLDERS = (f"{LEDGER_ROOT}/placements",)
-"""Folders that only later generator versions write; the files record the node of each service."""
-
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of what demandops.demand.claim.demand_id returns
 _VERSION = re.compile(r"^demandops\.ledger/v([0-9]{1,9})$")
 

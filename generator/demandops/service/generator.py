@@ -17,6 +17,7 @@ from demandops.service.approvals.approvals import Approvals
 from demandops.service.demand_lifecycle import Demands
 from demandops.service.remote_status import RemoteStatus
 from demandops.service.ticket import Listener, Ticket
+from demandops.service.timing.heartbeat import Heartbeat
 from demandops.service.worker import Worker
 from demandops.staterepo.git.open_repository import connect
 from demandops.staterepo.git.repository import access_error
@@ -76,6 +77,7 @@ class Generator:
             StateRepoError, InvalidInput: if the state repo, the key or the journal cannot be used.
             Unsound: if a disk failed.
         """
+        heartbeat = Heartbeat(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
         try:
             self._slot = Slot(data or settings.data_home(state_repo))
@@ -108,6 +110,7 @@ class Generator:
             Approvals(repository, snapshot.state, self._demands, with_targets, token_file),
             with_targets,
             fetch_interval,
+            heartbeat,
         )
         self._finished: Future[bool] | None = None
         self._stop_lock = runtime.lock()

@@ -33,6 +33,7 @@ from demandops.service.timing.backoff import (
     Backoff,
 )
 from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
+from demandops.service.timing.heartbeat import Heartbeat
 from demandops.service.timing.own_work import OwnWork
 from demandops.service.timing.polling import PollTimer
 from demandops.service.timing.rest import Rest
@@ -70,12 +71,14 @@ class Worker:
         approvals: Approvals,
         with_targets: bool,
         fetch_interval: float,
+        heartbeat: Heartbeat,
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
         self.remote = RemoteMonitor(repository.address, repository.runtime)
         self._repository, self._demands, self._approvals = repository, demands, approvals
         self._runtime = repository.runtime
+        self._heartbeat = repository.while_waiting = heartbeat
         self._evaluator = Evaluator(repository, demands, approvals, with_targets)
         self._timer = PollTimer(fetch_interval, repository.runtime, local=repository.always_current)
         self._lease_expiry = LeaseExpiry(repository.runtime)
@@ -114,6 +117,7 @@ class Worker:
             if self._demands.proposed:
                 self._work()
             while self._demands.wait(self._seconds_until_due()):
+                self._heartbeat()
                 self._work()
         self._approvals.suspend()
 
@@ -205,6 +209,7 @@ class Worker:
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
         while batch or self._ended_leases(self.snapshot):
+            self._heartbeat()
             self._require_not_ending()
             try:
                 wait = self._attempt(batch, backoff)
@@ -294,6 +299,7 @@ class Worker:
         Returns:
             The demand with its result.
         """
+        self._heartbeat()
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         self._own_work.follow(commits, before)

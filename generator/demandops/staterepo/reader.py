@@ -99,7 +99,7 @@ class Reader:
 
     def refuse_other_render_version(self) -> None:
         """Raise StateRepoError if the repo has another render version than this program."""
-        last_valid_config.refuse_other_render_version(self._tree())
+        last_valid_config.refuse_other_render_version(self._objects, self._tip)
 
     def commit(self, revision: str | None = None) -> str:
         """Return the id of the commit that a revision or a time names; by default the newest.

@@ -17,11 +17,12 @@ import pytest
 import yaml
 from demandops.errors import InvalidInput
 from demandops.service import Generator
-from demandops.settings import GENERATED_ROOTS
+from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
 from demandops.staterepo.history import authorship
 from demandops.staterepo.load import snapshot, state_in_effect
 
 from tests.kit import rig
+from tests.kit.cli import Run
 from tests.kit.config import override
 from tests.kit.repo import FORGER
 from tests.kit.repo import read as text
@@ -455,3 +456,70 @@ def test_after_people_squash_the_history_a_start_needs_valid_files_and_no_more(
         rig.book(generator, goal(4))
         assert tag(bare) == "v2"
     rig.assert_sound(bare, verify_last=2)
+
+
+ROOT = "demandops.yaml"
+MISTAKES: dict[str, Callable[[str], str | None]] = {
+    **{
+        f"renderVersion: {shown}": lambda root, value=value: root.replace(  # type: ignore[misc]
+            f"renderVersion: {RENDER_VERSION}", f"renderVersion: {value}"
+        )
+        for shown, value in {
+            "-1": "-1",
+            "0": "0",
+            "lower": str(RENDER_VERSION - 1),
+            "higher": str(RENDER_VERSION + 1),
+            "63 bits": str(2**63 - 1),
+            "5000 digits": "9" * 5000,
+            "true": "true",
+            "text": f'"{RENDER_VERSION}"',
+            "nothing": "",
+        }.items()
+    },
+    "gitops: unknown": lambda root: root.replace("gitops: flux", "gitops: helm"),
+    "another schema": lambda root: root.replace("demandops/v1", "demandops/v99"),
+    "empty": lambda root: "",
+    "no text": lambda root: "\0",
+    "deleted": lambda root: None,
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_no_mistake_in_the_settings_stops_demands(
+    bare: Path, person: Person, tmp_path: Path, demandops: Run, mistake: str
+) -> None:
+    """What was in effect stays so, for a running generator and for one that starts."""
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        person.change({ROOT: MISTAKES[mistake](person.read(ROOT))})
+        rig.book(generator, goal(2))
+        assert any(each.file == ROOT for each in generator.snapshot.problems)
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(3))
+        assert any(each.file == ROOT for each in generator.snapshot.problems)
+    person.fetch()
+    checked = demandops("check", person.folder, "--output", "json")
+    assert checked.code == 1
+    assert ROOT in checked.out
+
+
+def test_no_file_in_the_ledger_stops_demands(bare: Path, person: Person, demandops: Run) -> None:
+    """A claim of a schema that no program wrote, and folders that DemandOps does not have."""
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        path = rig.claims(bare)[0]
+        newer = text(bare, path).replace("demandops.ledger/v2", "demandops.ledger/v99")
+        edit = dict.fromkeys(
+            ("ledger/placements/aa/some.yaml", "ledger/new/some.yaml"), "kind: Unknown\n"
+        )
+        edit[path] = newer
+        person.fetch()
+        for place, content in edit.items():
+            (person.folder / place).parent.mkdir(parents=True, exist_ok=True)
+            (person.folder / place).write_text(content)
+        checked = demandops("check", person.folder, "--output", "json")
+        assert checked.code == 1
+        assert {each["file"] for each in checked.json()["faults"]} == {*edit}
+        person.change(edit)
+        rig.book(generator, goal(2))
+        assert generator.snapshot.quarantined_files == (path,)

@@ -15,12 +15,12 @@ from demandops.errors import StateRepoError, Unsound
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.new_objects import NewObjects, sync_folder
 from demandops.staterepo.git.repository import (
-    ENVIRONMENT,
     MAIN,
     PushDenied,
     StateRepository,
     Unavailable,
     disk_error,
+    git_environment,
     missing_main,
     unopened,
 )
@@ -66,7 +66,7 @@ class LocalRepository(StateRepository):
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
             cwd=self.objects.path,
-            env=os.environ | ENVIRONMENT,
+            env=os.environ | git_environment(),
             capture_output=True,
             text=True,
             errors="replace",

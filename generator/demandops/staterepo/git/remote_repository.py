@@ -21,7 +21,6 @@ from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.repository import (
-    ENVIRONMENT,
     MAIN,
     TIMEOUT_S,
     DiskFull,
@@ -31,6 +30,7 @@ from demandops.staterepo.git.repository import (
     StateRepository,
     Unavailable,
     access_error,
+    git_environment,
     missing_main,
 )
 from demandops.staterepo.git.slow_git import SlowGit
@@ -384,7 +384,7 @@ class RemoteRepository(StateRepository):
     ) -> tuple[str, str]:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
-        with repo.git.custom_environment(**ENVIRONMENT):
+        with repo.git.custom_environment(**git_environment()):
             guard = repo.git.execute(  # keep the guard: its garbage collection ends the process
                 [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
                 as_process=True,
@@ -398,7 +398,7 @@ class RemoteRepository(StateRepository):
         slow = SlowGit(f"{_DOING.get(command[0], 'asking')} {self.address}")
         began = REAL.monotonic()
         try:
-            out, err = _wait_for(process, urgent, timeout, slow)
+            out, err = _wait_for(process, urgent, timeout, slow, self.while_waiting)
         finally:
             self._process = None
             slow.ends()
@@ -420,11 +420,16 @@ class RemoteRepository(StateRepository):
 
 
 def _wait_for(
-    process: subprocess.Popen[bytes], urgent: Callable[[], bool], timeout: float, slow: SlowGit
+    process: subprocess.Popen[bytes],
+    urgent: Callable[[], bool],
+    timeout: float,
+    slow: SlowGit,
+    meanwhile: Callable[[], object],
 ) -> tuple[bytes, bytes]:
     """Return git's standard output and error output; end git after ``timeout`` seconds.
 
-    If ``urgent`` returns true before that, end git and raise FetchInterrupted.
+    Until then, call ``meanwhile`` again and again. If ``urgent`` returns true before that, end git
+    and raise FetchInterrupted.
     """
     start = REAL.monotonic()
     end = start + timeout
@@ -433,6 +438,7 @@ def _wait_for(
             return process.communicate(timeout=_POLL_S)
         except subprocess.TimeoutExpired:
             slow.lasts(REAL.monotonic() - start)
+            meanwhile()
             hurry = urgent()
             if not hurry and REAL.monotonic() < end:
                 continue

@@ -19,6 +19,7 @@ from pygit2 import Oid, Repository, Tree
 from demandops.errors import StateRepoError, Unsound
 from demandops.runtime import REAL, Runtime
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.git import child_processes
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.new_objects import NewObjects
 from demandops.staterepo.git.signing import Signer
@@ -26,13 +27,18 @@ from demandops.staterepo.git.signing import Signer
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
 _REPACK = ("repack", "--geometric=2", "-d", "-l", "--quiet")
-ENVIRONMENT = {
+_ENVIRONMENT = {
     "GIT_TERMINAL_PROMPT": "0",
     "LC_ALL": "C",
     # git ends an HTTP transfer with less than 1 byte a second for 60 seconds
     "GIT_HTTP_LOW_SPEED_LIMIT": "1",
     "GIT_HTTP_LOW_SPEED_TIME": "60",
 }
+
+
+def git_environment() -> dict[str, str]:
+    """Return the environment variables that git gets in addition to those of this process."""
+    return _ENVIRONMENT | child_processes.mark()
 
 
 class Unavailable(StateRepoError):
@@ -144,6 +150,8 @@ class StateRepository(ABC):
     """Signs the commits that this process makes. If None, the commits are not signed."""
     runtime: Runtime = REAL
     """The clock, randomness and threads of the code that writes to the state repo."""
+    while_waiting: Callable[[], object] = staticmethod(lambda: None)
+    """Called again and again while this waits for git."""
     always_current: bool
     """Whether :meth:`tip` needs no fetch, as in a repository on this disk."""
     _tidying: subprocess.Popen[bytes] | None = None
@@ -254,7 +262,7 @@ class StateRepository(ABC):
         self._tidying = subprocess.Popen(
             ["git", *_REPACK],
             cwd=self.objects.path,
-            env=os.environ | ENVIRONMENT,
+            env=os.environ | git_environment(),
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             start_new_session=True,  # so that Ctrl-C does not end it

@@ -16,6 +16,7 @@ from pygit2 import Oid, Signature
 from pygit2.enums import ObjectType
 
 from demandops.errors import StateRepoError
+from demandops.staterepo.git import child_processes
 from demandops.staterepo.git.new_objects import NewObjects
 
 _TIMEOUT_S = 20
@@ -46,7 +47,7 @@ class Signer:
     def sign(self, data: bytes) -> str:
         """Return the armored signature of ``data``, or raise SigningFailed."""
         command = ["ssh-keygen", "-Y", "sign", "-n", "git", "-f", str(self.key)]
-        environment = dict(os.environ) | {"SSH_ASKPASS_REQUIRE": "never", "LC_ALL": "C"}
+        environment = os.environ | {"SSH_ASKPASS_REQUIRE": "never", "LC_ALL": "C"}
         try:
             done = subprocess.run(
                 command,
@@ -54,7 +55,7 @@ class Signer:
                 capture_output=True,
                 timeout=_TIMEOUT_S,
                 check=False,
-                env=environment,
+                env=environment | child_processes.mark(),
                 start_new_session=True,  # no terminal, so that ssh-keygen asks for no passphrase
             )
         except FileNotFoundError:

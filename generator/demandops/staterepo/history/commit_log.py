@@ -131,6 +131,23 @@ def commits(
     return ((commit, entry_of(commit)) for commit in walker)
 
 
+def was_rendered_with(repo: Repository, tip: Oid, version: int) -> bool:
+    """Return whether a program of this render version committed at or before ``tip``.
+
+    If no program committed anything, return true, because nothing contradicts the version.
+    """
+    is_other = False
+    for commit in repo.walk(tip):
+        # whole messages are parsed only where they matter: the history may be long
+        if b"\nRender-Version: " not in commit.raw_message:
+            continue
+        entry = entry_of(commit)
+        if entry.first("Render-Version") == str(version) and is_by_generator(repo, commit):
+            return True
+        is_other = is_other or entry.by_generator
+    return not is_other
+
+
 def person_commits(
     repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[Commit]:

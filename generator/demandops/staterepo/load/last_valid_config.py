@@ -23,7 +23,6 @@ from demandops.config.load import load as load_config
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.errors import Fault, InvalidInput, StateRepoError
 from demandops.ledger import ended_override_file
-from demandops.ledger.claim_file import RESERVED_FOLDERS
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import commit_log
@@ -91,23 +90,22 @@ def ended_overrides_at(tree: Tree) -> dict[str, str]:
     return ended_override_file.read(end_markers_at(tree))
 
 
-def refuse_other_render_version(tree: Tree) -> None:
-    """Raise StateRepoError if the state repo needs a generator of another render version.
+def refuse_other_render_version(repo: Repository, commit: Oid) -> None:
+    """Raise StateRepoError if a program of another render version serves the state repo.
 
-    Generators of two render versions would undo each other's changes. If ``demandops.yaml`` states
-    no version that can be read, raise nothing.
+    Generators of two render versions would undo each other's changes. A version that no program
+    ever wrote here is a person's mistake, and :func:`load_last_valid_config` holds it back like any
+    other file that is not valid. So raise nothing then, or one merge would stop all demands.
     """
-    for folder in RESERVED_FOLDERS:
-        if trees.entry_id(tree, folder) is not None:
-            raise StateRepoError(
-                f"{folder}: only a newer generator writes this folder; update the generator"
-            )
     try:
-        data = strict_yaml.load(trees.read_text(tree, ROOT_FILE) or "")
+        text = trees.read_text(trees.commit_of(repo, commit).tree, ROOT_FILE)
+        data = strict_yaml.load(text or "")
     except InvalidInput:
         return
     version = data.get("renderVersion") if isinstance(data, dict) else None
-    if not isinstance(version, int) or version == RENDER_VERSION:
+    if type(version) is not int or version == RENDER_VERSION:
+        return
+    if not commit_log.was_rendered_with(repo, commit, version):
         return
     remedy = "update the generator"
     if version < RENDER_VERSION:

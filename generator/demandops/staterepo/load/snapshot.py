@@ -279,7 +279,10 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
     """
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
-    config = load_config(files)
+    config, in_force = load_config(files), state.config.repo_settings.render_version
+    if config.repo_settings.render_version < in_force:
+        message = f"is lower than {in_force}, which `demandops upgrade` wrote; write {in_force}"
+        raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
     if config != state.config:
         # what takes too long is a fault for `check`, and of each demand that needs it; whether a
         # configuration is valid must not depend on the machine
@@ -304,7 +307,7 @@ class ReadAhead:
 
         Raises StateRepoError if ``tip`` has another render version.
         """
-        last_valid_config.refuse_other_render_version(trees.commit_of(repo, tip).tree)
+        last_valid_config.refuse_other_render_version(repo, tip)
         known = self._known
         if known is None or self._start != before.commit:
             known = Advance(before, (), False)

@@ -70,7 +70,7 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
     the state repo needs a generator of another render version.
     """
     objects, tip = repository.objects, repository.tip()
-    last_valid_config.refuse_other_render_version(trees.commit_of(objects, tip).tree)
+    last_valid_config.refuse_other_render_version(objects, tip)
     return start_at(objects, tip, progress)
 
 

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from demandops.errors import Fault, fault
 from demandops.quoting import quoted
+from demandops.staterepo.git import child_processes
 
 HELM_BIN = "HELM_BIN"
 """The environment variable that names the program, instead of ``helm`` on ``PATH``."""
@@ -78,6 +79,7 @@ class Helm:
             "HOME": str(self.home),
             "KUBECONFIG": os.devnull,
             "HELM_PLUGINS": str(self.home / "plugins"),
+            **child_processes.mark(),
         }
         try:
             done = subprocess.run(
