@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
 
 import pygit2
@@ -9,6 +10,7 @@ from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
 from pygit2.enums import FileMode, ObjectType
 
 from demandops.errors import StateRepoError
+from demandops.quoting import quoted
 from demandops.staterepo.git.new_objects import Entries, NewObjects
 
 # Sync the files that libgit2 writes, so that a commit is on the disk before anybody learns of it.
@@ -17,27 +19,29 @@ pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
 
+_ID = re.compile("[0-9a-f]{40}")
 MAX_DEPTH = 64
 """How many folders deep a file may be; deeper folders are not read."""
 
 
-def commit_of(repo: Repository, revision: str | Oid) -> Commit:
-    """Return the commit that ``revision`` names, or raise StateRepoError."""
+def commit_of(repo: Repository, commit: str | Oid) -> Commit:
+    """Return the commit with a whole id, or raise StateRepoError.
+
+    An id as text may come from a trailer or the journal, so it may be any text. What people write
+    is read by :func:`demandops.staterepo.history.revisions.resolve`.
+    """
     try:
-        found = repo[revision] if isinstance(revision, Oid) else repo.revparse_single(revision)
-        return found.peel(Commit)
-    except (KeyError, ValueError, pygit2.GitError) as error:
-        if isinstance(revision, Oid) and isinstance(error, pygit2.InvalidError):
-            raise StateRepoError(
-                f"commit {error}; set the branch back to the commit before it"
-            ) from None
-        if isinstance(revision, Oid):  # a branch or a commit named it, not a person
-            raise StateRepoError(
-                f"the commit {revision} cannot be read; check the disk of the state repo and of "
-                "its clone, then try again"
-            ) from None
+        if isinstance(commit, str) and not _ID.fullmatch(commit):
+            raise StateRepoError(f"{quoted(commit)} is no commit's id of 40 hexadecimal digits")
+        return repo[commit].peel(Commit)
+    except pygit2.InvalidError as error:
         raise StateRepoError(
-            f"'{revision}' is not a commit of the state repo; `demandops log` lists the commits"
+            f"commit {error}; set the branch back to the commit before it"
+        ) from None
+    except (KeyError, ValueError, pygit2.GitError):
+        raise StateRepoError(
+            f"the commit {commit} cannot be read; check the disk of the state repo and of its "
+            "clone, then try again"
         ) from None
 
 
