@@ -85,7 +85,7 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     is_plain = text.isprintable() and len(text.encode(errors="replace")) <= _LONGEST
     match = _REVISION.fullmatch(text) if is_plain else None
     try:
-        found = _found(repo, tip, *match.groups(), now) if match is not None else None
+        found = _found(repo, tip, match[1], match[2], now) if match is not None else None
     except (KeyError, ValueError, pygit2.GitError) as error:
         raise StateRepoError(
             f"{quoted(text)} names no commit that can be read: {error.args[0]}; name another "
