@@ -141,9 +141,10 @@ class Site:
     def _render(self, view: View, request: Request) -> Response:
         try:
             version = self._follower.version  # before the data, so that no later change is missed
-            asked = ViewRequest(self._follower, request)
-            template, data = view(asked)
-            return self._page(asked, template, {**data, "version": version})
+            with self._follower.reading():
+                asked = ViewRequest(self._follower, request)
+                template, data = view(asked)
+                return self._page(asked, template, {**data, "version": version})
         except DemandOpsError as error:
             return self._message(request, "Nothing to show", str(error), 404)
         except Exception:  # the visitor must learn where to look

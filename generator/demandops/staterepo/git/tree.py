@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 
 import pygit2
 from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
-from pygit2.enums import FileMode, ObjectType
+from pygit2.enums import FileMode, ObjectType, SortMode
 
 from demandops.errors import StateRepoError
 from demandops.quoting import quoted
@@ -20,6 +21,7 @@ pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectTyp
 
 
 _ID = re.compile("[0-9a-f]{40}")
+_MOST_SEARCHED = 10_000
 MAX_DEPTH = 64
 """How many folders deep a file may be; deeper folders are not read."""
 
@@ -43,6 +45,38 @@ def commit_of(repo: Repository, commit: str | Oid) -> Commit:
             f"the commit {commit} cannot be read; check the disk of the state repo and of its "
             "clone, then try again"
         ) from None
+
+
+def place_of(repo: Repository, wanted: Oid) -> str | None:
+    """Return which file or folder of which commit has an object, or None if none is found.
+
+    The object itself may be missing. The newest commits are searched.
+    """
+    seen = set[Oid]()
+
+    def path_in(tree: Tree, prefix: str) -> str | None:
+        seen.add(tree.id)
+        for found in tree:
+            path = prefix + _printable(found.raw_name or b"")
+            if found.id == wanted:
+                return path
+            if isinstance(found, Tree) and found.id not in seen and path.count("/") < MAX_DEPTH:
+                inner = path_in(found, f"{path}/")
+                if inner is not None:
+                    return inner
+        return None
+
+    try:
+        walker = repo.walk(None, SortMode.TIME)
+        for name in repo.references:
+            walker.push(repo.references[name].peel(Commit).id)
+        for commit in islice(walker, _MOST_SEARCHED):
+            path = "the top folder" if commit.tree_id == wanted else path_in(commit.tree, "")
+            if path is not None:
+                return f"{path} of commit {str(commit.id)[:10]}"
+    except (KeyError, ValueError, pygit2.GitError):  # more is damaged
+        pass
+    return None
 
 
 def parent_tree(commit: Commit) -> Tree | None:

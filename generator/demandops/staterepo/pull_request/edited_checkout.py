@@ -21,7 +21,7 @@ from demandops.render.changes import merge_preview
 from demandops.runtime import REAL
 from demandops.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.repository import unopened
+from demandops.staterepo.git.repository import reading, unopened
 from demandops.staterepo.history import revisions
 from demandops.staterepo.load import state_in_effect
 
@@ -125,6 +125,11 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         )
     if repo.is_empty or repo.head_is_unborn:
         return None
+    with reading(str(folder), repo):
+        return _base_in(repo, revision)
+
+
+def _base_in(repo: Repository, revision: str | None) -> Base:
     target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
     tip = _tip_of(repo, target) if target else None
     commit = _started_from(repo, target, tip)
