@@ -38,9 +38,9 @@ FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 SOURCE_END = "mqtt-vehicle01-edge-source-092a70a6cc97"
 TARGET_END = "mqtt-vehicle01-edge-target-f918b3fb6980"
 NO_REVISION = (
-    "error: 'nope' is neither a commit of the state repo nor a time; `demandops log` lists the "
-    "commits; write a time like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h "
-    "(two hours ago)\n"
+    "error: 'nope' is neither a commit of the state repo nor a time; write a branch, a tag or 4 to "
+    "40 digits of an id, with ~N for the Nth commit before it, or a time like 2026-01-31T14:03, "
+    "2026-01-31, 14:03 (all UTC) or 2h (two hours ago); `demandops log` lists the commits\n"
 )
 REQUEST_KEYS = ["index", "request", "outcome", "commit", "faults", "warnings", "not_held", "placed"]
 NO_CARRIER = (

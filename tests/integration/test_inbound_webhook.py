@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from demandops.errors import InvalidInput
-from demandops.service import push_webhook
+from demandops.service import http_server
 from demandops.service.push_webhook import PushWebhook
 
 SECRET = b"s3cret-of-the-hook"
@@ -46,7 +46,7 @@ def signed(heard: Heard) -> Iterator[PushWebhook]:
 
 @pytest.fixture
 def impatient(heard: Heard, monkeypatch: pytest.MonkeyPatch) -> Iterator[PushWebhook]:
-    monkeypatch.setattr(push_webhook, "_TIMEOUT_S", 1.0)  # set before any connection
+    monkeypatch.setattr(http_server, "_STUCK_S", 0.5)  # set before any connection
     hook = PushWebhook("127.0.0.1:0", SECRET, heard)
     yield hook
     hook.close()
@@ -188,7 +188,7 @@ def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
     slow = [_connected(impatient) for _ in range(40)]
     for number, raw in enumerate(slow):
         with suppress(ConnectionError):  # the hook may have closed it already
-            raw.sendall(b"POST /push HTTP/1.1\r\nHost: x\r\n\r\n"[: number + 1])
+            raw.sendall(b"POST /push HTTP/1.1\r\nHost: x\r\n\r\n"[: number % 30 + 1])
     for raw in slow:
         assert _is_cut_off(raw)
         raw.close()
@@ -196,12 +196,28 @@ def test_who_sends_slowly_is_cut_off_and_keeps_nobody_out(
     assert heard.times == 1
 
 
-def test_there_are_only_so_many_connections(signed: PushWebhook) -> None:
-    held = [_connected(signed) for _ in range(16)]
-    with _connected(signed) as one_more:
-        assert _is_cut_off(one_more)
+def test_however_many_connections_wait_health_and_pushes_are_answered(
+    signed: PushWebhook, heard: Heard
+) -> None:
+    """The oldest connection gives way, so those who hold connections open cannot fill the hook."""
+    head = b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 9\r\n\r\n"
+    held = [_connected(signed) for _ in range(100)]
+    for number, raw in enumerate(held):
+        with suppress(ConnectionError):  # the hook may have closed it already
+            raw.sendall(head[: number + 1] if number % 2 else head)
+    assert send(signed, method="GET", path="/", body=None) == (200, "ok")
+    assert send(signed, GENUINE["gitea"])[0] == 202
+    assert all(_is_cut_off(raw) for raw in held[:84])
     for raw in held:
         raw.close()
+
+
+def test_who_sends_a_body_in_tiny_chunks_is_cut_off(signed: PushWebhook) -> None:
+    """The parser takes as long for a chunk of one byte as for one of many thousand."""
+    with _connected(signed) as raw, suppress(ConnectionError):
+        raw.sendall(b"POST /push HTTP/1.1\r\nHost: x\r\nTransfer-Encoding: chunked\r\n\r\n")
+        raw.sendall(b"1\r\nx\r\n" * 100_000 + b"0\r\n\r\n")
+        assert raw.recv(100) == b""
 
 
 def test_a_close_waits_for_no_slow_sender(heard: Heard) -> None:

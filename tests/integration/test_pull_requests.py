@@ -474,10 +474,19 @@ def test_a_checkout_that_git_cannot_open_is_not_taken_for_files_without_git(
         assert errors.rstrip().endswith(remedy)
 
 
+@pytest.mark.parametrize(
+    "base", ["nowhere", ":/", "HEAD^{/(.*)*}", "origin/main@{1}", "-x", "\udcff"]
+)
+def test_a_base_of_another_kind_is_refused(branch: Path, check: Run, base: str) -> None:
+    code, out, errors = check("--base", base)
+    assert (code, out) == (1, "")
+    assert "is neither a commit of the state repo nor a time" in errors
+
+
 def test_a_base_that_is_none_is_told(branch: Path, check: Run) -> None:
     code, out, errors = check("--base", "nowhere")
     assert (code, out) == (1, "")
-    assert errors.startswith("error: 'nowhere' is not a commit")
+    assert errors.startswith("error: 'nowhere' is neither a commit")
     git(branch, "checkout", "--quiet", "--orphan", "alone")
     commit(branch)
     assert check()[2] == (

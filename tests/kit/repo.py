@@ -317,7 +317,8 @@ def branches(repo: Path) -> list[str]:
 
 
 def books(repo: Path, revision: str = "main") -> dict[str, Any]:
-    state = snapshots.load(pygit2.Repository(str(repo)), revision).state
+    opened = pygit2.Repository(str(repo))
+    state = snapshots.load(opened, opened.revparse_single(revision).id).state
     return as_data(bookkeeping(state), "")
 
 

@@ -112,7 +112,8 @@ class Oracle:
 
     def claims(self, revision: str = MAIN) -> dict[str, Claim]:
         """Return the claims of a commit, by the paths of their files."""
-        tree = trees.commit_of(self.world.remote, revision).tree
+        commit = self.world.remote.revparse_single(revision).id
+        tree = trees.commit_of(self.world.remote, commit).tree
         found = {}
         for path, blob in trees.blobs(tree, ["ledger"]):
             if claim_file.kind_of(path):

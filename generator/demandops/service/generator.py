@@ -20,7 +20,7 @@ from demandops.service.ticket import Listener, Ticket
 from demandops.service.timing.heartbeat import Heartbeat
 from demandops.service.worker import Worker
 from demandops.staterepo.git.open_repository import connect
-from demandops.staterepo.git.repository import access_error
+from demandops.staterepo.git.repository import access_error, reading
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.history import revisions
 from demandops.staterepo.load import state_in_effect
@@ -137,9 +137,9 @@ class Generator:
         """
         objects = self._repository.reopened()
         tip, now = self.snapshot.commit, self._runtime.now()
-        return state_in_effect.snapshot_at(
-            objects, revisions.resolve(objects, tip, revision, now).id
-        )
+        with reading(self.address, objects):
+            commit = revisions.resolve(objects, tip, revision, now)
+            return state_in_effect.snapshot_at(objects, commit.id)
 
     @property
     def remote_status(self) -> RemoteStatus:

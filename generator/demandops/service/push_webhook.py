@@ -1,35 +1,29 @@
 """The inbound webhook: a Git server reports a push, and the generator fetches at once.
 
-Notifications are untrusted: their signature is checked, and their content is not read. Anyone who
-reaches the address may connect. So the server limits the number of open connections, and cuts off
-each connection after some seconds, however slow its sender is.
+Notifications are untrusted: their signature is checked, and their content is not read.
 """
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import hmac
 import logging
 from collections.abc import Callable
 
-import uvicorn
 from starlette.applications import Starlette
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import PlainTextResponse
 from starlette.routing import Route
-from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from demandops.errors import InvalidInput
 from demandops.runtime import REAL
-from demandops.service import listening_socket
+from demandops.service import http_server
+from demandops.service.http_server import HttpServer
 
 log = logging.getLogger("demandops")
 
 _PATH = "/push"
-_TIMEOUT_S = 10.0
 _AT_ONCE = 16
-_STOP_TIMEOUT_S = 1
 _MAX_BODY = 25 << 20
 """The largest body that GitHub sends, in bytes; a body is hashed and not stored."""
 _WARN_EVERY_S = 60.0
@@ -55,37 +49,23 @@ class PushWebhook:
         """
         self._secret, self._on_push = secret, on_push
         self._warned = float("-inf")
-        self._socket = listening_socket.bound(address, "--webhook")
-        if not (secret or listening_socket.is_local(self._socket)):
-            self._socket.close()
+        listening = http_server.bound(address, "--webhook")
+        if not (secret or http_server.is_local(listening)):
+            listening.close()
             raise InvalidInput.at(
                 "--webhook",
                 f"'{address}' can be reached from other machines, so notifications must be "
                 "signed; give --webhook-secret-file FILE, or listen on 127.0.0.1",
             )
-        self.url = listening_socket.url_of(self._socket) + _PATH
+        self.url = http_server.url_of(listening) + _PATH
         app = Starlette(routes=[Route("/", _health), Route(_PATH, self._handle, methods=["POST"])])
         app.router.redirect_slashes = False
-        config = uvicorn.Config(
-            app,
-            http=_BoundedConnection,
-            ws="none",
-            lifespan="off",
-            log_config=None,
-            log_level="error",  # anybody who connects could fill the log with warnings
-            access_log=False,  # paths and headers may hold secrets
-            proxy_headers=False,  # anyone may send such headers
-            server_header=False,
-            headers=[("Connection", "close")],  # a connection has time for one request only
-            timeout_graceful_shutdown=_STOP_TIMEOUT_S,
-        )
-        self._server = uvicorn.Server(config)
-        self._thread = REAL.keep_running("webhook", lambda: self._server.run([self._socket]))
+        one_request = [("Connection", "close")]
+        self._server = HttpServer(listening, app, "webhook", _AT_ONCE, one_request)
 
     def close(self) -> None:
         """Stop the server and wait for its end."""
-        self._server.should_exit = True
-        self._thread.join()
+        self._server.close()
 
     async def _handle(self, request: Request) -> PlainTextResponse:
         """Answer a request; if it is a valid notification, report the push."""
@@ -125,19 +105,6 @@ class PushWebhook:
                 "the same here and at the Git server?",
                 sender,
             )
-
-
-class _BoundedConnection(H11Protocol):
-    """A connection that the server cuts off after some seconds, or at once if too many are open."""
-
-    def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        super().connection_made(transport)
-        limit = _TIMEOUT_S if len(self.connections) <= _AT_ONCE else 0.0
-        self._cut_off = asyncio.get_running_loop().call_later(limit, transport.abort)
-
-    def connection_lost(self, exc: Exception | None) -> None:
-        self._cut_off.cancel()
-        super().connection_lost(exc)
 
 
 async def _health(request: Request) -> PlainTextResponse:

@@ -141,7 +141,9 @@ class Worker:
             if not self._rest:
                 self._check_proposals()
         except Exception as error:
-            self._fail(batch, access_error(error, self._repository.address))
+            self._fail(
+                batch, access_error(error, self._repository.address, self._repository.objects)
+            )
         else:
             if not self._rest:
                 self._rest.succeeded()
@@ -214,7 +216,7 @@ class Worker:
             try:
                 wait = self._attempt(batch, backoff)
             except Exception as error:
-                reason = access_error(error, self._repository.address)
+                reason = access_error(error, self._repository.address, self._repository.objects)
                 if isinstance(reason, PushDenied):
                     self.remote.record_push_denied(str(reason))
                 if not isinstance(reason, Unavailable):

@@ -24,7 +24,7 @@ from demandops.staterepo.audit.verification import Verdict
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.checkout import LastFetch
 from demandops.staterepo.git.open_repository import connect, is_url
-from demandops.staterepo.git.repository import StateRepository, access_error
+from demandops.staterepo.git.repository import StateRepository, access_error, reading
 from demandops.staterepo.history import authorship, commit_log, revisions
 from demandops.staterepo.history.authorship import Person
 from demandops.staterepo.history.commit_log import LogEntry, PathHistory
@@ -327,13 +327,11 @@ def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
     The folder of a checkout is allowed only with ``only_read``. Raises StateRepoError if the state
     repo cannot be read, also during the block, and Unsound if its disk fails.
     """
-    try:
-        with closing(Reader.of(address, only_read=only_read)) as reader:
-            yield reader
-    except (pygit2.GitError, OSError) as error:  # an object is missing, or its file is unreadable
-        if getattr(error, "errno", None) is not None:  # not from libgit2, so about another file
-            raise
-        raise access_error(error, address) from None
+    with (
+        closing(Reader.of(address, only_read=only_read)) as reader,
+        reading(address, reader.repository.objects),
+    ):
+        yield reader
 
 
 @contextmanager

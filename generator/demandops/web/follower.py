@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from itertools import islice
 
@@ -23,6 +23,7 @@ from demandops.errors import DemandOpsError
 from demandops.quoting import one_line
 from demandops.runtime import REAL, Runtime
 from demandops.service import rollout_targets
+from demandops.staterepo.git.repository import reading
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load.snapshot import Progress, Snapshot
 from demandops.staterepo.reader import Reader
@@ -100,6 +101,11 @@ class Follower:
             StateRepoError: if the state repo cannot be read.
         """
         return self._reader.for_another_thread()
+
+    def reading(self) -> AbstractContextManager[None]:
+        """Return a context that raises StateRepoError if an object is missing or damaged."""
+        repository = self._reader.repository
+        return reading(repository.address, repository.objects)
 
     def at(self, revision: str) -> Situation:
         """Return the situation at a revision, which is a commit or a time.
@@ -182,11 +188,12 @@ class Follower:
         known = self._newest
         try:
             commit, commit_state = self._reader.refresh(), known.commit_state
-            if commit != commit_state.commit:
-                snapshot = self._reader.snapshot_after(commit_state.snapshot)
-                commit_state = _commit_state(self._reader, snapshot)
-                commit_state.take_over(known.commit_state)
-            found = self._situation_at(commit_state)
+            with self.reading():
+                if commit != commit_state.commit:
+                    snapshot = self._reader.snapshot_after(commit_state.snapshot)
+                    commit_state = _commit_state(self._reader, snapshot)
+                    commit_state.take_over(known.commit_state)
+                found = self._situation_at(commit_state)
         except DemandOpsError as error:
             found = replace(known, unread=one_line(str(error).replace("\n", "; ")))
         except Exception as error:  # the page must show that it does not follow any more

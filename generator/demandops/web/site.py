@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 import shlex
+from collections import Counter
 from collections.abc import AsyncIterator, Callable
 from datetime import datetime, timezone
 from pathlib import Path
@@ -19,7 +20,7 @@ from anyio import to_thread
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from starlette.applications import Starlette
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import Request
@@ -64,11 +65,11 @@ _LOOK_S = 0.1
 _HEARTBEAT_S = 15.0
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
-_EARLIER_AT_ONCE = 4
-"""How many views with a chosen commit or time may be rendered at the same time.
-
-Such a view may take seconds. The limit keeps these views from delaying the others.
-"""
+_SLOW = {"at", "id", "name"}
+"""The parameters with which a view reads commits, which may take seconds."""
+_AT_ONCE, _SLOW_AT_ONCE = 20, 4
+"""How many views may be rendered at the same time; slow ones may not delay the others."""
+_MOST_WAITING = 20
 
 
 class Site:
@@ -90,7 +91,9 @@ class Site:
             documentation: the folder of the built documentation; None if it is not built.
         """
         self._follower, self._has_docs = follower, documentation is not None
-        self._earlier = anyio.CapacityLimiter(_EARLIER_AT_ONCE)
+        self._quick = anyio.CapacityLimiter(_AT_ONCE)
+        self._slow = anyio.CapacityLimiter(_SLOW_AT_ONCE)
+        self._unanswered = Counter[anyio.CapacityLimiter]()
         self._templates = Environment(
             loader=FileSystemLoader(_HERE / "pages"),
             autoescape=True,
@@ -115,7 +118,7 @@ class Site:
                 *([Mount("/docs", StaticFiles(directory=documentation))] if documentation else []),
             ],
             middleware=[
-                Middleware(_ClosedHeaders),
+                Middleware(_Closed),
                 Middleware(TrustedHostMiddleware, allowed_hosts=list(hosts), www_redirect=False),
             ],
             exception_handlers={404: self._nothing_here},
@@ -124,17 +127,24 @@ class Site:
 
     def _shows(self, view: View) -> Callable[[Request], Any]:
         async def answer(request: Request) -> Response:
-            limiter = self._earlier if request.query_params.get("at") else None
-            return await to_thread.run_sync(self._render, view, request, limiter=limiter)
+            limiter = self._slow if _SLOW & request.query_params.keys() else self._quick
+            if self._unanswered[limiter] >= limiter.total_tokens + _MOST_WAITING:
+                return PlainTextResponse("too many requests wait; try again later\n", 503)
+            self._unanswered[limiter] += 1
+            try:
+                return await to_thread.run_sync(self._render, view, request, limiter=limiter)
+            finally:
+                self._unanswered[limiter] -= 1
 
         return answer
 
     def _render(self, view: View, request: Request) -> Response:
         try:
             version = self._follower.version  # before the data, so that no later change is missed
-            asked = ViewRequest(self._follower, request)
-            template, data = view(asked)
-            return self._page(asked, template, {**data, "version": version})
+            with self._follower.reading():
+                asked = ViewRequest(self._follower, request)
+                template, data = view(asked)
+                return self._page(asked, template, {**data, "version": version})
         except DemandOpsError as error:
             return self._message(request, "Nothing to show", str(error), 404)
         except Exception:  # the visitor must learn where to look
@@ -202,8 +212,8 @@ class _Events:
             silent += _LOOK_S
 
 
-class _ClosedHeaders:
-    """Middleware that adds headers to the answers, so that other sites cannot use the page."""
+class _Closed:
+    """Middleware that refuses what other sites make browsers ask, and adds headers to answers."""
 
     def __init__(self, application: ASGIApp) -> None:
         self._application = application
@@ -215,7 +225,30 @@ class _ClosedHeaders:
                 MutableHeaders(scope=message).update(_DOCS_HEADERS if is_of_docs else _HEADERS)
             await send(message)
 
-        await self._application(scope, receive, sending)
+        is_foreign = scope["type"] == "http" and _is_foreign(Headers(scope=scope))
+        answer = _REFUSAL if is_foreign else self._application
+        await answer(scope, receive, sending)
+
+
+_REFUSAL = PlainTextResponse("another site asked for this; open the page itself\n", 403)
+
+
+def _is_foreign(headers: Headers) -> bool:
+    """Return whether another site made the browser send a request.
+
+    A link to the page may be on any site: the browser shows the page in a tab of its own, where no
+    other site can read it. It may not be opened before somebody follows the link.
+    """
+    site = headers.get("sec-fetch-site")
+    if site is None:  # an old browser, a program, or a page without TLS on another machine
+        origin = headers.get("origin")
+        return origin is not None and origin.partition("://")[2] != headers.get("host")
+    is_link = (
+        headers.get("sec-fetch-mode") == "navigate"
+        and headers.get("sec-fetch-dest") == "document"
+        and "sec-purpose" not in headers
+    )
+    return site not in ("same-origin", "none") and not is_link
 
 
 # ---- filters of the templates ----

@@ -94,7 +94,7 @@ def assert_rendered(bare: Path) -> None:
     from demandops.staterepo.load import snapshot as snapshots
 
     repo = pygit2.Repository(str(bare))
-    state = snapshots.load(repo, "main").state
+    state = snapshots.load(repo, repo.head.target).state
     stands = trees.texts(repo.revparse_single("main").peel(pygit2.Tree), ("clusters",))
     stands = {path: text for path, text in stands.items() if path.endswith(".yaml")}
     wanted = {p: t for p, t in rendered_files(state).items() if p.startswith("clusters/")}

@@ -7,6 +7,7 @@ import os
 import shutil
 import socket
 import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -33,6 +34,7 @@ from pygit2 import Oid, Repository
 
 from tests.kit import rig
 from tests.kit.cli import Run
+from tests.kit.connections import IMAGES
 from tests.kit.limits import files_end_at
 from tests.kit.memory import NOW
 from tests.kit.repo import git, tip
@@ -380,28 +382,62 @@ def test_what_people_push_beside_a_damaged_clone_is_followed(
         assert str(generator.snapshot.commit) == tip(bare)
 
 
-def test_a_repo_of_this_disk_that_lost_a_file_is_told_with_the_remedy(
-    bare: Path, tmp_path: Path, demandops: Run
-) -> None:
-    blob = rig.git(bare, "rev-parse", "main:demandops.yaml").strip()
-    packs = [path.replace(tmp_path / path.name) for path in bare.glob("objects/pack/*.pack")]
+def lose(repo: Path, tmp_path: Path, spec: str) -> str:
+    """Remove an object from a bare repository; return its id."""
+    lost = rig.git(repo, "rev-parse", spec).strip()
+    packs = [path.replace(tmp_path / path.name) for path in repo.glob("objects/pack/*.pack")]
     for pack in packs:
         with pack.open("rb") as file:
-            subprocess.run(["git", "unpack-objects", "-q"], cwd=bare, stdin=file, check=True)
-    (bare / "objects" / blob[:2] / blob[2:]).unlink()
+            subprocess.run(["git", "unpack-objects", "-q"], cwd=repo, stdin=file, check=True)
+    (repo / "objects" / lost[:2] / lost[2:]).unlink()
+    return lost
+
+
+@pytest.mark.parametrize("path", ["demandops.yaml", "inventory", "registry/images.yaml"])
+def test_a_repo_of_this_disk_that_lost_a_file_is_told_with_the_remedy(
+    bare: Path, tmp_path: Path, demandops: Run, path: str
+) -> None:
+    lost = lose(bare, tmp_path, f"main:{path}")
     with (
         pytest.raises(StateRepoError) as error,
         rig.running(str(bare), data=tmp_path / "data"),
     ):
         pass
-    assert str(error.value) == (
-        f"{bare} cannot be read: missing blob {blob}; check its disk, and if "
-        f"`git -C {bare} fsck` finds it broken, restore it from a backup or a clone"
-    )
+    assert str(error.value).startswith(f"{bare} cannot be read: ") and lost in str(error.value)
+    assert f"if `git -C {bare} fsck` finds it broken, restore it from a backup" in str(error.value)
     told = demandops("bookkeeping", "--state-repo", bare)
+    commit = rig.git(bare, "rev-parse", "main")[:10]
     assert told.code == 1
-    assert f"error: {bare} cannot be read: " in told.err
+    assert f"error: {bare} cannot be read: {path} of commit {commit}, Git object {lost}" in told.err
     assert "check its disk and its files" in told.err
+
+
+def test_a_file_that_the_state_in_effect_had_and_git_lost_is_told(
+    bare: Path, tmp_path: Path, person: Person
+) -> None:
+    """While a file is quarantined, its last valid version is read by its id."""
+    valid = tip(bare)
+    with rig.running(bare) as generator:
+        person.change({IMAGES: "kind: [\n"})
+        rig.book(generator, goal(1))
+    lost = lose(bare, tmp_path, f"{valid}:{IMAGES}")
+    command = [sys.executable, "-m", "demandops.cli.main", "bookkeeping", "--state-repo", str(bare)]
+    told = subprocess.run(command, capture_output=True, text=True, check=False)  # without caches
+    assert told.returncode == 1, told.stderr
+    assert f"{IMAGES} of commit {valid[:10]}" in told.stderr
+    assert lost in told.stderr
+
+
+def test_a_checkout_that_lacks_a_file_is_told_by_check(
+    bare: Path, tmp_path: Path, demandops: Run
+) -> None:
+    folder = tmp_path / "checkout"
+    rig.git(tmp_path, "clone", "--quiet", "--no-local", str(bare), str(folder))
+    lost = lose(folder / ".git", tmp_path, "HEAD:demandops.yaml")
+    told = demandops("check", folder)
+    assert told.code == 1
+    assert f"demandops.yaml of commit {rig.git(folder, 'rev-parse', 'HEAD')[:10]}" in told.err
+    assert lost in told.err
 
 
 def test_a_branch_that_cannot_be_read_is_no_fault_of_the_program(

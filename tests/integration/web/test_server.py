@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import select
 import socket
 import urllib.error
 import urllib.request
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from urllib.parse import urlsplit
+from urllib.parse import urlencode, urlsplit
 
 import pytest
+from demandops.service import http_server
 from demandops.staterepo.reader import Reader
 from demandops.web import server, site
 from demandops.web.follower import Follower
@@ -81,7 +83,7 @@ def _is_open(page: WebServer) -> bool:
 def test_clients_that_neither_ask_nor_read_are_cut_off(
     follower: Follower, monkeypatch: pytest.MonkeyPatch, sent: str
 ) -> None:
-    monkeypatch.setattr(server, "_STUCK_S", 0.2)
+    monkeypatch.setattr(http_server, "_STUCK_S", 0.2)
     monkeypatch.setattr(server, "_AT_ONCE", 4)
     page = WebServer("127.0.0.1:0", "--listen", follower)
     with ExitStack() as stack:
@@ -92,8 +94,20 @@ def test_clients_that_neither_ask_nor_read_are_cut_off(
     page.close()
 
 
+def test_however_many_clients_hold_connections_open_health_is_told(served: WebServer) -> None:
+    """The oldest connection that waits for its client gives way, and no stream of events does."""
+    with ExitStack() as stack:
+        stream = stack.enter_context(asking(served, STREAM))
+        assert stream.recv(12) == b"HTTP/1.1 200"
+        for number in range(250):
+            with suppress(ConnectionError):
+                stack.enter_context(asking(served, "GET / HTTP/1.1\n"[: number % 15]))
+        assert status(served, "health") == 200
+        assert stream.recv(4096)
+
+
 def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server, "_STUCK_S", 0.05)
+    monkeypatch.setattr(http_server, "_STUCK_S", 0.05)
     monkeypatch.setattr(site, "_HEARTBEAT_S", 0.3)
     page = WebServer("127.0.0.1:0", "--listen", follower)
     with asking(page, STREAM) as stream:
@@ -103,6 +117,27 @@ def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch
             assert chunk, got
             got += chunk
     page.close()
+
+
+@pytest.mark.parametrize(
+    "at", [":/", ":/(((.*)*)*)*!", "HEAD^{/.*}", "HEAD@{1}", "main^{tree}", "-x", "\0", "x" * 9000]
+)
+def test_whatever_is_asked_of_git_the_page_refuses_and_lives(served: WebServer, at: str) -> None:
+    assert status(served, f"services?{urlencode({'at': at})}") == 404
+    assert status(served, "services?at=HEAD") == 200
+
+
+def test_more_slow_requests_than_can_wait_are_refused(
+    served: WebServer, follower: Follower, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(site, "_MOST_WAITING", 3)
+    request = "GET /?at=HEAD~1 HTTP/1.1\nHost: localhost\n\n"
+    with ExitStack() as stack:
+        stack.enter_context(follower._loading)
+        waiting = [stack.enter_context(asking(served, request)) for _ in range(8)]
+        ready, _, _ = select.select(waiting, [], [], PATIENCE_S)
+        assert {each.recv(12) for each in ready} == {b"HTTP/1.1 503"}
+        assert status(served, "health") == 200
 
 
 def test_requests_for_earlier_commits_keep_no_other_request_waiting(

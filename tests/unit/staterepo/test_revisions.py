@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
 
+import demandops
 import pygit2
 import pytest
 from demandops.errors import StateRepoError
+from demandops.staterepo.git import tree as trees
 from demandops.staterepo.history import revisions
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from pygit2.enums import ObjectType
 
+MAIN = "refs/heads/main"
+ROS_BRIDGE = Path(__file__).parents[3] / "ros_bridge"
+WHO = pygit2.Signature("a", "a@example.org", 0, 0)
 NOW = datetime(2026, 1, 31, 12, 0, 30, tzinfo=timezone.utc)
 
 
@@ -65,10 +75,14 @@ def repo(tmp_path: Path) -> pygit2.Repository:
     return repo
 
 
-def resolved(repo: pygit2.Repository, text: str) -> str:
-    tip = repo.references["refs/heads/main"].target
+def commit_of(repo: pygit2.Repository, text: str) -> pygit2.Commit:
+    tip = repo.references[MAIN].target
     assert isinstance(tip, pygit2.Oid)
-    return revisions.resolve(repo, tip, text, NOW).message
+    return revisions.resolve(repo, tip, text, NOW)
+
+
+def resolved(repo: pygit2.Repository, text: str) -> str:
+    return commit_of(repo, text).message
 
 
 @pytest.mark.parametrize(
@@ -93,7 +107,7 @@ def test_a_revision_or_the_newest_commit_at_a_time(
 
 
 def test_the_name_of_a_tag_comes_before_a_time(repo: pygit2.Repository) -> None:
-    repo.references.create("refs/tags/2026-01-31", repo.revparse_single("main~2").id)
+    repo.references.create("refs/tags/2026-01-31", commit_of(repo, "main~2").id)
     assert resolved(repo, "2026-01-31") == "0"
 
 
@@ -106,11 +120,132 @@ def test_before_the_first_commit(repo: pygit2.Repository) -> None:
     )
 
 
+@pytest.fixture
+def named(repo: pygit2.Repository) -> dict[str, str]:
+    """Names and ids in a repository with more than one branch, as name → whole id."""
+    tip, middle, first = (str(commit.id) for commit in repo.walk(repo.references[MAIN].target))
+    tag = repo.create_tag("annotated", pygit2.Oid(hex=first), ObjectType.COMMIT, WHO, "a tag")
+    for name, commit in {
+        "refs/tags/plain": middle,
+        "refs/heads/demand/a-b": first,
+        "refs/heads/\u00e9": middle,
+        "refs/remotes/origin/tracked": first,
+        "refs/heads/-x": first,
+        f"refs/heads/{tip}": first,
+        f"refs/heads/{middle[:9]}": first,
+        "refs/heads/twice": first,
+        "refs/tags/twice": tip,
+        "refs/stash": first,
+    }.items():
+        repo.references.create(name, pygit2.Oid(hex=commit))
+    repo.references.create("refs/tags/folder", repo.TreeBuilder().write())
+    return {"tip": tip, "middle": middle, "first": first, "tag": str(tag)}
+
+
+@pytest.mark.parametrize(
+    ("text", "wanted"),
+    [
+        ("main~2", "first"),
+        ("main^^", "first"),
+        ("main~1~1", "first"),
+        ("main~0", "tip"),
+        ("HEAD~", "middle"),
+        ("refs/heads/main", "tip"),
+        ("heads/main", "tip"),
+        ("annotated", "first"),
+        ("plain~1", "first"),
+        ("demand/a-b", "first"),
+        ("\u00e9", "middle"),
+        ("origin/tracked", "first"),
+        ("tracked", "first"),
+        ("-x", "first"),
+        ("{tag}", "first"),
+        ("{first:.8}", "first"),
+        ("{middle:.8}~1", "first"),
+        ("{tip}", "tip"),  # a branch of that name does not count
+        ("refs/heads/{tip}", "first"),
+        ("refs/tags/twice", "tip"),
+    ],
+)
+def test_names_ids_and_steps_back(
+    repo: pygit2.Repository, named: dict[str, str], text: str, wanted: str
+) -> None:
+    assert str(commit_of(repo, text.format_map(named)).id) == named[wanted]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *(":/2", ":/", ":0:file", "main:file", "main^{{/5}}", "main^{{tree}}", "main^{{}}"),
+        *("main^2", "^main", "~1", "@", "@~1", "HEAD@{{1}}", "@{{u}}", "@{{-1}}", "main@{{1h}}"),
+        *("main..main", "main...main", "--all", "--upload-pack=x", "-", "refs/heads/../../HEAD"),
+        *("../HEAD", "/main", "refs/heads/", "refs/heads/main.lock", "refs/stash", "stash"),
+        *("main~3", "main~999999999", "main~9999999999", "main~" + "9" * 5000, "main~-1"),
+        *("main\0", "main\n", "main\nx", "\0", "\udcff", "main~\u0661", "\uff12h", "\uff4dain"),
+        *("MAIN", "config", "abc", "folder", "{tree}", "{tree:.8}", "{middle:.9}", "twice"),
+        *("0" * 40, "f" * 40, "f" * 41, "x" * 251, "x" * 249, "x/" * 120, "x" * 1_000_000),
+        *("main" + "^" * 1_000_000, "", " "),
+    ],
+)  # fmt: skip
+def test_anything_else_is_refused_and_quoted(
+    repo: pygit2.Repository, named: dict[str, str], text: str
+) -> None:
+    text = text.format_map({**named, "tree": str(repo.TreeBuilder().write())})
+    with pytest.raises(StateRepoError) as told:
+        commit_of(repo, text)
+    assert str(told.value).isprintable()
+    assert str(told.value).startswith("'") and len(str(told.value)) < 600
+
+
+_PIECES = [
+    "main",
+    "HEAD",
+    "@",
+    "{",
+    "}",
+    "^",
+    "~",
+    ":/",
+    "/",
+    "..",
+    "-",
+    "0",
+    "\0",
+    "refs/heads/",
+    "1h",
+]
+
+
+@given(st.one_of(st.text(), st.lists(st.sampled_from(_PIECES), max_size=12).map("".join)))
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+def test_whatever_the_text_it_is_a_commit_or_refused(repo: pygit2.Repository, text: str) -> None:
+    with suppress(StateRepoError):
+        assert isinstance(commit_of(repo, text), pygit2.Commit)
+
+
+def test_nothing_lets_libgit2_or_git_parse_a_revision() -> None:
+    """Their grammars have searches in messages, and some of these end the process."""
+    parsers = re.compile(r"rev_?-?parse|resolve_refish|lookup_reference_dwim|rev-list")
+    sources = [*Path(demandops.__file__).parent.rglob("*.py"), *ROS_BRIDGE.rglob("*.py")]
+    assert len(sources) > 100
+    assert [path.name for path in sources if parsers.search(path.read_text())] == []
+
+
 def test_neither_revision_nor_time(repo: pygit2.Repository) -> None:
     with pytest.raises(StateRepoError) as told:
         resolved(repo, "domain")
     assert str(told.value) == (
-        "'domain' is neither a commit of the state repo nor a time; `demandops log` lists the "
-        "commits; write a time like 2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h "
-        "(two hours ago)"
+        "'domain' is neither a commit of the state repo nor a time; write a branch, a tag or 4 to "
+        "40 digits of an id, with ~N for the Nth commit before it, or a time like "
+        "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago); `demandops log` "
+        "lists the commits"
     )
+
+
+@pytest.mark.parametrize("text", ["main", "HEAD", ":/2", "main^{/2}", "{tip:.39}", "none", ""])
+def test_a_trailer_or_a_journal_names_a_commit_by_its_whole_id_only(
+    repo: pygit2.Repository, named: dict[str, str], text: str
+) -> None:
+    assert str(trees.commit_of(repo, named["tip"]).id) == named["tip"]
+    with pytest.raises(StateRepoError):
+        trees.commit_of(repo, text.replace("{tip:.39}", named["tip"][:39]))

@@ -8,9 +8,11 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import subprocess
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pygit2
@@ -71,6 +73,7 @@ class PushDenied(StateRepoError):
     """
 
 
+_OBJECT = re.compile("[0-9a-f]{40}")
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NOT_ALLOWED = (errno.EACCES, errno.EPERM, errno.EROFS)
 _BROKEN = (errno.EIO, errno.EUCLEAN, errno.ENODEV, errno.ENXIO, errno.ESTALE)
@@ -123,16 +126,35 @@ def unopened(folder: Path, error: Exception) -> StateRepoError | None:
     )
 
 
-def access_error(error: Exception, address: str) -> Exception:
+def access_error(error: Exception, address: str, objects: Repository | None = None) -> Exception:
     """Return the error to raise if reading or writing ``address`` failed with ``error``.
 
     Only an error of the system or of libgit2 is replaced. Any other error is returned unchanged.
+    With ``objects``, the text names the file and the commit of an object that cannot be read.
     """
-    if not isinstance(error, OSError | pygit2.GitError):
+    missing = isinstance(error, KeyError) and isinstance(error.args[0], Oid)
+    if not (missing or isinstance(error, OSError | pygit2.GitError)):
         return error
+    # the text of a KeyError would have quotes
+    what = str(error.args[0]) if isinstance(error, KeyError) else str(error)
+    if objects is not None and (name := _OBJECT.search(what)):
+        place = trees.place_of(Repository(objects.path), Oid(hex=name[0]))
+        what = f"{place}, Git object {name[0]}, is missing or damaged" if place else what
     return disk_error(error, address) or StateRepoError(
-        f"{address} cannot be read: {error}; check its disk and its files, then try again"
+        f"{address} cannot be read: {what}; check its disk and its files with `git fsck`, then "
+        "fetch or clone the missing files again, or restore them from a backup"
     )
+
+
+@contextmanager
+def reading(address: str, objects: Repository) -> Iterator[None]:
+    """Raise StateRepoError if an object is missing or damaged; see :func:`access_error`."""
+    try:
+        yield
+    except (pygit2.GitError, KeyError, OSError) as error:
+        if getattr(error, "errno", None) is not None:  # not from libgit2, so about another file
+            raise
+        raise access_error(error, address, objects) from None
 
 
 class StateRepository(ABC):

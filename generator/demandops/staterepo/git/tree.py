@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 
 import pygit2
 from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
-from pygit2.enums import FileMode, ObjectType
+from pygit2.enums import FileMode, ObjectType, SortMode
 
 from demandops.errors import StateRepoError
+from demandops.quoting import quoted
 from demandops.staterepo.git.new_objects import Entries, NewObjects
 
 # Sync the files that libgit2 writes, so that a commit is on the disk before anybody learns of it.
@@ -17,28 +20,63 @@ pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
 
+_ID = re.compile("[0-9a-f]{40}")
+_MOST_SEARCHED = 10_000
 MAX_DEPTH = 64
 """How many folders deep a file may be; deeper folders are not read."""
 
 
-def commit_of(repo: Repository, revision: str | Oid) -> Commit:
-    """Return the commit that ``revision`` names, or raise StateRepoError."""
+def commit_of(repo: Repository, commit: str | Oid) -> Commit:
+    """Return the commit with a whole id, or raise StateRepoError.
+
+    An id as text may come from a trailer or the journal, so it may be any text. What people write
+    is read by :func:`demandops.staterepo.history.revisions.resolve`.
+    """
     try:
-        found = repo[revision] if isinstance(revision, Oid) else repo.revparse_single(revision)
-        return found.peel(Commit)
-    except (KeyError, ValueError, pygit2.GitError) as error:
-        if isinstance(revision, Oid) and isinstance(error, pygit2.InvalidError):
-            raise StateRepoError(
-                f"commit {error}; set the branch back to the commit before it"
-            ) from None
-        if isinstance(revision, Oid):  # a branch or a commit named it, not a person
-            raise StateRepoError(
-                f"the commit {revision} cannot be read; check the disk of the state repo and of "
-                "its clone, then try again"
-            ) from None
+        if isinstance(commit, str) and not _ID.fullmatch(commit):
+            raise StateRepoError(f"{quoted(commit)} is no commit's id of 40 hexadecimal digits")
+        return repo[commit].peel(Commit)
+    except pygit2.InvalidError as error:
         raise StateRepoError(
-            f"'{revision}' is not a commit of the state repo; `demandops log` lists the commits"
+            f"commit {error}; set the branch back to the commit before it"
         ) from None
+    except (KeyError, ValueError, pygit2.GitError):
+        raise StateRepoError(
+            f"the commit {commit} cannot be read; check the disk of the state repo and of its "
+            "clone, then try again"
+        ) from None
+
+
+def place_of(repo: Repository, wanted: Oid) -> str | None:
+    """Return which file or folder of which commit has an object, or None if none is found.
+
+    The object itself may be missing. The newest commits are searched.
+    """
+    seen = set[Oid]()
+
+    def path_in(tree: Tree, prefix: str) -> str | None:
+        seen.add(tree.id)
+        for found in tree:
+            path = prefix + _printable(found.raw_name or b"")
+            if found.id == wanted:
+                return path
+            if isinstance(found, Tree) and found.id not in seen and path.count("/") < MAX_DEPTH:
+                inner = path_in(found, f"{path}/")
+                if inner is not None:
+                    return inner
+        return None
+
+    try:
+        walker = repo.walk(None, SortMode.TIME)
+        for name in repo.references:
+            walker.push(repo.references[name].peel(Commit).id)
+        for commit in islice(walker, _MOST_SEARCHED):
+            path = "the top folder" if commit.tree_id == wanted else path_in(commit.tree, "")
+            if path is not None:
+                return f"{path} of commit {str(commit.id)[:10]}"
+    except (KeyError, ValueError, pygit2.GitError):  # more is damaged
+        pass
+    return None
 
 
 def parent_tree(commit: Commit) -> Tree | None:

@@ -323,7 +323,7 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
 def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -> list[str]:
     """Return the items that ``git log`` prints; ``query`` has options for git, then the path."""
     *options, path = query
-    commits = [str(commit_of(repo, tip).id), *([f"^{after}"] if after else [])]
+    commits = [str(commit_of(repo, tip).id), *([f"^{commit_of(repo, after).id}"] if after else [])]
     with git.Repo(repo.path) as opened:
         try:
             output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)

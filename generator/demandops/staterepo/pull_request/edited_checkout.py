@@ -16,10 +16,13 @@ from demandops.errors import Fault, InvalidInput, StateRepoError, fault
 from demandops.ledger import claim_file
 from demandops.plan.release import Release
 from demandops.plan.release_keys import ReleaseKey
+from demandops.quoting import quoted
 from demandops.render.changes import merge_preview
+from demandops.runtime import REAL
 from demandops.settings import GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT
 from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.repository import unopened
+from demandops.staterepo.git.repository import reading, unopened
+from demandops.staterepo.history import revisions
 from demandops.staterepo.load import state_in_effect
 
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
@@ -122,11 +125,16 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         )
     if repo.is_empty or repo.head_is_unborn:
         return None
+    with reading(str(folder), repo):
+        return _base_in(repo, revision)
+
+
+def _base_in(repo: Repository, revision: str | None) -> Base:
     target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
-    commit = _started_from(repo, target)
+    tip = _tip_of(repo, target) if target else None
+    commit = _started_from(repo, target, tip)
     base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
-    if target:
-        tip = trees.commit_of(repo, target)
+    if tip is not None:
         _, newer = repo.ahead_behind(repo.head.peel(Commit).id, tip.id)
         merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
         base = replace(base, target=_short(target), newer=newer, merged=merged)
@@ -141,13 +149,22 @@ def _short(reference: str) -> str:
     return reference.removeprefix("refs/remotes/").removeprefix("refs/heads/")
 
 
-def _started_from(repo: Repository, target: str) -> Commit:
+def _tip_of(repo: Repository, target: str) -> Commit:
+    try:
+        return revisions.resolve(repo, repo.head.peel(Commit).id, target, REAL.now())
+    except StateRepoError:
+        if repo.is_shallow:
+            raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
+        raise
+
+
+def _started_from(repo: Repository, target: str, tip: Commit | None) -> Commit:
     head = repo.head.peel(Commit)
     try:
-        common = repo.merge_base(head.id, trees.commit_of(repo, target).id) if target else None
-    except (StateRepoError, pygit2.GitError, KeyError):
+        common = repo.merge_base(head.id, tip.id) if tip is not None else None
+    except (pygit2.GitError, KeyError):
         if repo.is_shallow:
-            raise StateRepoError(f"'{target}': {_SHALLOW}") from None
+            raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
         raise
     if common is not None:
         return trees.commit_of(repo, common)
