@@ -509,7 +509,7 @@ class TestLog:
         assert (join["operation"], join["request"], join["author"]) == (
             "join",
             "request",
-            "vehicle00",
+            "vehicle00 (requester)",
         )
         assert join["requesters"] == ["vehicle00"]
         assert (join["applications"], join["connections"]) == ([APP], ["vehicle00/edge"])

@@ -97,7 +97,7 @@ def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(
     author, made, body = rig.git(bare, "log", "-1", "--format=%an <%ae>%n%ct%n%b", commit.id).split(
         "\n", 2
     )
-    assert author == "station00, vehicle00 <short@demandops.invalid>"
+    assert author == "station00, vehicle00 (requesters) <short@requester.demandops.invalid>"
     assert int(made) >= int(end.timestamp()), "the lease was ended too early"
     told = end.strftime("%Y-%m-%d %H:%M:%S UTC")
     assert "the lease of demand 'short' on 1 application and 1 connection in the name" in body
