@@ -100,9 +100,12 @@ class Forge(ABC):
                 raise
             return existing  # an earlier call opened it, but its answer was lost
 
-    def close(self, request: PullRequest) -> None:
-        """Close a pull request without merging it."""
-        self._call("PATCH", f"{self._pulls}/{request.number}", {"state": "closed"})
+    def close(self, request: PullRequest, body: str) -> None:
+        """Close a pull request without merging it, and replace its text, which says why.
+
+        A comment would need a further permission of the token.
+        """
+        self._call("PATCH", f"{self._pulls}/{request.number}", {"state": "closed", "body": body})
 
     def _call(self, method: str, path: str, body: Mapping[str, object] | None = None) -> Any:  # noqa: ANN401 - the caller knows the answer's form
         """Send JSON, if any, to a path below the API's address; return the answer's JSON."""

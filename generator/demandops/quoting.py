@@ -39,6 +39,33 @@ def escaped(text: str, kept: str = "") -> str:
     )
 
 
+_TRIGGER = re.compile(
+    r"""
+    (?<![A-Za-z0-9_])@(?=[A-Za-z0-9_])       # @name, @org/team
+    | \#(?=[A-Za-z0-9_]) | [!&$](?=[0-9])     # #1, o/r#1, Jira's #close; GitLab's !1, &1, $1
+    | (?<=\bGH)-(?=[0-9])                    # GH-1
+    | /(?=(?:issues|pulls?|merge_requests|work_items|epics)/[0-9])  # https://host/o/r/issues/1
+    | \[(?=[^][]*(?:skip|ci)|[a-z_]+:)       # [skip ci], [no ci]; GitLab's [issue:1]
+    | \*(?=\*\*)                             # ***NO_CI***
+    | \b(?:clos|fix|resolv|implement)[a-z]*:?\s+(?:issues?\s+)?[A-Z][A-Z0-9_]*-(?=[0-9])
+    """,
+    re.IGNORECASE | re.VERBOSE,
+)
+"""Matches text that ends in the character at which a forge, or a pipeline, takes it for an order.
+
+The last line is for an issue elsewhere, ``Closes ABC-1``.
+"""
+
+
+def harmless(text: str) -> str:
+    """Return text that no forge acts on, with an escape like ``\\x40`` in the place of ``@``.
+
+    Forges look into commit messages, titles and texts of pull requests: ``[skip ci]`` stops a
+    pipeline, ``Fixes #1`` closes an issue, ``@name`` calls a person.
+    """
+    return _TRIGGER.sub(lambda found: f"{found[0][:-1]}\\x{ord(found[0][-1]):02x}", text)
+
+
 def clipped(text: str, most: int) -> str:
     """Return text of at most ``most`` characters, with ``…`` if it was longer."""
     return text if len(text) <= most else text[: most - 1].rstrip() + "…"

@@ -62,8 +62,8 @@ def test_git_finds_commits_as_the_docs_say(played: Any) -> None:
 
     subjects = f"{APP}, vehicle00/edge, station00/edge"
     assert log("--author=vehicle00", "--format=%an: %s", "main") == [
-        f"vehicle00, station00: Release {subjects}",
-        f"vehicle00, station00: Join {subjects}",
+        f"vehicle00, station00 (requesters): Release {subjects}",
+        f"vehicle00, station00 (requesters): Join {subjects}",
     ]
     requesters = log("--format=%(trailers:key=Requester,valueonly,separator=%x2C )", "main")
     assert requesters[:2] == ["vehicle01, station00", "vehicle00, station00"]
@@ -82,7 +82,7 @@ def test_git_finds_commits_as_the_docs_say(played: Any) -> None:
     path = next(p for p, text in played.files("ledger/").items() if "- vehicle02" in text)
     said = git(played, "blame", "--line-porcelain", "main", "--", path)
     authors = {line for line in said.splitlines() if line.startswith("author ")}
-    assert authors == {"author vehicle02, station00"}
+    assert authors == {"author vehicle02, station00 (requesters)"}
 
 
 class TestWhy:
@@ -122,7 +122,7 @@ class TestWhy:
         said = git(played, "log", "--format=%H", "main", "--", found["file"]).splitlines()
         assert [one["commit"] for one in [*found["changes"], found["started"]]] == said
         assert (found["stopped"], found["more_changes"]) == (None, 0)
-        assert found["started"]["author"] == "vehicle00, station00"
+        assert found["started"]["author"] == "vehicle00, station00 (requesters)"
         bounded = ask("why", FUSION, "-n", "1")
         assert [one["commit"] for one in bounded["changes"]] == said[:1]
         assert bounded["more_changes"] == len(said) - 2

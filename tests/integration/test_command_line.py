@@ -509,7 +509,7 @@ class TestLog:
         assert (join["operation"], join["request"], join["author"]) == (
             "join",
             "request",
-            "vehicle00",
+            "vehicle00 (requester)",
         )
         assert join["requesters"] == ["vehicle00"]
         assert (join["applications"], join["connections"]) == ([APP], ["vehicle00/edge"])
@@ -528,7 +528,7 @@ class TestLog:
         ]
         assert all(row[1].endswith(" ago") for row in rows)
         wide = cells_of(demandops("log", "-o", "wide", "--state-repo", joined.path).out)
-        assert wide[2][5:] == ["join", "vehicle00", "request"]
+        assert wide[2][5:] == ["join", "vehicle00 (requester)", "request"]
 
     def test_as_many_and_from_where_one_says(
         self, demandops: Run, state: Any, request_json: Run

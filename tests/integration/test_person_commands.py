@@ -222,13 +222,14 @@ class TestProposals:
         self, demandops: Run, state: GitRepo, proposed: str, scheme: str
     ) -> None:
         where = ("--state-repo", f"{scheme}{state.path}")
-        assert demandops("approve", "nothing", *where).err == (
+        assert demandops("approve", "nothing", "--commit", "0" * 40, *where).err == (
             f"error: no proposal fits 'nothing'; known: {proposed}\n"
         )
-        ran = demandops("approve", "visit", "-m", "Agreed", *where)
+        commit = ("--commit", git(state, "rev-parse", proposed))
+        ran = demandops("approve", "visit", "-m", "Agreed #1", *commit, *where)
         assert ran.code == 0, ran.err
         assert ran.out == f"approved: {proposed} is merged in {state.tip}\n"
-        assert git(state, "log", "-1", "--format=%an|%b") == "Petra Platform|Agreed\n"
+        assert git(state, "log", "-1", "--format=%an|%b") == "Petra Platform|Agreed #1\n"
         assert git(state, "rev-parse", "main^2") == git(state, "rev-parse", proposed)
         with running(state.path, fetch_interval=0.05):
             wait_until(lambda: not branches(state.path), "the generator removes the branch")
@@ -242,7 +243,8 @@ class TestProposals:
         path = git(state, "diff", "--name-only", "main", proposed, "--", "ledger").split("\n")[0]
         state.commit({path: "mine\n"})
         before = state.tip
-        ran = demandops("approve", "visit", "--state-repo", state.path)
+        commit = ("--commit", git(state, "rev-parse", proposed))
+        ran = demandops("approve", "visit", *commit, "--state-repo", state.path)
         assert (ran.code, state.tip) == (1, before)
         assert "wait until a running generator has made the branch anew, then try again" in ran.err
 

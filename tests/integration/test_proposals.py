@@ -12,6 +12,7 @@ import pytest
 import yaml
 
 from tests.kit.cli import Ran, Run
+from tests.kit.dialogue import Dialogue
 from tests.kit.generator import wait_until
 from tests.kit.goals import perception, put
 from tests.kit.repo import GitRepo, Person, branches, git
@@ -184,7 +185,8 @@ def test_what_a_person_added_to_a_proposal_is_approved_with_it(
     send(strict)
     [branch] = branches(strict.path)
     head = edit(person, branch, b"text")
-    assert demandops("approve", branch, "--yes", "--state-repo", strict.path).code == 0
+    ran = demandops("approve", branch, "--commit", head, "--state-repo", strict.path)
+    assert ran.code == 0 and "  ~ file sketch\n" in ran.err
     assert git(strict, "rev-parse", "main^2") == head
     assert strict.files()["sketch"] == "text"
 
@@ -205,9 +207,77 @@ def test_a_file_that_approve_would_change_is_told(
 ) -> None:
     send(strict)
     [branch] = branches(strict.path)
-    edit(person, branch, content, executable=content == b"text")
+    head = edit(person, branch, content, executable=content == b"text")
     tip = strict.tip
-    ran = demandops("approve", branch, "--yes", "--state-repo", strict.path)
+    ran = demandops("approve", branch, "--commit", head, "--state-repo", strict.path)
     told = f"sketch in {branch} is not a plain text file; merge the branch with git"
     assert (ran.code, ran.err.splitlines()[-1]) == (1, f"error: {told}")
     assert strict.tip == tip
+
+
+def _commits(state: GitRepo) -> tuple[str, str]:
+    """Return the commits of the only proposal and of main."""
+    (branch,) = branches(state.path)
+    return git(state, "rev-parse", branch), state.tip
+
+
+@pytest.mark.parametrize("command", ["approve", "reject"])
+def test_a_proposal_that_has_changed_since_it_was_seen_is_left_alone(
+    demandops: Run, send: Send, strict: GitRepo, command: str
+) -> None:
+    send(strict, goal=put("visit"))
+    seen, main = _commits(strict)
+    send(strict, goal=put("visit", topic=("/other", "vehicle00")))
+    now, where = _commits(strict)[0], ("--state-repo", strict.path)
+    assert now != seen
+    ran = demandops(command, "visit", "--commit", seen[:12], *where)
+    assert (ran.code, ran.out) == (1, "")
+    assert f"is at commit {now}, not at '{seen[:12]}'; if it has changed since" in ran.err
+    for other in (now[:6], now.upper(), "HEAD", f"{now[:12]}~0", f"{now}0"):
+        assert demandops(command, "visit", "--commit", other, *where).code == 1, other
+    assert _commits(strict) == (now, main)
+    ran = demandops(command, "visit", "--commit", now[:7], *where)
+    assert ran.code == 0, ran.err
+    assert (git(strict, "rev-parse", "main^2") == now) if command == "approve" else True
+    assert "changed: it replaces demand/visit-" in ran.err and seen in ran.err
+
+
+@pytest.mark.parametrize("more", [(), ("--yes",), ("--output", "json"), ("--commit", "")])
+def test_without_a_terminal_nothing_is_approved_that_was_not_seen(
+    demandops: Run, send: Send, strict: GitRepo, more: tuple[str, ...]
+) -> None:
+    send(strict)
+    before = _commits(strict)
+    ran = demandops("approve", *branches(strict.path), *more, "--state-repo", strict.path)
+    assert (ran.code, ran.out, _commits(strict)) == (2, "", before)
+    assert "--commit ID" in ran.err
+
+
+@pytest.mark.parametrize("typed", ["n", "y"])
+def test_at_a_terminal_the_consequence_is_shown_and_just_that_is_merged(
+    send: Send, strict: GitRepo, typed: str
+) -> None:
+    send(strict)
+    seen, main = _commits(strict)
+    with Dialogue("approve", *branches(strict.path), "--state-repo", strict.path) as asked:
+        asked.read_until("Approve it? [y/N]:")
+        for told in (seen, "required by access domain 'perception'", "for vehicle00, proposed"):
+            assert told in asked.text
+        assert "+ connection vehicle00/edge for vehicle00" in asked.text
+        assert "+ release od-edge-vehicle00" in asked.text
+        asked.type(f"{typed}\n")
+        assert asked.end() == (0 if typed == "y" else 1)
+    merged = [main, seen] if typed == "y" else []
+    assert git(strict, "log", "-1", "--merges", "--format=%P", "main").split() == merged
+
+
+def test_what_changes_while_a_person_looks_at_it_is_not_merged(send: Send, strict: GitRepo) -> None:
+    send(strict, goal=put("visit"))
+    (seen, main), (branch,) = _commits(strict), branches(strict.path)
+    with Dialogue("approve", branch, "--state-repo", strict.path) as asked:
+        asked.read_until("Approve it? [y/N]:")
+        send(strict, goal=put("visit", topic=("/other", "vehicle00")))
+        asked.type("y\n")
+        assert asked.end() == 1
+        assert f"{branch} is no longer at commit {seen}, so nothing was merged" in asked.text
+    assert strict.tip == main

@@ -63,7 +63,7 @@ COMMANDS = (
 """Commands that leave the fleet unchanged."""
 
 CHANGING = (
-    "approve visit --yes --state-repo fleet.git",
+    "approve visit --yes --commit PROPOSED --state-repo fleet.git",
     "check clone",
     "completion bash",
     "config list",
@@ -162,12 +162,16 @@ def printed(command: str, patch: pytest.MonkeyPatch, columns: int = 80) -> str:
         if command.startswith("watch"):
             own.setattr(REAL, "sleep", _interrupt)
         with terminal(own, columns, lines=40 if command.startswith("watch") else 1000) as screen:
-            run(shlex.split(command))
+            run(shlex.split(command.replace("PROPOSED", _proposed())))
         text = "\n".join(map(str.rstrip, _CONTROL.sub("", screen.text).split("\n")))
         text = text.replace(str(Path.cwd()), "/home/petra")
     if command == "version":
         text = re.sub(r"\d[\w.+-]*", "1.2.3", text)
     return same_ids(text)
+
+
+def _proposed() -> str:
+    return git("fleet.git", "for-each-ref", "--format=%(objectname)", "refs/heads/demand")
 
 
 def _interrupt(seconds: float) -> None:

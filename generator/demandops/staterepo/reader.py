@@ -270,10 +270,18 @@ class Reader:
         """
         return commit_log.stopped_release_names(self._objects, revision)
 
-    def changed_files(self, before: str, after: str, roots: Sequence[str]) -> list[str]:
-        """Return the files below these folders that differ between two commits, sorted."""
+    def changed_files(self, before: str, after: str, roots: Sequence[str] = ()) -> list[str]:
+        """Return the files below these folders that differ between two commits, sorted.
+
+        Without folders, these are all files.
+        """
         changed = trees.differences(self._tree(before), self._tree(after), roots)
         return sorted(path for path, _ in changed)
+
+    def base_of(self, commit: str) -> str:
+        """Return the commit at which another commit, of a proposal, left main."""
+        base = self._objects.merge_base(self._tip, trees.commit_of(self._objects, commit).id)
+        return str(base or self._tip)
 
     def changed_roots(self, commit: str) -> tuple[str, ...]:
         """Return the top-level files and folders that a commit changed, sorted."""

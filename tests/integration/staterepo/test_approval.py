@@ -335,21 +335,127 @@ def put(demand: str, vehicle: int, who: str = "user", **more: Any) -> Any:
     return goals.put(demand, who, topic=(f"/vehicles/{name}/ego_data", name), **more)
 
 
-def test_a_put_of_the_same_demand_replaces_the_proposal(bare: Path, petra: Person) -> None:
-    with rig.running(bare) as generator:
+def test_a_put_of_the_same_demand_is_another_proposal_that_says_so(
+    address: str, bare: Path, petra: Person
+) -> None:
+    with rig.running(address) as generator:
         first = Proposed(generator, put("d", 1), "op-1")
-        branch = first.branch
+        seen = f"{first.branch} {git(bare, 'rev-parse', first.branch)}"
         second = Proposed(generator, put("d", 2), "op-2")
-        with pytest.raises(Withdrawn, match="replaced by a later demand"):
+        with pytest.raises(Withdrawn, match=f"replaced by a later demand .*: {second.branch}"):
             rig.receipt(first.ticket)
-        assert (second.branch, branches(bare)) == (branch, [branch])
+        assert second.branch != first.branch and branches(bare) == [second.branch]
+        [commit] = rig.commits(bare, f"main..{second.branch}")
+        assert commit.one("Replaces") == seen
+        head = git(bare, "log", "-1", "--format=%b", second.branch).splitlines()[0]
+        assert head == f"Changed: replaces {seen}; no approval of that counts here."
         with pytest.raises(Refused, match="is a demand of user"):
             rig.receipt(generator.submit(put("d", 3, who="stranger")))
-        petra.merge(branch)
+        petra.merge(second.branch)
         assert second.outcome() == "booked"
     [claim] = [path for path in rig.claims(bare) if "/applications/" in path]
     assert "vehicle02" in git(bare, "show", f"main:{claim}")
     assert "vehicle01" not in git(bare, "show", f"main:{claim}")
+
+
+NO_DELETION = 'case "$1 $3" in refs/heads/demand/*\\ 00000000*) exit 1;; esac'
+
+
+def test_who_merges_what_was_approved_before_the_change_gets_just_that(
+    bare: Path, url: str, petra: Person
+) -> None:
+    """The branch is merged after the demand was changed, and before the generator deletes it."""
+    rig.hook(bare, "update", NO_DELETION)
+    with rig.running(url, fetch_interval=0.1) as generator:
+        first = Proposed(generator, put("d", 1), "op-1")
+        old = first.branch
+        second = Proposed(generator, put("d", 2), "op-2")
+        new = second.branch
+        assert sorted(branches(bare)) == sorted([old, new])
+        stood = git(bare, "rev-parse", new)
+        petra.merge(old)
+        assert first.outcome() == "booked"
+        assert not second.ticket.future.done()
+        [claim] = [path for path in rig.claims(bare) if "/applications/" in path]
+        assert "vehicle01" in git(bare, "show", f"main:{claim}")
+        rig.wait_until(lambda: git(bare, "rev-parse", new) != stood, "the other one is rebuilt")
+        petra.merge(new)
+        assert second.outcome() == "booked"
+    assert rig.operations(bare) == ["op-1", "op-2"]
+
+
+def test_a_release_takes_away_what_was_replaced_too(bare: Path, url: str, petra: Person) -> None:
+    """Else somebody could merge the replaced branch after the release was answered."""
+    hook = rig.hook(bare, "update", NO_DELETION)
+    with rig.running(url, fetch_interval=0.1) as generator:
+        first = Proposed(generator, put("d", 1), "op-1")
+        assert [first.branch] == branches(bare)
+        second = Proposed(generator, put("d", 2), "op-2")
+        assert len({first.branch, second.branch}) == len(branches(bare)) == 2
+        hook.unlink()
+        release = {"kind": "Demand", "demand": "d", "operation": "release", "requesters": ["user"]}
+        assert rig.book(generator, release)[0].outcome == "released"
+        assert branches(bare) == []
+        for each in (first, second):
+            with pytest.raises(Withdrawn):
+                rig.receipt(each.ticket)
+
+
+def test_a_change_that_is_taken_back_at_once_leaves_what_waited(bare: Path, petra: Person) -> None:
+    gate = Gate()
+    with rig.running(bare) as generator:
+        first = Proposed(generator, put("d", 1), "op-1")
+        assert [first.branch] == branches(bare)
+        changed = generator.submit(put("d", 2), "op-2", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        generator.withdraw("op-2")
+        gate.open.set()
+        with pytest.raises(Withdrawn):
+            rig.receipt(changed)
+        assert branches(bare) == [first.branch]
+        petra.merge(first.branch)
+        assert first.outcome() == "booked"
+
+
+def test_the_same_put_sent_twice_waits_on_one_branch(bare: Path, petra: Person) -> None:
+    with rig.running(bare) as generator:
+        first = Proposed(generator, put("d", 1))
+        stands = git(bare, "rev-parse", first.branch)
+        second = Proposed(generator, put("d", 1))
+        assert (second.branch, branches(bare)) == (first.branch, [first.branch])
+        assert git(bare, "rev-parse", first.branch) == stands
+        petra.merge(first.branch)
+        assert (first.outcome(), second.outcome()) == ("booked", "booked")
+
+
+def test_a_demand_that_main_would_place_elsewhere_is_another_proposal(
+    bare: Path, url: str, petra: Person
+) -> None:
+    """Who approved it on one node has not approved it on another."""
+    nodes = petra.read("inventory/nodes.yaml")
+    for id in ("edge", "cloud"):
+        nodes = nodes.replace(f"  - id: {id}\n", f"  - id: {id}\n    capabilities: [gpu]\n")
+    petra.change({"inventory/nodes.yaml": nodes})
+    demand = put("d", 1, connect="mqtt")
+    del demand["applications"][0]["node"]
+    demand["applications"][0]["place"] = {"capabilities": ["gpu"]}
+    with rig.running(url, fetch_interval=0.1) as generator:
+        proposed = Proposed(generator, demand, "op-1")
+        old = proposed.branch
+        seen = f"{old} {git(bare, 'rev-parse', old)}"
+        was_on = "cloud" if "object-fusion on cloud" in git(bare, "log", "-1", old) else "edge"
+        drained = nodes.replace(f"  - id: {was_on}\n", f"  - id: {was_on}\n    drained: true\n")
+        petra.change({"inventory/nodes.yaml": drained})
+        rig.wait_until(lambda: old not in branches(bare), "the first branch is deleted")
+        rig.wait_until(lambda: proposed.branch != old, "the requester is told")
+        assert branches(bare) == [proposed.branch]
+        [commit] = rig.commits(bare, f"main..{proposed.branch}")
+        assert (commit.one("Operation-Id"), commit.one("Replaces")) == ("op-1", seen)
+        petra.merge(proposed.branch)
+        assert proposed.outcome() == "booked"
+        rig.wait_until(lambda: branches(bare) == [], "the merged branch is deleted")
+    assert rig.operations(bare) == ["op-1"]
+    rig.assert_sound(bare)
 
 
 def test_a_lease_counts_from_the_merge(bare: Path, petra: Person) -> None:
@@ -456,14 +562,14 @@ def test_what_replaced_a_proposal_waits_on_after_two_restarts(
     bare: Path, url: str, petra: Person
 ) -> None:
     with rig.running(url) as generator:
-        branch = Proposed(generator, put("d", 1), "op-1").branch
-        hook = rig.hook(bare, "update", 'case "$1" in refs/heads/demand/*) exit 1;; esac')
-        generator.submit(put("d", 2), "op-2")
-        rig.wait_until(lambda: generator.failures, "the push is denied")
+        old = Proposed(generator, put("d", 1), "op-1").branch
+        hook = rig.hook(bare, "update", NO_DELETION)
+        branch = Proposed(generator, put("d", 2), "op-2").branch
+        rig.wait_until(lambda: generator.failures, "the deletion is denied")
+    assert sorted(branches(bare)) == sorted([old, branch])
     hook.unlink()
-    before = git(bare, "rev-parse", branch)
     with rig.running(url):
-        rig.wait_until(lambda: git(bare, "rev-parse", branch) != before, "the branch is rebuilt")
+        rig.wait_until(lambda: branches(bare) == [branch], "the replaced branch is deleted")
     assert rig.restart(url)
     petra.merge(branch)
     assert rig.restart(url)
@@ -652,26 +758,27 @@ def test_odd_ids_give_branches_that_git_takes(bare: Path, petra: Person) -> None
     assert all(len(name) < 70 and name.isascii() for name in names)
 
 
-def test_what_a_request_adds_while_it_waits_is_proposed_with_it(bare: Path, petra: Person) -> None:
-    """The second join adds to the first, so the branch gets a commit for each of the two."""
+def test_what_a_request_adds_while_it_waits_is_proposed_beside_it(
+    bare: Path, petra: Person
+) -> None:
+    """The second join adds to the first, whose branch a person may have approved already."""
     more = goal(1, vehicle=2) | {"connections": []}
     with rig.running(bare) as generator:
         first = Proposed(generator, goal(1), "op-1")
         branch = first.branch
+        stands = git(bare, "rev-parse", branch)
         second = Proposed(generator, more, "op-2")
-        assert second.branch == branch
-        found = rig.commits(bare, f"main..{branch}")
-        assert [commit.one("Operation-Id") for commit in found] == ["op-1", "op-2"]
-        assert generator.withdraw("op-2")
-        with pytest.raises(Withdrawn):
-            rig.receipt(second.ticket)
-        rig.wait_until(
-            lambda: len(rig.commits(bare, f"main..{branch}")) == 1,
-            "only one commit of the two demands is left",
-        )
+        assert sorted([branch, second.branch]) == sorted(branches(bare))
+        assert git(bare, "rev-parse", branch) == stands
         petra.merge(branch)
         assert first.outcome() == "booked"
-    assert rig.books(bare) == rig.books_after([goal(1)])
+        rig.wait_until(
+            lambda: git(bare, "merge-base", "main", second.branch) == stands,
+            "the second branch is rebuilt on the first",
+        )
+        petra.merge(second.branch)
+        assert second.outcome() == "booked"
+    assert rig.books(bare) == rig.books_after([goal(1), more])
 
 
 def test_whoever_watches_hears_of_a_merge(bare: Path, petra: Person) -> None:

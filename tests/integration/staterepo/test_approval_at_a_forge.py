@@ -16,10 +16,10 @@ import pytest
 from demandops.errors import TurnedDown, Withdrawn
 from demandops.service.approvals import forge_worker
 
-from tests.kit import rig
+from tests.kit import goals, rig
 from tests.kit.generator import Proposed
 from tests.kit.http import Answer, Call, serving
-from tests.kit.repo import Person, branches
+from tests.kit.repo import Person, branches, git
 from tests.kit.rig import goal
 
 TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
@@ -86,11 +86,32 @@ def test_a_pull_request_is_opened_and_its_link_told(
         assert f"{branch} {pull['html_url']} (required by" in proposed.told[-1][1]
         assert (pull["head"], pull["base"]) == (branch, "main")
         assert pull["title"] == "Join edge/fusion-1, vehicle01/edge"
-        assert "This demand needs approval, as required by access domain" in pull["body"]
+        assert "This demand needs approval, as required by ` access domain" in pull["body"]
         assert "```text\nJoin edge/fusion-1, vehicle01/edge\n" in pull["body"]
         petra.merge(branch)
         assert proposed.outcome() == "booked"
     assert [one["state"] for one in hub.pulls] == ["open"], "the generator must not merge"
+
+
+def test_a_changed_demand_is_a_new_pull_request_and_the_old_one_is_closed_and_names_it(
+    hub: Hub, url: str, bare: Path, petra: Person
+) -> None:
+    def visit(vehicle: str) -> Any:
+        return goals.put("visit", "user", topic=(f"/vehicles/{vehicle}/ego_data", vehicle))
+
+    with rig.running(url) as generator:
+        first = Proposed(generator, visit("vehicle01"))
+        seen = f"{first.branch} {git(bare, 'rev-parse', first.branch)}"
+        second = Proposed(generator, visit("vehicle02"))
+        assert f"{second.branch} " in second.told[-1][1]
+        rig.wait_until(lambda: hub.pulls[0]["state"] == "closed", "the old one is closed")
+        old, new = hub.pulls
+        assert (old["head"], new["head"]) == (first.branch, second.branch)
+        assert second.branch in old["body"].splitlines()[0]
+        assert old["body"].endswith("```\n"), "the text is kept"
+        changed = f"This has changed: it replaces {seen}, and no approval of that counts here. "
+        assert new["body"].startswith(changed)
+        assert "https://github.com/its/state/pull/2 " in second.told[-1][1]
 
 
 def test_a_closed_pull_request_turns_the_demand_down(hub: Hub, bare: Path, petra: Person) -> None:

@@ -131,7 +131,7 @@ def test_a_change_is_honoured_without_any_demand(
         commit = followed(bare, made)
         assert commit.one("Caused-By") == f"{made} Petra Platform <petra@example.org>"
         assert holds(_everything(bare))
-        by_petra = rig.git(bare, "log", "--author=petra@example.org", "--format=%H", "main")
+        by_petra = rig.git(bare, "log", "--author=<petra@example.org>", "--format=%H", "main")
         assert by_petra.splitlines() == [commit.id, made]
         committer = rig.git(bare, "log", "-1", "--format=%cn", commit.id)
         assert committer == "DemandOps generator"

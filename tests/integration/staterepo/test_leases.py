@@ -97,7 +97,7 @@ def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(
     author, made, body = rig.git(bare, "log", "-1", "--format=%an <%ae>%n%ct%n%b", commit.id).split(
         "\n", 2
     )
-    assert author == "station00, vehicle00 <short@demandops.invalid>"
+    assert author == "station00, vehicle00 (requesters) <short@requester.demandops.invalid>"
     assert int(made) >= int(end.timestamp()), "the lease was ended too early"
     told = end.strftime("%Y-%m-%d %H:%M:%S UTC")
     assert "the lease of demand 'short' on 1 application and 1 connection in the name" in body
@@ -265,9 +265,10 @@ def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
             rig.book(generator, put(name, None, who=name))
     assert "internal error" not in caplog.text
     made = rig.commits(bare)[-len(names) :]
-    assert [commit.all("Demand-Id") for commit in made] == [[name] for name in names]
+    written = [name.replace("#1", r'"\x231"') for name in names]
+    assert [commit.all("Demand-Id") for commit in made] == [[name] for name in written]
     assert [set(commit.all("Requester")) for commit in made] == [
-        {name, "station00"} for name in names
+        {name, "station00"} for name in written
     ]
     with rig.running(bare) as generator:
         assert {claim.demand for claim in generator.snapshot.state.ledger} == set(names)

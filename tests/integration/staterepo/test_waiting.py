@@ -81,7 +81,7 @@ def test_demands_wait_and_are_booked_in_turn_by_any_generator(
         rig.book(third, _release("d"), _release("c"))
         assert _runs(bare) == ["of-b"]
         message = rig.git(bare, "log", "-1", "--format=%an%n%B", "main")
-        assert message.startswith("vehicle00\nPut b, derived/vehicle00/edge\n")
+        assert message.startswith("vehicle00 (requester)\nPut b, derived/vehicle00/edge\n")
         assert "It waited for room." in message
         person.change({waiting.path_of("nobody"): "not: valid\n"}, "A file that is none")
         rig.book(third, _release("b"))

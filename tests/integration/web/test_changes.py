@@ -28,7 +28,7 @@ from starlette.testclient import TestClient
 from tests.integration.web.conftest import VIEWS, Look, causes
 from tests.kit import goals
 from tests.kit.generator import Proposed, book, running, wait_until
-from tests.kit.repo import GitRepo, Person, away
+from tests.kit.repo import GitRepo, Person, away, git
 
 DENY = """apiVersion: demandops/v1
 kind: Override
@@ -103,8 +103,8 @@ def test_too_many_causes_are_counted(
     assert page.texts("h1") == ["2 things need attention"]
 
 
-def test_a_proposal_names_the_branch_to_merge(
-    booked: Generator, person: Person, look: Look, follower: Follower
+def test_a_proposal_names_its_commit_and_how_to_approve_just_that(
+    booked: Generator, state: GitRepo, person: Person, look: Look, follower: Follower
 ) -> None:
     person.policy(approval="required")
     booked.fetch_now()
@@ -112,8 +112,12 @@ def test_a_proposal_names_the_branch_to_merge(
     proposed = Proposed(booked, goals.goal([goals.application("edge/new", who=["v"])], []))
     branch = proposed.branch
     wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
-    assert f"git merge origin/{branch} && git push" in look("/").text
-    assert f"git push origin --delete {branch}" in look("/overrides").text
+    commit = git(state.path, "rev-parse", branch)
+    approve = f"demandops approve {branch} --commit {commit[:12]}"
+    assert approve in look("/").text
+    shown = look("/overrides").text
+    assert commit in shown and approve in shown
+    assert approve.replace("approve", "reject") in shown
 
 
 def _approved(generator: Generator) -> bool:

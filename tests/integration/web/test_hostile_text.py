@@ -68,10 +68,11 @@ def test_a_branch_is_no_command_and_hides_nothing(
     commit = git(state.path, "commit-tree", "main^{tree}", "-p", "main", "-m", message).strip()
     git(state.path, "branch", branch, commit)
     wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
-    shown = f"origin/{branch}".replace(HIDDEN, "\\u202e")
+    shown = branch.replace(HIDDEN, "\\u202e")
+    wanted = ["demandops", "approve", shown, "--commit", commit[:12]]
     page = look("/overrides")
-    (merge,) = [text for text in page.texts("code") if text.startswith("git merge")]
-    assert shlex.split(merge) == ["git", "merge", shown, "&&", "git", "push"]
-    (merge,) = [text for text in look("/").texts("code") if text.startswith("git merge")]
-    assert shlex.split(merge) == ["git", "merge", shown, "&&", "git", "push"]
+    (approve,) = [text for text in page.texts("code") if " approve " in text]
+    assert shlex.split(approve) == wanted
+    (approve,) = [text for text in look("/").texts("code") if " approve " in text]
+    assert shlex.split(approve) == wanted
     assert HIDDEN not in page.text + look("/").text

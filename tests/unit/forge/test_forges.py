@@ -77,7 +77,7 @@ def test_what_became_of_a_request_is_told(kind: str, state: str, token: Path) ->
 
 def test_a_request_is_closed(kind: str, token: Path) -> None:
     with forge(kind, "close", token) as (made, _):
-        made.close(PullRequest(7, LINKS[kind], "open"))
+        made.close(PullRequest(7, LINKS[kind], "open"), "Closed: ` was replaced `")
 
 
 def test_a_refusal_is_told_in_the_forges_words_without_the_token(kind: str, token: Path) -> None:

@@ -13,6 +13,7 @@ from demandops.errors import fault
 from demandops.identifiers import id_problem
 from demandops.render.changes.changeset import ReleaseChange
 from demandops.staterepo.history import commit_log, commit_message
+from demandops.staterepo.history.message_format import compose
 
 from tests.kit import goals
 from tests.kit.repo import git, write_tree
@@ -196,7 +197,7 @@ def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly
             continue
         parents = [commit]
         commits.append(name)
-        assert who.email.endswith("@demandops.invalid")
+        assert who.email.endswith("@requester.demandops.invalid")
         assert who.name.strip()
         assert len(who.name) <= 200
         assert commit_log.entry_of(repo[commit].peel(pygit2.Commit)).trailers["Requester"] == [name]
@@ -205,7 +206,8 @@ def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly
     fsck = subprocess.run(command, capture_output=True, text=True, check=False)
     form = "--format=%(trailers:key=Requester,valueonly)%x1e"
     read_back = git(repo.path, "log", "--reverse", form).split("\n\x1e\n")
-    assert [name.removesuffix("\n\x1e") for name in read_back] == commits
+    lines = [compose([], [("Requester", name)]).strip() for name in commits]
+    assert [f"Requester: {name}".removesuffix("\n\x1e") for name in read_back] == lines
     assert (fsck.returncode, fsck.stdout, fsck.stderr) == (0, "", "")
     assert failed == []
 
@@ -213,20 +215,20 @@ def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly
 @pytest.mark.parametrize(
     ("names", "wanted"),
     [
-        (("vehicle00", "station00"), "vehicle00, station00"),
-        (("Ada <ada@example.org>",), "Ada (ada@example.org)"),
-        (("x" * 300,), "x" * 199 + "…"),
-        ((".",), "unnamed"),
-        (("\\",), "unnamed"),
-        (("'quoted'",), "quoted"),
+        (("vehicle00", "station00"), "vehicle00, station00 (requesters)"),
+        (("Ada <ada@example.org>",), "Ada (ada@example.org) (requester)"),
+        (("x" * 300,), "x" * 187 + "… (requester)"),
+        ((".",), "(requester)"),
+        (("\\",), "(requester)"),
+        (("'quoted'",), "quoted' (requester)"),
     ],
 )
-def test_the_author_is_the_requesters_as_listed(
+def test_the_author_is_the_requesters_as_listed_and_never_a_person(
     desk: Any, names: tuple[str, ...], wanted: str
 ) -> None:
     decision = desk.join(*names)
     who = commit_message.author(decision, desk.now)
     assert who.name == wanted
     demand = decision.changes.claims[0].key.demand
-    assert who.email == f"{demand}@demandops.invalid"
+    assert who.email == f"{demand}@requester.demandops.invalid"
     assert (who.time, who.offset) == (int(desk.now.timestamp()), 0)

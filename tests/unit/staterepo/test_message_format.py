@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
+
 import pygit2
-from demandops.quoting import is_visible, one_line
+from demandops.quoting import harmless, is_visible, one_line
 from demandops.staterepo.history.message_format import compose, parse
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -40,8 +42,8 @@ def test_trailers_are_read_back_exactly_and_nothing_else_stands_in_the_message(
         wanted.setdefault(key, []).append(value)
     found = parse(text)
     assert found.trailers == wanted
-    assert found.summary == one_line(paragraphs[0][0])
-    lines = [one_line(line) for paragraph in paragraphs for line in paragraph]
+    assert found.summary == harmless(one_line(paragraphs[0][0]))
+    lines = [harmless(one_line(line)) for paragraph in paragraphs for line in paragraph]
     above = text.removesuffix("\n").rpartition("\n\n")[0].split("\n")
     assert [line for line in above if line] == [line for line in lines if line]
 
@@ -61,16 +63,74 @@ def test_git_keeps_the_message_whole_and_finds_the_same_trailers(
     repo: pygit2.Repository, trailers: list[tuple[str, str]]
 ) -> None:
     text = compose([["Join a"]], [*trailers, ("Render-Version", "2")])
+    assert parse(f"Join a\n\n{_trailers_of_git(repo, text)}") == parse(text)
+
+
+def _trailers_of_git(repo: pygit2.Repository, text: str) -> str:
     who = pygit2.Signature("x", "x@example.org", 0, 0)
     commit = repo.create_commit(None, who, who, text, repo.TreeBuilder().write(), [])
     assert repo[commit].peel(pygit2.Commit).message == text
-    by_git = git(
-        repo.path, "log", "-1", "--encoding=UTF-8", "--format=%(trailers:only)", str(commit)
-    )
-    assert parse(f"Join a\n\n{by_git}") == parse(text)
+    shown = ("log", "-1", "--encoding=UTF-8", "--format=%(trailers:only)", str(commit))
+    return git(repo.path, *shown).strip()
+
+
+FORGES = {
+    "GitHub skips a pipeline": r"(?i)\[(skip ci|ci skip|no ci|skip actions|actions skip)\]",
+    "GitLab skips a pipeline": r"(?i)\[(ci[ _-]skip|skip[ _-]ci)\]",
+    "Azure skips a pipeline": r"(?i)\*\*\*NO_CI\*\*\*|\[skip (azp|azurepipelines)\]",
+    "GitHub skips its checks": r"(?im)^(skip|request)-checks\s*:",
+    "GitHub and Gitea link an issue": r"(?i)(?<![\w&])(#|[\w.-]+/[\w.-]+#|GH-)[0-9]+",
+    "GitLab links an issue, a merge request, a snippet or an epic": r"(?<!\w)[\w./-]*[#!$&][0-9]+",
+    "GitLab closes an issue": r"(?i)\b(clos(e[sd]?|ing)|fix(e[sd]|ing)?|resolv(e[sd]?|ing)|"
+    r"implement(s|ed|ing)?):? +(issues? +)?([\w./-]*#[0-9]+|[A-Z][A-Z0-9_]+-[0-9]+|"
+    r"https?://\S+/(-/)?(issues|work_items|merge_requests|epics)/[0-9]+)",
+    "Gitea and GitHub follow an address": r"https?://\S+/(issues|pulls?|merge_requests)/[0-9]+",
+    "Gitea links an issue": r"""(?:\s|^|[(\["'])[#!][0-9]+""",
+    "Jira obeys": r"\B#(close|resolve|comment|time)\b",
+    "somebody is called": r"(?a:(^|\W)@[A-Za-z0-9_])",
+    "GitLab or Prow obeys": r"(?m)^/[a-z]",
+    "somebody has signed": r"(?im)^(signed-off|co-authored|reviewed|acked|tested)-by\s*:",
+}
+"""What forges and pipelines act on, in the form that their documentation gives."""
+
+ORDERS = (
+    *("[skip ci]", "[CI SKIP]", "[no ci]", "[skip-ci]", "[actions skip]", "***NO_CI***"),
+    *("#1", "its/state#12", "GH-7", "!3", "its/state!3", "$4", "&5", "@petra", "@its/admins"),
+    *("Fixes #1", "closes: its/state#2", "Resolve GH-3", "Closes ABC-12", "Fix issue ABC-1"),
+    *("https://github.com/its/state/issues/1", "Closes https://gitlab.com/a/b/-/issues/9"),
+    *("/merge", "/approve", "Signed-off-by: Petra <petra@example.org>", "skip-checks: true"),
+    *("Co-authored-by: Petra <petra@example.org>", "ABC-1 #close", "\n", "\n\n", " ", "x", "ä"),
+    *("[", "]", "skip", "ci", "#", "@", "!", "*", "-", "/", "1", '"', "\\", "\\x23", "\u200b"),
+)
+
+
+@given(text=st.lists(st.sampled_from(ORDERS), min_size=1, max_size=6).map("".join))
+@example(text=" ".join(ORDERS))
+@examples(200)
+def test_no_forge_acts_on_what_a_requester_writes(repo: pygit2.Repository, text: str) -> None:
+    paragraphs = [
+        [f"Join {text}"],
+        [f"Why: request '{text}', asks for {text}."],
+        ["List:", f"  {text}"],
+    ]
+    trailers = [("Requester", text), ("Demand-Id", text), ("Override", f"overrides/{text}.yaml")]
+    message = compose(paragraphs, trailers)
+    assert {what for what, acts in FORGES.items() if re.search(acts, message)} == set()
+    assert [(key, value) for key, [value] in parse(message).trailers.items()] == trailers
+    assert _trailers_of_git(repo, message) == compose([], trailers).strip()
+
+
+def test_the_patterns_find_what_is_not_made_harmless() -> None:
+    found = {what for what, acts in FORGES.items() if re.search(acts, "\n".join(ORDERS))}
+    assert found == set(FORGES)
+
+
+def test_a_person_may_close_an_issue_with_a_reason() -> None:
+    message = compose([["Roll back"]], [("Reason", "[no ci] Fixes #1, @anna"), ("Requester", "#1")])
+    assert message == 'Roll back\n\nReason: [no ci] Fixes #1, @anna\nRequester: "\\x231"\n'
 
 
 def test_messages_of_earlier_versions_are_read_as_they_were_meant() -> None:
-    values = ['"', "\\", '"a"', "a: b", "a\u200bb", '"\\\'"', "a\\x41"]
+    values = ["Fixes #1", "@a", '"', "\\", '"a"', "a: b", "a\u200bb", '"\\\'"', "a\\x41"]
     text = "Join a\n\n" + "".join(f"Requester: {value}\n" for value in values)
     assert parse(text).trailers["Requester"] == values

@@ -8,6 +8,7 @@ import click
 
 from demandops.cli.actions.person_change import (
     confirm,
+    is_asked,
     reason_option,
     warned_if_unnamed,
     writable,
@@ -17,12 +18,23 @@ from demandops.cli.json_output import output_option, show
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors
 from demandops.cli.target import signing_option, writable_repo_option
+from demandops.cli.views.diff import differences, entry_lines, release_lines
 from demandops.errors import InvalidInput, suggestion
+from demandops.ledger.claim_file import LEDGER_ROOT
+from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.runtime import REAL
 from demandops.staterepo.reader import Reader
 from demandops.staterepo.write import person_commit
 from demandops.staterepo.write.person_commit import CommitDetails
 from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
+
+commit_option = click.option(
+    "--commit",
+    metavar="ID",
+    default="",
+    help="The commit that you looked at, or at least 7 digits of its id. If the branch is at "
+    "another commit, nothing is changed.",
+)
 
 
 def proposal_named(repo: Reader, name: str) -> PendingProposal:
@@ -49,17 +61,38 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
 
 
 def print_proposal(proposal: PendingProposal, output: str) -> None:
-    """Print a proposal's branch, summary, requesters and time on stderr, unless output is JSON."""
+    """Print which proposal it is on stderr, unless output is JSON."""
     if output == "text":
-        errors.print(f"{proposal.branch}: {proposal.summary}")
-        errors.print(
-            f"  for {', '.join(proposal.requesters)}, proposed {proposal.since:%F %H:%M} UTC"
-        )
+        for line in (
+            f"{proposal.branch} at commit {proposal.commit}",
+            f"  {proposal.summary}",
+            f"  for {', '.join(proposal.requesters)}, proposed {proposal.since:%F %H:%M} UTC",
+            *(f"  required by {reason}" for reason in proposal.required_by),
+            *(f"  changed: it replaces {old}" for old in proposal.replaces),
+        ):
+            errors.print(line)
+
+
+def _print_consequence(repo: Reader, commit: str) -> None:
+    base = repo.base_of(commit)
+    entries, found = differences(repo, base, commit)
+    by_hand = (
+        path
+        for path in repo.changed_files(base, commit)
+        if not path.startswith((f"{CLUSTERS_ROOT}/", f"{LEDGER_ROOT}/"))
+    )
+    for line in (
+        *entry_lines(entries),
+        *release_lines(found.releases, "release "),
+        *(f"~ file {path}" for path in (*found.other_files, *by_hand)),
+    ):
+        errors.print(f"  {line}")
 
 
 @click.command()
 @click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
 @reason_option
+@commit_option
 @yes_option
 @writable_repo_option
 @signing_option
@@ -67,6 +100,7 @@ def print_proposal(proposal: PendingProposal, output: str) -> None:
 def approve(
     name: str,
     reason: str | None,
+    commit: str,
     yes: bool,
     state_repo: str,
     signing_key: Path | None,
@@ -74,18 +108,29 @@ def approve(
 ) -> None:
     """Approve a proposed demand: merge its branch in your own name.
 
-    The generator then answers the demand and removes the branch. If main has changed the same
-    files since the proposal was made, the command merges nothing. In this case, wait until a
-    running generator has rebuilt the branch, and then approve the proposal again.
+    At a terminal, the command first shows what the merge would change, and asks. Elsewhere, and
+    with --yes, name the commit that you looked at: --commit ID. If the branch is at another commit,
+    the command merges nothing. The generator then answers the demand and removes the branch. If
+    main has changed the same files since the proposal was made, the command merges nothing either.
+    In this case, wait until a running generator has rebuilt the branch, and then approve the
+    proposal again.
 
     \b
     Examples:
-      demandops approve demand/visit-3f2a9c1b04de
       demandops approve visit -m "Agreed with the control room"
+      demandops approve demand/visit-3f2a9c1b04de --commit 5d41402abc
     """
+    if not (commit or is_asked(yes, output)):
+        raise click.UsageError(
+            "name the commit that you looked at: --commit ID; `demandops get proposals` lists it"
+        )
     with writable(state_repo, signing_key) as repo:
         proposal = proposal_named(repo, name)
+        if commit:
+            proposal.require(commit)
         print_proposal(proposal, output)
+        if output == "text":
+            _print_consequence(repo, proposal.commit)
         confirm("Approve it?", yes, output)
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         why = " ".join((reason or "").split())

@@ -35,7 +35,7 @@ from demandops.config.repo_settings import Proposals
 from demandops.forge import ForgeError, forge_for
 from demandops.ledger.world import World
 from demandops.plan.views.override_report import Entry, override_report
-from demandops.quoting import one_line
+from demandops.quoting import harmless, one_line
 from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo import reader
@@ -218,7 +218,7 @@ def _push_options(repo: Reader, edit: Edit) -> list[str]:
     return [
         "merge_request.create",
         f"merge_request.target={MAIN_BRANCH}",
-        f"merge_request.title={one_line(edit.summary)}",
+        f"merge_request.title={harmless(one_line(edit.summary))}",
         f"merge_request.description={one_line(edit.reason)}",
         "merge_request.remove_source_branch",
     ]
@@ -233,7 +233,8 @@ def _opened(repo: Reader, edit: Edit, branch: str) -> str:
         forge = forge_for(_forge_settings(repo), settings.forge_token_file())
         if forge is None:
             return ""
-        return forge.open(branch, MAIN_BRANCH, one_line(edit.summary), one_line(edit.reason)).link
+        title = harmless(one_line(edit.summary))
+        return forge.open(branch, MAIN_BRANCH, title, one_line(edit.reason)).link
     except ForgeError as error:
         errors.print(f"warning: no merge request was opened: {error}; open one for {branch}")
         return ""

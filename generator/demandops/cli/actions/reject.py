@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import click
 
-from demandops.cli.actions.approve import print_proposal, proposal_named
+from demandops.cli.actions.approve import commit_option, print_proposal, proposal_named
 from demandops.cli.actions.person_change import confirm, writable, yes_option
 from demandops.cli.json_output import output_option, show
 from demandops.cli.name_completion import names_of
@@ -14,10 +14,11 @@ from demandops.staterepo.write.proposal_branch import ProposalBranches
 
 @click.command()
 @click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
+@commit_option
 @yes_option
 @writable_repo_option
 @output_option
-def reject(name: str, yes: bool, state_repo: str, output: str) -> None:
+def reject(name: str, commit: str, yes: bool, state_repo: str, output: str) -> None:
     """Turn a proposed demand down: delete its branch.
 
     The generator then aborts the goal with `turned-down`. If the branch has changed since the
@@ -30,6 +31,8 @@ def reject(name: str, yes: bool, state_repo: str, output: str) -> None:
     """
     with writable(state_repo, None) as repo:
         proposal = proposal_named(repo, name)
+        if commit:
+            proposal.require(commit)
         print_proposal(proposal, output)
         confirm("Turn it down?", yes, output)
         ProposalBranches(repo.repository).remove(proposal.branch, proposal.commit)

@@ -12,7 +12,7 @@ from demandops.cli.output import SIGNS, progress, warn_of
 from demandops.cli.target import state_repo_option
 from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 from demandops.render.changes.changeset import ReleaseChange
-from demandops.render.changes.merge_preview import planned_releases, preview
+from demandops.render.changes.merge_preview import MergePreview, planned_releases, preview
 from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.staterepo import reader
 from demandops.staterepo.load.snapshot import Snapshot
@@ -36,15 +36,7 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
       demandops diff 2h 0s
     """
     with reader.opened(state_repo) as repo:
-        old, new = (loaded(repo, revision) for revision in (before, after))
-        commits = str(old.commit), str(new.commit)
-        differing = repo.changed_files(*commits, (CLUSTERS_ROOT,))
-        texts = []
-        for read in map(repo.file_reader, commits):
-            read_texts = {path: read(path) for path in differing}
-            texts.append({path: text for path, text in read_texts.items() if text is not None})
-    found = preview(planned_releases(old.state), planned_releases(new.state), *texts)
-    entries = bookkeeping_changes(bookkeeping(old.state), bookkeeping(new.state))
+        entries, found = differences(repo, before, after)
     data = {
         "bookkeeping": [asdict(each) for each in entries],
         "releases": [asdict(each) for each in found.releases],
@@ -60,6 +52,21 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
             *(lines or ["no difference in releases"]),
         ],
     )
+
+
+def differences(
+    repo: Reader, before: str, after: str
+) -> tuple[tuple[EntryChange, ...], MergePreview]:
+    """Return what differs between two commits, in the bookkeeping and in what runs."""
+    old, new = (loaded(repo, revision) for revision in (before, after))
+    commits = str(old.commit), str(new.commit)
+    differing = repo.changed_files(*commits, (CLUSTERS_ROOT,))
+    texts = []
+    for read in map(repo.file_reader, commits):
+        read_texts = {path: read(path) for path in differing}
+        texts.append({path: text for path, text in read_texts.items() if text is not None})
+    entries = bookkeeping_changes(bookkeeping(old.state), bookkeeping(new.state))
+    return entries, preview(planned_releases(old.state), planned_releases(new.state), *texts)
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:

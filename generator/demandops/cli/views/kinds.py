@@ -350,6 +350,7 @@ KINDS: dict[str, Kind] = {
         lambda source: proposals(source.repo),
         (
             Column("Branch"),
+            Column("Commit"),
             Column("Requesters", 1, wraps=True),
             Column("Since", 2),
             Column("What", 3, wraps=True),
@@ -357,6 +358,7 @@ KINDS: dict[str, Kind] = {
         ),
         lambda item, now: (
             item["branch"],
+            item["commit"][:10],
             ", ".join(item["requesters"]),
             _when(item["since"], now),
             item["summary"],

@@ -10,6 +10,7 @@ that verdict out.
 
 from __future__ import annotations
 
+import json
 import logging
 from collections import Counter, deque
 from collections.abc import Iterable
@@ -25,17 +26,16 @@ from demandops.quoting import quoted
 from demandops.service.approvals.check_timer import CheckTimer
 from demandops.service.approvals.forge_worker import ForgeWorker
 from demandops.service.approvals.proposal import (
-    Key,
     Proposal,
     Verdict,
     admit_or_none,
+    code,
     decide_in_turn,
     is_release,
     key_of,
-    pull_request_body,
+    pull_request_texts,
     push_options,
     releases,
-    title_of,
     waiting_text,
 )
 from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
@@ -88,19 +88,18 @@ class Approvals:
         self._branches = ProposalBranches(repository)
         self._forge = ForgeWorker(token_file, self._on_forge_update, repository.runtime)
         self._timer = CheckTimer(repository.runtime, local=repository.always_current)
-        self._proposals: dict[Key, Proposal] = {}
+        self._proposals: dict[str, Proposal] = {}  # by branch
         self._changed: deque[str] = deque()
         for ticket in demands.proposed:
             self._resume(ticket, admit_or_none(state, ticket.goal))
+        for proposal in self._proposals.values():  # the last run may have ended in `add`
+            if old := self._proposals.get(proposal.record.replaced_branch):
+                self._replace(old, proposal.branch)
 
     def _resume(self, ticket: Ticket, request: DemandRequest | None) -> None:
         record = replace(ticket.proposal or ProposalRecord(""), withdrawn="")
-        proposal = next((p for p in self._proposals.values() if p.branch == record.branch), None)
-        if proposal is None:
-            key = key_of(request) if request else ("operation", ticket.operation)
-            if key in self._proposals:  # the earlier run left another branch with the same key
-                key = ("operation", ticket.operation)
-            proposal = self._proposals[key] = Proposal(key, record, searched_to=ticket.base)
+        new = Proposal(record, searched_to=ticket.base)
+        proposal = self._proposals.setdefault(record.branch, new)
         if ticket.state == "proposed":  # a withdrawn ticket has an older record
             proposal.record = record
         proposal.tickets.append(ticket)
@@ -125,7 +124,8 @@ class Approvals:
                 continue
             for proposal in [p for p in self._proposals.values() if releases(request, p.requests)]:
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
-                self._delete_branch(proposal, self._branches.heads())
+                if proposal.record.commits:
+                    self._delete_branch(proposal.branch, self._branches.heads())
                 # the next check answers the demands, because their branch may be merged already
                 self._changed.append(proposal.branch)
                 ticket.has_released = True
@@ -146,44 +146,54 @@ class Approvals:
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
-        """Add a demand to the proposal that has the demand's key, or to a new proposal.
+        """Add a demand to the proposal of the same demand, or to a new proposal.
 
-        A put with other content replaces the earlier demands of its proposal. The demand gets an
-        error as its answer if other requesters own the proposal, if a requester has too many
-        proposals, or if the demand was withdrawn.
+        What a person has seen on a branch never becomes another demand there. So a put with other
+        content gets a branch of its own, and replaces the earlier proposal. The demand gets an
+        error as its answer if other requesters own the earlier proposal, if a requester has too
+        many proposals, or if the demand was withdrawn.
         """
-        request, key = decision.request, key_of(decision.request)
-        proposal = self._proposals.get(key)
-        if proposal is not None and not proposal.requesters() & set(request.requesters()):
-            owners = ", ".join(sorted(proposal.requesters()))
-            message = f"'{request.demand}' is a demand of {owners}; choose another demand id"
+        request, waiting = decision.request, self._waiting(decision.request)
+        owners = {name for each in waiting for name in each.requesters()}
+        if owners and not owners & set(request.requesters()):
+            message = f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; "
+            message += "choose another demand id"
             self._demands.fail([ticket], Refused([fault("demand", message, code="not-yours")]))
             return
-        if proposal is None and (full := self._requester_over_limit(request)):
-            message = (
-                f"requester {quoted(full)} already has {PROPOSAL_LIMIT} proposals that await "
-                "approval; release some of the demands in these proposals, or ask a person to "
-                "approve or reject some of the proposals"
-            )
-            self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
-            return
+        goal = json.dumps(ticket.goal)
+        proposal = next((each for each in waiting if goal in each.goals()), None)
+        replaced = waiting if isinstance(request, Put) and proposal is None else []
         if proposal is None:
+            if not replaced and (full := self._requester_over_limit(request)):
+                message = (
+                    f"requester {quoted(full)} already has {PROPOSAL_LIMIT} proposals that await "
+                    "approval; release some of the demands in these proposals, or ask a person to "
+                    "approve or reject some of the proposals"
+                )
+                self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
+                return
             branch = branch_name(request.demand or request.id, ticket.operation)
-            proposal = Proposal(key, ProposalRecord(branch), searched_to=ticket.base)
-        elif isinstance(request, Put) and request not in proposal.requests:
-            # the next check answers the withdrawn demands: a person may have merged them meanwhile
-            self._demands.withdraw_proposed(proposal.tickets, REPLACED)
-            proposal.requests = []
+            replaces = next((each.record.as_replaced() for each in replaced), "")
+            proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
             return
-        self._proposals[key] = proposal
+        self._proposals[proposal.branch] = proposal
         proposal.tickets.append(ticket)
         proposal.requests.append(request)
         self._changed.append(proposal.branch)
+        for old in replaced:
+            self._replace(old, branch)
+
+    def _waiting(self, request: DemandRequest) -> list[Proposal]:
+        """Return the proposals of the same demand, whatever its content."""
+        key = key_of(request)
+        waiting = (each for each in self._proposals.values() if each.waits)
+        return [each for each in waiting if key in map(key_of, each.requests)]
 
     def _requester_over_limit(self, request: DemandRequest) -> str:
-        counts = Counter(name for each in self._proposals.values() for name in each.requesters())
+        waiting = (each for each in self._proposals.values() if each.waits)
+        counts = Counter(name for each in waiting for name in each.requesters())
         full = (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT)
         return next(full, "")
 
@@ -192,9 +202,16 @@ class Approvals:
 
         The caller has found that ``request`` needs no approval.
         """
-        proposal = self._proposals.get(key_of(request))
-        if proposal is not None and isinstance(request, Put):
+        for proposal in self._waiting(request) if isinstance(request, Put) else ():
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
+
+    def _replace(self, old: Proposal, branch: str) -> None:
+        """Withdraw the demands of a proposal, because the proposal on ``branch`` replaces it.
+
+        The next check answers them: a person may have merged them meanwhile.
+        """
+        self._demands.withdraw_proposed(old.tickets, f"{REPLACED}: {branch}")
+        self._changed.append(old.branch)
 
     # ---- after main was read ----
 
@@ -237,10 +254,8 @@ class Approvals:
                 this check did not reach.
         """
         while self._changed:
-            branch = self._changed.popleft()
-            for proposal in self._proposals.values():
-                if proposal.branch == branch:
-                    proposal.checked_at = ""
+            if changed := self._proposals.get(self._changed.popleft()):
+                changed.checked_at = ""
         began, proposals = self._runtime.monotonic(), list(self._proposals.values())
         for number, proposal in enumerate(proposals):
             if number and self._must_pause(began):
@@ -266,8 +281,7 @@ class Approvals:
 
     def _check_next(self, proposals: list[Proposal]) -> None:
         """Make another check due, which begins with ``proposals``."""
-        first = set(proposals)
-        self._proposals = {k: p for k, p in self._proposals.items() if p in first} | self._proposals
+        self._proposals = {each.branch: each for each in proposals} | self._proposals
         self._changed.append(proposals[0].branch)
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
@@ -296,18 +310,21 @@ class Approvals:
         if verdict.unapproved:
             if booked and not head:  # a person merged only some of the demands
                 proposal.record = replace(proposal.record, pushed=False)
-            if not self._leave_out(proposal, verdict, snapshot, head):
+            if not self._leave_out(proposal, verdict, snapshot, heads):
                 self._changed.append(proposal.branch)
                 return
             proposal.checked_at = tip
-        elif not booked or head in proposal.record.commits:
-            self._delete_branch(proposal, heads)
+        else:
+            if proposal.record.commits and (not booked or head in proposal.record.commits):
+                self._delete_branch(proposal.branch, heads)
+            self._delete_replaced(proposal, heads)
         # the branch no longer has these demands, so nobody can merge them
         self._demands.answer(verdict.failed)
         self._demands.requeue(verdict.free)
         if not verdict.unapproved:
             proposal.wait_for([])
-            self._forget(proposal, close=not booked)
+            why = next((error for _, error in verdict.failed), "it needs no approval any more")
+            self._forget(proposal, "" if booked else str(why))
 
     def _receipt(
         self,
@@ -327,7 +344,7 @@ class Approvals:
     # ---- the branch and its pull request ----
 
     def _leave_out(
-        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
+        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
         """Update the branch so that it contains only the demands that still need approval.
 
@@ -337,13 +354,15 @@ class Approvals:
         before, is_updated = proposal.tickets, False
         proposal.wait_for(verdict.unapproved)
         try:
-            is_updated = self._update(proposal, verdict, snapshot, head)
+            is_updated = self._update(proposal, verdict, snapshot, heads)
         finally:
             if not is_updated:
                 proposal.tickets = [ticket for ticket in before if ticket.state != "done"]
         return is_updated
 
-    def _update(self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str) -> bool:
+    def _update(
+        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
+    ) -> bool:
         """Rebuild the branch if it is outdated, open its pull request and notify the requesters.
 
         A branch with commits by a person stays unchanged.
@@ -351,17 +370,18 @@ class Approvals:
         Returns:
             False if a demand was withdrawn meanwhile and the proposal must be checked again.
         """
+        head = heads.branches.get(proposal.branch)
         if head and head not in proposal.record.commits:
             if not proposal.edited:
                 log.info("%s has commits by a person and stays unchanged", proposal.branch)
             proposal.edited = True
-        elif not self._bring_up_to_date(proposal, verdict, snapshot, head):
+        elif not self._bring_up_to_date(proposal, verdict, snapshot, heads):
             return False
         forge = snapshot.state.config.repo_settings.proposals
         if forge.forge in ("github", "gitea"):
             message = self._branches.message(proposal.record.commits[-1])
-            body = pull_request_body(message, proposal.reasons)
-            self._forge.open(forge, proposal.branch, title_of(message), body)
+            title, body = pull_request_texts(message)
+            self._forge.open(forge, proposal.branch, title, body)
             if not self._forge.was_queried(proposal.branch):
                 return True  # the requester is notified once the link is known
         request = self._forge.pull_request(proposal.branch)
@@ -371,9 +391,12 @@ class Approvals:
         return True
 
     def _bring_up_to_date(
-        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, head: str
+        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
         """Rebuild the branch on main, with one commit for each demand, unless it is up to date.
+
+        If the demands would now book something else, such as another node that was chosen, the
+        proposal moves to another branch: what was approved so far is not that.
 
         Return False if a demand was withdrawn; the branch is then not pushed.
         """
@@ -382,22 +405,32 @@ class Approvals:
         verdict.failed.extend(failed)
         proposal.drop(failed)
         old, tip = proposal.record, snapshot.commit
+        head = heads.branches.get(old.branch, "")
         files = {path: text for _, step in steps for path, text in step.files.items()}
         if head and self._branches.is_up_to_date(tip, head, old.base, files):
             return True
-        now, branch = self._runtime.now(), proposal.branch
+        if head and steps and not self._branches.books_the_same(tip, head, old.base, files):
+            request, ticket = proposal.requests[0], proposal.tickets[0]
+            branch = branch_name(request.demand or request.id, f"{ticket.operation} {head}")
+            self._forget(proposal, f"main has changed, so it is proposed anew: {branch}")
+            proposal.record = old = ProposalRecord(branch, replaces=f"{old.branch} {head}")
+            self._proposals[branch] = proposal
+            head = ""
+        now, branch = self._runtime.now(), old.branch
         for ticket, step in steps:
             if step.files:
-                commits.commit(step, ticket.operation, ticket.received, now, branch)
+                commits.commit(step, ticket.operation, ticket.received, now, old)
         commit = commits.head.commit
         newest = (head, str(commit)) if head else (str(commit),)
         record = replace(old, commits=newest, base=str(tip))
         if not self._journal(proposal, record):
             return False
+        if not head:
+            self._delete_replaced(proposal, heads)
         forge, options = snapshot.state.config.repo_settings.proposals, []
         if forge.forge == "gitlab":
             message = self._branches.message(str(commit))
-            options = push_options(message, proposal.reasons, forge.labels)
+            options = push_options(message, forge.labels)
         link = self._branches.put(branch, commit, head, options)
         self._journal(proposal, replace(record, pushed=True, link=link or old.link))
         log.info("%s %s", branch, "was rebuilt" if head else "awaits approval")
@@ -409,20 +442,25 @@ class Approvals:
         waiting = [self._demands.propose(ticket, record) for ticket in proposal.tickets]
         return all(waiting)
 
-    def _delete_branch(self, proposal: Proposal, heads: BranchHeads) -> None:
-        head = heads.branches.get(proposal.branch)
-        if head and proposal.record.commits:
-            self._branches.remove(proposal.branch, head)
+    def _delete_replaced(self, proposal: Proposal, heads: BranchHeads) -> None:
+        """Delete the branch that a proposal replaces, unless that is a proposal still."""
+        if proposal.record.replaced_branch not in self._proposals:
+            self._delete_branch(proposal.record.replaced_branch, heads)
+
+    def _delete_branch(self, branch: str, heads: BranchHeads) -> None:
+        if head := heads.branches.get(branch):
+            self._branches.remove(branch, head)
+            del heads.branches[branch]
 
     # ---- the end ----
 
     def _end(self, proposal: Proposal, error: DemandOpsError) -> None:
         self._demands.fail(proposal.tickets, error)
-        self._forget(proposal, close=True)
+        self._forget(proposal, str(error))
 
-    def _forget(self, proposal: Proposal, *, close: bool) -> None:
-        self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
-        self._forge.forget(proposal.branch, close=close)
+    def _forget(self, proposal: Proposal, closed_as: str) -> None:
+        self._proposals.pop(proposal.branch, None)
+        self._forge.forget(proposal.branch, code(closed_as) if closed_as else "")
 
     def _on_forge_update(self, branch: str) -> None:
         """Make a check of the branch due, because its pull request changed.

@@ -32,7 +32,8 @@ class _Task:
     branch: str
     title: str
     body: str
-    close: bool = False
+    closed_as: str = ""
+    """Why to close the pull request; empty to open it."""
 
 
 class ForgeWorker:
@@ -72,13 +73,14 @@ class ForgeWorker:
         """Return the pull request of a branch as of the last query; None if none is known."""
         return self._pull_requests.get(branch)
 
-    def forget(self, branch: str, *, close: bool) -> None:
-        """Stop watching a branch; with ``close``, also close its open pull request."""
+    def forget(self, branch: str, closed_as: str) -> None:
+        """Stop watching a branch; also close its pull request, if ``closed_as`` says why."""
         with self._lock:
             task = self._wanted.pop(branch, None)
-            self._pull_requests.pop(branch, None)
-        if task is not None and close:
-            self._enqueue(replace(task, close=True))
+            known = self._pull_requests.pop(branch, None)
+        is_closed = known is not None and known.state == "closed"  # by a person
+        if task is not None and closed_as and not is_closed:
+            self._enqueue(replace(task, closed_as=closed_as))
 
     def _enqueue(self, task: _Task) -> None:
         self._tasks.append(task)
@@ -123,16 +125,17 @@ class ForgeWorker:
 
     @staticmethod
     def _handle(task: _Task, forge: Forge, known: PullRequest | None) -> PullRequest | None:
-        if not task.close and known is None:
+        if not task.closed_as and known is None:
             return forge.open(task.branch, MAIN_BRANCH, task.title, task.body)
         found = forge.find(task.branch, MAIN_BRANCH) or known
-        if task.close and found is not None and found.state == "open":
-            forge.close(found)
+        if task.closed_as and found is not None and found.state != "merged":
+            # the forge may have closed it already, because its branch is gone
+            forge.close(found, f"Closed: {task.closed_as}\n\n{task.body}")
         return found
 
     def _remember(self, task: _Task, pull_request: PullRequest | None) -> None:
         with self._lock:
-            if task.close or task.branch not in self._wanted:
+            if task.closed_as or task.branch not in self._wanted:
                 return
             known = self._pull_requests
             changed = task.branch not in known or known[task.branch] != pull_request

@@ -6,6 +6,7 @@ recognizes the requests that release a proposal, and composes the texts that des
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Container, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -17,13 +18,13 @@ from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import DemandRequest, Release
 from demandops.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
 from demandops.forge import PullRequest
-from demandops.quoting import one_line
+from demandops.quoting import harmless, one_line
 from demandops.render.changes.changeset import FileReader
 from demandops.service.ticket import Ticket
 from demandops.settings import MAIN_BRANCH
+from demandops.staterepo.history import commit_log, message_format
 from demandops.staterepo.write.journal import ProposalRecord
 
-Key = tuple[str, ...]
 Decided: TypeAlias = list[tuple[Ticket, Decision]]
 Failed: TypeAlias = list[tuple[Ticket, DemandOpsError]]
 
@@ -49,7 +50,7 @@ class Verdict:
 
 @dataclass(eq=False)
 class Proposal:
-    """Demands that have the same key (:func:`key_of`), and therefore share a branch.
+    """A demand that awaits approval on a branch, with all goals that ask for it.
 
     ``reasons`` say why approval is needed. ``searched_to`` is the commit of main up to which the
     history was searched for merged demands. ``checked_at`` is the commit of main at the last check;
@@ -57,7 +58,6 @@ class Proposal:
     the branch.
     """
 
-    key: Key
     record: ProposalRecord
     tickets: list[Ticket] = field(default_factory=list)
     requests: list[DemandRequest] = field(default_factory=list)
@@ -70,6 +70,11 @@ class Proposal:
     def branch(self) -> str:
         """The name of the branch that a person merges."""
         return self.record.branch
+
+    @property
+    def waits(self) -> bool:
+        """Whether a demand waits that was not withdrawn."""
+        return any(ticket.state == "proposed" for ticket in self.tickets)
 
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
         """Return whether main, this proposal's branch and its demands are as at the last check.
@@ -94,8 +99,7 @@ class Proposal:
 
         A demand counts as booked if a commit of main names its operation id in a trailer. A squash
         merge may lose the trailer. So a demand also counts as booked if it would change no file of
-        main, or if it would change only claims in ``added`` and all demands of the proposal have
-        the same goal.
+        main, or if it would change only claims in ``added``.
 
         If no demand is booked, and the branch is gone or the pull request was closed, the demands
         that still need approval are turned down.
@@ -110,8 +114,6 @@ class Proposal:
             pull_request: the pull request, if it is known.
         """
         verdict = Verdict()
-        if any(ticket.goal != self.tickets[0].goal for ticket in self.tickets):
-            added = ()  # a claim may come from any of these demands
         for ticket in self.tickets:
             decision: Decision | InvalidInput
             try:
@@ -152,6 +154,10 @@ class Proposal:
         self.requests = [decision.request for _, decision in left]
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
 
+    def goals(self) -> list[str]:
+        """Return the goals of the demands that were not withdrawn, as JSON: 1 is not true."""
+        return [json.dumps(each.goal) for each in self.tickets if each.state == "proposed"]
+
     def requesters(self) -> set[str]:
         """Return the requesters of the proposal's demands."""
         return {name for request in self.requests for name in request.requesters()}
@@ -176,11 +182,11 @@ def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
     return isinstance(request, Release) or subjects <= set(request.subjects())
 
 
-def key_of(request: DemandRequest) -> Key:
-    """Return the key of a request's proposal.
+def key_of(request: DemandRequest) -> tuple[str, ...]:
+    """Return what tells a demand from others, whatever its content.
 
-    The key contains the demand id. A request of the reference's action has no demand id, so its key
-    contains the request id and the requesters.
+    That is the demand id. A request of the reference's action has none, so it is the request id and
+    the requesters.
     """
     if request.is_reference:
         return ("request", request.id, *sorted(request.requesters()))
@@ -241,45 +247,52 @@ def parse_waiting_text(text: str) -> dict[str, str]:
     return {"branch": branch, "link": link}
 
 
-def pull_request_body(message: str, reasons: Iterable[str]) -> str:
-    """Return the text of a pull request, which contains the commit's message in a code block.
+def pull_request_texts(message: str) -> tuple[str, str]:
+    """Return the title and the text of a pull request for a commit with this message.
 
-    Requesters choose the ids in the message. Outside of a code block, an id could become a link or
-    a mention.
+    Requesters choose the ids in the message. Outside of a code block, an id could become a link.
     """
-    fence = _fence(message, 3)
-    return (
-        f"{_required_by(reasons)} Merging approves the demand; closing this pull request or "
-        f"deleting the branch rejects the demand.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
+    title, fence = message.partition("\n")[0], _fence(message, 3)
+    return title, (
+        f"{_head(message)} Merging approves the demand; closing this pull request or deleting the "
+        f"branch rejects the demand.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
     )
 
 
-def push_options(message: str, reasons: Iterable[str], labels: Iterable[str]) -> list[str]:
+def push_options(message: str, labels: Iterable[str]) -> list[str]:
     """Return the push options that make GitLab open a merge request; each option is one line."""
+    title = message.partition("\n")[0]
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
-    fence = _fence(why, 1)
     description = (
-        f"{_required_by(reasons)} {fence} {why} {fence} Merging approves the demand; deleting the "
-        "branch rejects the demand."
+        f"{_head(message)} {code(why)} Merging approves the demand; deleting the branch rejects "
+        "the demand."
     )
     return [
         "merge_request.create",
         f"merge_request.target={MAIN_BRANCH}",
-        f"merge_request.title={title_of(message)}",
+        f"merge_request.title={title}",
         f"merge_request.description={description}",
         "merge_request.remove_source_branch",
         *(f"merge_request.label={label}" for label in labels),
     ]
 
 
-def title_of(message: str) -> str:
-    """Return the title of a pull request: the first line of a commit's message."""
-    return message.split("\n", 1)[0]
+def _head(message: str) -> str:
+    """Return why a pull request is there: what requires approval, and which one it replaces."""
+    trailers = message_format.parse(message).trailers
+    reasons = ", ".join(trailers.get(commit_log.REQUIRED_BY, ()))
+    changed = "".join(
+        f"This has changed: it replaces {old}, and no approval of that counts here. "
+        for old in trailers.get(commit_log.REPLACES, ())
+    )
+    why = code(reasons) if reasons else "an access policy"
+    return f"{changed}This demand needs approval, as required by {why}."
 
 
-def _required_by(reasons: Iterable[str]) -> str:
-    why = one_line(", ".join(reasons)) or "an access policy"
-    return f"This demand needs approval, as required by {why}."
+def code(text: str) -> str:
+    """Return text from outside as code in one line of Markdown."""
+    fence = _fence(text, 1)
+    return f"{fence} {harmless(one_line(text))} {fence}"
 
 
 def _fence(text: str, shortest: int) -> str:

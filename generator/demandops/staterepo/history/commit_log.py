@@ -25,6 +25,10 @@ from demandops.staterepo.history import allowed_signers, message_format
 
 PROPOSAL = "Proposal"
 """The trailer that names the branch on which a commit was proposed for approval."""
+REPLACES = "Replaces"
+"""The trailer with the branch and commit where the demand was proposed with other content."""
+REQUIRED_BY = "Approval-Required-By"
+"""The trailer, repeated, with what requires the approval."""
 
 GENERATOR_NAME = "DemandOps generator"
 """The committer's name in every commit by a generator."""

@@ -29,7 +29,7 @@ from demandops.quoting import one_line
 from demandops.render.changes.changeset import Changeset, ReleaseChange
 from demandops.settings import RENDER_VERSION
 from demandops.staterepo.history import revisions
-from demandops.staterepo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME
+from demandops.staterepo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME, REPLACES
 from demandops.staterepo.history.message_format import compose
 from demandops.subject import SubjectKind
 
@@ -63,9 +63,11 @@ def generator_signature(time: datetime) -> pygit2.Signature:
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
     """Return the author of the commit of a demand, a rollback or a decommission.
 
-    The author of a demand is its requesters. The author of a rollback or a decommission is the
-    person who ran the command; a decommission that names no person is by the generator.
-    ``received`` is the author's time.
+    The author of a demand is its requesters. A requester may have any name, also that of a person,
+    so the name says that it is a requester's, and the address is nobody's: no person and no other
+    commit has one of its domain. The author of a rollback or a decommission is the person who ran
+    the command; a decommission that names no person is by the generator. ``received`` is the
+    author's time.
     """
     request = decision.request
     if isinstance(request, Restoration):
@@ -73,11 +75,13 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
     if isinstance(request, Decommission):
         name, _, email = request.by.removesuffix(">").rpartition(" <")
         return signature(name, email, received) if name else generator_signature(received)
-    names = ", ".join(_requesters(decision))
+    requesters = _requesters(decision)
+    who = "requester" if len(requesters) == 1 else "requesters"
+    names = one_line(", ".join(requesters), _MAX_AUTHOR - len(f" ({who})"))
     claims = decision.changes.claims
     demand = claims[0].key.demand if claims else request.demand
     local = demand if _LOCAL_PART.fullmatch(demand) else claim_file.segment(demand)
-    return signature(names, f"{local}@demandops.invalid", received)
+    return signature(f"{names} ({who})", f"{local}@requester.demandops.invalid", received)
 
 
 def of_decision(
@@ -90,9 +94,12 @@ def of_decision(
     """
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
+    more = list(more)
     title, why = _title_and_why(decision, received)
+    replaced = "".join(value for key, value in more if key == REPLACES)
     paragraphs = [
         [one_line(title, _MAX_SUBJECT)],
+        [f"Changed: replaces {replaced}; no approval of that counts here."] if replaced else [],
         [f"Why: {why}"],
         _desired_state(decision.releases) if decision.releases or claims else [_UNCHANGED],
         _list("Listed in the request, but not held by the requester:", decision.changes.not_held),

@@ -2,9 +2,10 @@
 
 Only this module writes and reads messages. A line of a paragraph is for people: its text is
 escaped and shortened. A trailer is for programs: its value is read back exactly. A value of visible
-characters is written unchanged, so ``git log --format='%(trailers:key=Requester)'`` shows it; any
-other value is written in double quotes with escapes like ``\\u202e``. So no value can begin a line,
-end the message or look like a trailer. Messages of earlier versions, which did not quote, are read
+characters on which no forge acts is written unchanged, so
+``git log --format='%(trailers:key=Requester)'`` shows it; any other value is written in double
+quotes with escapes like ``\\u202e``. So no value can begin a line, end the message, look like a
+trailer or give a forge an order. Messages of earlier versions, which did not quote, are read
 the same way.
 """
 
@@ -14,11 +15,12 @@ import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from demandops.quoting import escaped, is_visible, one_line
+from demandops.quoting import escaped, harmless, is_visible, one_line
 
 Trailers = Iterable[tuple[str, str]]
 
 _WHY = "Why: "
+_AS_WRITTEN = ("Reason",)  # the person who runs a command may close an issue with it
 _KEY = re.compile(r"[A-Za-z0-9-]+")
 _ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U00(?:0[0-9a-f]|10)[0-9a-f]{4}|[nrt\\\"])"
 _ESCAPES = re.compile(_ESCAPE)
@@ -41,8 +43,8 @@ def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
 
     Empty paragraphs, and trailers with an empty value, are left out.
     """
-    lines = [f"{key}: {_encoded(value)}" for key, value in trailers if value]
-    body = ("\n".join(map(one_line, paragraph)) for paragraph in paragraphs)
+    lines = [f"{key}: {_encoded(key, value)}" for key, value in trailers if value]
+    body = ("\n".join(harmless(one_line(line)) for line in lines) for lines in paragraphs)
     return "\n\n".join(text for text in (*body, "\n".join(lines)) if text) + "\n"
 
 
@@ -69,11 +71,12 @@ def _trailers(message: str) -> dict[str, list[str]]:
     return trailers
 
 
-def _encoded(value: str) -> str:
-    if is_visible(value) and value == value.strip() and not _QUOTED.fullmatch(value):
+def _encoded(key: str, value: str) -> str:
+    is_plain = is_visible(value) and value == value.strip() and not _QUOTED.fullmatch(value)
+    if is_plain and (key in _AS_WRITTEN or harmless(value) == value):
         return value
     text = escaped(value.replace("\\", r"\\").replace('"', r"\""))
-    return f'"{_EDGES.sub(_SPACE, text)}"'
+    return f'"{_EDGES.sub(_SPACE, harmless(text))}"'
 
 
 def _decoded(text: str) -> str:

@@ -52,6 +52,7 @@ from demandops.staterepo.load import (
     state_in_effect,
 )
 from demandops.staterepo.load.snapshot import Advance, Snapshot
+from demandops.staterepo.write.journal import ProposalRecord
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02
@@ -95,16 +96,19 @@ class CommitBatch:
         operation: str,
         received: datetime,
         now: datetime,
-        proposal: str = "",
+        proposal: ProposalRecord | None = None,
     ) -> str:
         """Commit one demand and return the commit's id.
 
-        ``proposal`` is the branch on which the demand awaits approval. It is empty if the demand
-        needs no approval.
+        ``proposal`` is the proposal with which the demand awaits approval, if it needs approval.
         """
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
-            more.append((commit_log.PROPOSAL, proposal))
+            more += [
+                (commit_log.PROPOSAL, proposal.branch),
+                (commit_log.REPLACES, proposal.replaces),
+                *((commit_log.REQUIRED_BY, reason) for reason in decision.approval),
+            ]
         text = commit_message.of_decision(decision, operation, received, more)
         self._settled = []
         self.frees = self.frees or decision.frees

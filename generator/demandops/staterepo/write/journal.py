@@ -54,6 +54,7 @@ class ProposalRecord:
     After a person merges only some of the demands, this is false until the branch is pushed again.
     ``link``: the address of the branch's merge request, if GitLab printed it at a push, or empty.
     ``withdrawn``: the reason why the demand was withdrawn, or empty.
+    ``replaces``: branch and commit where the demand waited, before it became another, or empty.
     """
 
     branch: str
@@ -62,6 +63,19 @@ class ProposalRecord:
     pushed: bool = False
     link: str = ""
     withdrawn: str = ""
+    replaces: str = ""
+
+    @property
+    def replaced_branch(self) -> str:
+        """The branch in ``replaces``."""
+        return self.replaces.partition(" ")[0]
+
+    def as_replaced(self) -> str:
+        """Return ``replaces`` for a proposal that replaces this one.
+
+        Nobody has seen a proposal without a commit, so that is what this proposal replaces.
+        """
+        return f"{self.branch} {self.commits[-1]}" if self.commits else self.replaces
 
 
 @dataclass(frozen=True, slots=True)

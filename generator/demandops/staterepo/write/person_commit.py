@@ -13,6 +13,7 @@ from pygit2 import Blob, Commit, Oid, Tree
 from pygit2.enums import FileMode
 
 from demandops.errors import Fault, InvalidInput, StateRepoError
+from demandops.quoting import one_line
 from demandops.render.changes.changeset import FileReader
 from demandops.runtime import REAL
 from demandops.settings import MAIN_BRANCH
@@ -43,8 +44,10 @@ class CommitDetails:
 
     @property
     def text(self) -> str:
-        """The message of the commit."""
-        return compose([[self.summary], [self.reason] if self.reason else []], [])
+        """The message of the commit. The person's reason is as written: it may close an issue."""
+        return compose([[self.summary]], []) + (
+            f"\n{one_line(self.reason)}\n" if self.reason else ""
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,17 +113,26 @@ def merge(
 ) -> Published:
     """Merge a proposal into main, and return what was published.
 
+    What is merged is the commit ``proposal.commit``, which a person has seen. If the branch is
+    elsewhere now, nothing is merged. If it moves at the very end, this commit is merged all the
+    same: a demand that was changed waits on another branch.
+
     Raises:
         InvalidInput: with the proposal, the configuration has faults that main does not have;
             nothing was changed.
-        StateRepoError: main has other changes to the same files, or cannot be written, or the
-            proposal has a file that is not plain text.
+        StateRepoError: the branch has moved, or main has other changes to the same files, or cannot
+            be written, or the proposal has a file that is not plain text.
         Unsound: the disk failed, and nobody knows whether the merge was published.
     """
     objects = repository.objects
     head = trees.commit_of(objects, proposal.commit)
 
     def make(tip: Commit) -> tuple[Files, list[Oid]]:
+        if ProposalBranches(repository).heads().branches.get(proposal.branch) != proposal.commit:
+            raise StateRepoError(
+                f"{proposal.branch} is no longer at commit {proposal.commit}, so nothing was "
+                "merged; look at the proposals again"
+            )
         base = objects.merge_base(tip.id, head.id)
         if base is None:
             raise StateRepoError(

@@ -16,17 +16,18 @@ from datetime import datetime
 from functools import lru_cache
 
 import git
-import pygit2
-from pygit2 import GitError, Oid, Repository
+from pygit2 import GitError, Oid, Repository, Tree
 
 from demandops import naming
-from demandops.errors import StateRepoError
+from demandops.errors import InvalidInput, StateRepoError
+from demandops.quoting import quoted
 from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.remote_repository import RemoteRepository
 from demandops.staterepo.git.repository import MAIN, PushDenied, StateRepository
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
+from demandops.staterepo.load import ledger_files
 
 log = logging.getLogger("demandops")
 
@@ -34,6 +35,7 @@ PREFIX = "demand/"
 _HEADS = "refs/heads/"
 _NO_OPTIONS = re.compile(r"does not support push options")
 _LINK = re.compile(r"https?://\S+")
+_ABBREVIATED = re.compile(r"[0-9a-f]{7,64}")
 
 
 class BranchMoved(StateRepoError):
@@ -190,17 +192,40 @@ class ProposalBranches:
             base: the commit of main that the proposal was made on.
             files: path → text of the files that the demands would change on the current main.
         """
-        objects = self._repository.objects
-        try:
-            old, proposal = commit_of(objects, base).tree, commit_of(objects, commit).tree
-        except StateRepoError:
-            return False  # the clone was made again, or `git gc` removed the commit
-        now = commit_of(objects, tip).tree
-        new = objects[trees.write(self._repository.new, now, files)].peel(pygit2.Tree)
+        if (found := self._trees(tip, commit, base, files)) is None:
+            return False
+        old, proposal, now, new = found
         proposed = dict(trees.differences(old, proposal))
         if proposed != dict(trees.differences(now, new)):
             return False
         return proposed.keys().isdisjoint(path for path, _ in trees.differences(old, now))
+
+    def books_the_same(
+        self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
+    ) -> bool:
+        """Return whether a proposal would book the same on the current main, leases aside.
+
+        Return True if this repository lacks the proposal or its base. The arguments are those of
+        :meth:`is_up_to_date`.
+        """
+        if (found := self._trees(tip, commit, base, files)) is None:
+            return True
+        old, proposal, now, new = found
+        paths = {*ledger_files.changed_files(old, proposal), *ledger_files.changed_files(now, new)}
+        pairs = (map(ledger_files.valid_claim_at, (proposal, new), (path,) * 2) for path in paths)
+        return all((a and a.booked) == (b and b.booked) for a, b in pairs)
+
+    def _trees(
+        self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
+    ) -> tuple[Tree, Tree, Tree, Tree] | None:
+        """Return the trees of base and proposal, and those that they would be now, if known."""
+        objects = self._repository.objects
+        try:
+            old, proposal = commit_of(objects, base).tree, commit_of(objects, commit).tree
+        except StateRepoError:
+            return None  # the clone was made again, or `git gc` removed the commit
+        now = commit_of(objects, tip).tree
+        return old, proposal, now, objects[trees.write(self._repository.new, now, files)].peel(Tree)
 
 
 def _link(output: str) -> str:
@@ -215,7 +240,8 @@ class PendingProposal:
     """A proposal that awaits approval, with data from the messages of its commits.
 
     ``commit`` is the newest commit of the branch, perhaps by a person. ``since`` is the time when
-    the first demand was received.
+    the first demand was received. ``required_by`` is what requires approval. ``replaces`` has the
+    branch and the commit where the demand waited before it was changed.
     """
 
     branch: str
@@ -225,6 +251,17 @@ class PendingProposal:
     requesters: tuple[str, ...]
     demands: tuple[str, ...]
     operations: tuple[str, ...]
+    required_by: tuple[str, ...] = ()
+    replaces: tuple[str, ...] = ()
+
+    def require(self, commit: str) -> None:
+        """Raise InvalidInput unless ``commit`` is the newest commit's id, or at least 7 of it."""
+        if not (_ABBREVIATED.fullmatch(commit) and self.commit.startswith(commit)):
+            raise InvalidInput.at(
+                "",
+                f"{self.branch} is at commit {self.commit}, not at {quoted(commit)}; if it has "
+                "changed since, look at it again",
+            )
 
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
@@ -256,6 +293,8 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
             requesters=_all_of(entries, "Requester"),
             demands=_all_of(entries, "Demand-Id"),
             operations=_all_of(entries, "Operation-Id"),
+            required_by=_all_of(entries, commit_log.REQUIRED_BY),
+            replaces=_all_of(entries, commit_log.REPLACES),
         )
 
 

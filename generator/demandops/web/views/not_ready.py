@@ -242,7 +242,7 @@ def _proposed(proposal: PendingProposal) -> Cause:
         Remedy(
             "a person who may merge to main",
             "merge the branch to approve the demand, or delete the branch to refuse it",
-            shlex.join(["git", "merge", f"origin/{proposal.branch}"]) + " && git push",
+            shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit[:12]]),
         ),
         since=proposal.since,
         requesters=proposal.requesters,
