@@ -24,6 +24,7 @@ from tests.kit.cli import Ran, Run, runner
 from tests.kit.generator import running
 from tests.kit.processes import Drivers
 from tests.kit.repo import GitRepo, Person
+from tests.kit.second_try import SecondTry
 
 _LIMIT_S = 300.0
 _MEMORY = Path("/dev/shm")
@@ -35,6 +36,11 @@ def pytest_configure(config: pytest.Config) -> None:
         "markers", f"limit(seconds): fail the test when it takes longer (default {_LIMIT_S:.0f})"
     )
     config.addinivalue_line("markers", "synced: flush files to the disk, as the program does")
+    config.addinivalue_line(
+        "markers", "nightly: waits for wall-clock time, compares times or takes long; not in the gate"
+    )
+    if (unsteady := os.environ.get("UNSTEADY")) and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(SecondTry(Path(unsteady)))
     sync.force(False)
     _keep_files_in_memory()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
