@@ -22,22 +22,24 @@ from demandops.staterepo.pull_request.helm import HELM_BIN
 from tests.kit import repo, sync
 from tests.kit.cli import Ran, Run, runner
 from tests.kit.generator import running
+from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.processes import Drivers
 from tests.kit.repo import GitRepo, Person
 from tests.kit.second_try import SecondTry
 
-_LIMIT_S = 300.0
 _MEMORY = Path("/dev/shm")
 _ROOM_IN_MEMORY = 2 << 30
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
-        "markers", f"limit(seconds): fail the test when it takes longer (default {_LIMIT_S:.0f})"
+        "markers",
+        f"limit(seconds): fail the test when it takes longer (default {LONGEST_TEST_S:.0f})",
     )
     config.addinivalue_line("markers", "synced: flush files to the disk, as the program does")
     config.addinivalue_line(
-        "markers", "nightly: waits for wall-clock time, compares times or takes long; not in the gate"
+        "markers",
+        "nightly: waits for wall-clock time, compares times or takes long; not in the gate",
     )
     if (unsteady := os.environ.get("UNSTEADY")) and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SecondTry(Path(unsteady)))
@@ -109,7 +111,7 @@ def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 def limited(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test that exceeds its time limit, and print the stack of every thread."""
     marker = request.node.get_closest_marker("limit")
-    seconds = float(marker.args[0]) if marker else _LIMIT_S
+    seconds = float(marker.args[0]) if marker else LONGEST_TEST_S
 
     def stop(number: int, frame: FrameType | None) -> None:
         faulthandler.dump_traceback(file=2)

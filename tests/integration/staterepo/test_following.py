@@ -305,7 +305,7 @@ def test_stopping_does_not_wait_for_a_look_that_hangs(http: str, server: Server)
     hang = server.faults.hang = threading.Event()
     try:
         rig.wait_until(lambda: generator._repository._process, "a fetch is under way and hangs")  # type: ignore[attr-defined]
-        assert generator.stop(timeout=60).result(10) is True
+        assert generator.stop(timeout=2 * rig.PATIENCE_S).result(rig.PATIENCE_S) is True
     finally:
         server.faults.hang = None
         hang.set()

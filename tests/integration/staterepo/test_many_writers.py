@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.kit import git_over_http, rig
+from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.rig import Drivers, Goal
 
 pytestmark = pytest.mark.synced
@@ -85,7 +86,8 @@ def _images(number: int) -> str:
     return "\n".join([f"# change {number}", *kept]) + "\n"
 
 
-@pytest.mark.limit(60 + DEMANDS)
+@pytest.mark.nightly
+@pytest.mark.limit(LONGEST_TEST_S + DEMANDS)
 def test_many_writers_end_where_one_would(
     drivers: Drivers,
     bare: Path,

@@ -35,7 +35,6 @@ def _assert_all_there(bare: Path) -> None:
     assert rig.books(bare) == rig.books_after(made for _, made in names)
 
 
-@pytest.mark.limit(60)
 def test_two_generators_in_one_process_lose_and_double_nothing(
     url: str, bare: Path, tmp_path: Path
 ) -> None:
@@ -74,7 +73,6 @@ def test_two_generators_in_one_process_lose_and_double_nothing(
     assert {receipt.commit for receipt in results.values()} <= there
 
 
-@pytest.mark.limit(60)
 def test_two_processes_on_one_machine_lose_and_double_nothing(
     drivers: Drivers, bare: Path, data_home: Path
 ) -> None:

@@ -145,6 +145,7 @@ def apply(api: KubeApi, commit: str) -> None:
     api.put("kustomizations", "perception", "perception", status, spec=spec)
 
 
+@pytest.mark.nightly  # waits to see that nothing happens
 @pytest.mark.parametrize("step", ["asked", "fetched", "applied"])
 def test_flux_is_woken_again_only_when_it_is_idle_or_after_a_minute(
     api: KubeApi, tmp_path: Path, step: str
