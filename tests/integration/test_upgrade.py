@@ -231,7 +231,9 @@ def test_a_dry_run_tells_all_and_writes_nothing(
     assert (data["outcome"], data["commit"], state.tip) == ("would-change", before, before)
 
 
-@pytest.mark.parametrize(("answer", "code"), [("n", 1), ("y", 0)])
+@pytest.mark.parametrize(
+    ("answer", "code"), [pytest.param("n", 1, marks=pytest.mark.nightly), ("y", 0)]
+)
 def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
     state: GitRepo, data_home: Path, answer: str, code: int
 ) -> None:

@@ -267,7 +267,9 @@ def _cover(one: map_layout.NodeCard, other: map_layout.NodeCard) -> bool:
     )
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "stop", [pytest.param(signal.SIGINT, marks=pytest.mark.nightly), signal.SIGTERM]
+)
 def test_the_command_serves_the_page_until_it_is_stopped(bare: Path, stop: int) -> None:
     command = [sys.executable, "-m", "demandops.cli.main", "web"]
     process = subprocess.Popen(
