@@ -15,8 +15,8 @@ PAGE_TESTS := tests/page
 DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
 KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py tests/ros/test_crash.py
-# More workers than cores, because a core is free while a test waits for another process.
-WORKERS := $(shell echo $$(($$(nproc) + 2)))
+# One worker more than cores, because one is busy with the tests of ROS, which mostly wait.
+WORKERS := $(shell echo $$(($$(nproc) + 1)))
 # The ROS nodes of the tests and the demo talk on this machine only.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # Tests start many processes, and without bytecode files each would compile all modules anew.
@@ -60,9 +60,11 @@ FAST_TESTS := tests $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_T
 test: system-test setup  ## Run all tests but the slow ones, which other targets run
 	@$(PY) -m pytest -n $(WORKERS) --dist worksteal -m 'not nightly' $(FAST_TESTS)
 
-# In one process, because some of these tests compare times.
-test-nightly: system-test setup  ## Run the tests that `make test` leaves out because they take long or compare times
-	@$(PY) -m pytest -m nightly $(FAST_TESTS)
+# The marked tests run one after the other, because some of them compare times.
+test-nightly: export DEMANDOPS_EXAMPLES ?= 3
+test-nightly: system-test setup  ## Run the tests that `make test` leaves out, and all others with nine times as many examples
+	@$(PY) -m pytest -m nightly $(FAST_TESTS); marked=$$?; \
+	$(PY) -m pytest -n $(WORKERS) --dist worksteal -m 'not nightly' $(FAST_TESTS) && exit $$marked
 
 nightly:  ## Make all that the gate (.ci/run) leaves out, each part timed; about an hour
 	@.ci/run nightly
@@ -81,6 +83,7 @@ CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden test
   $(addprefix --ignore=tests/unit/,cluster forge service staterepo demand/test_fuzz.py) \
   --ignore-glob='tests/unit/test_[!s]*'
 CORE_COVERAGE := 84
+coverage: export DEMANDOPS_EXAMPLES := 1
 coverage: export PYTEST_ADDOPTS := --cov-report=term-missing:skip-covered
 coverage: system-test setup  ## Report what the tests cover, then what the core's tests cover without Git
 	@PYTEST_ADDOPTS="$$PYTEST_ADDOPTS --cov=demandops --cov=demandops_ros" $(MAKE) --no-print-directory test
