@@ -52,6 +52,7 @@ class Cluster:
         try:
             self.changes.get(timeout=10)
         except Empty:
+            self.reads -= 1  # after a watch that ended, the next read is no polling
             return Answer.json({})
         return Answer.json({"type": "MODIFIED", "object": self.item})
 
