@@ -42,7 +42,7 @@ from tests.kit.ros import Client, Serve, Served
 
 def held_remote(bare: Path) -> str:
     """Return the URL of a repository that delays every push until its folder has a file ``go``."""
-    hook(bare, "pre-receive", "for _ in $(seq 600); do [ -e go ] && exit; sleep 0.05; done")
+    hook(bare, "pre-receive", "for _ in $(seq 4800); do [ -e go ] && exit; sleep 0.05; done")
     return f"file://{bare}"
 
 
