@@ -56,4 +56,4 @@ class Broker:
         self._counter.disconnect()
         self._counter.loop_stop()
         self._process.terminate()
-        self._process.wait(10)
+        self._process.wait(PATIENCE_S)
