@@ -14,8 +14,6 @@ from typing import Any
 
 import pytest
 
-from tests.kit.limits import PATIENCE_S
-
 OURS = "application_manager_interfaces"
 
 # The hash of the reference's action; a client of the reference finds only a server with this hash.
@@ -155,6 +153,8 @@ def test_a_value_that_a_deployment_request_cannot_carry_is_refused(wrong: dict[s
 
 
 def test_a_goal_goes_round_with_nothing_set_by_hand(tmp_path: Path, ros_domain: int) -> None:
+    from tests.kit.limits import PATIENCE_S  # not found where this file runs as a program
+
     alone = {
         "HOME": str(tmp_path),
         "ROS_DOMAIN_ID": str(ros_domain),

@@ -116,7 +116,7 @@ def test_many_writers_end_where_one_would(
         finally:
             over.set()
         took = time.monotonic() - started
-        people.join(60)
+        people.join(rig.PATIENCE_S)
         cut = server.cut
     with capsys.disabled():
         _print(told, person, took, cut)

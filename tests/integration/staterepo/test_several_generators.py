@@ -64,7 +64,7 @@ def test_two_generators_in_one_process_lose_and_double_nothing(
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(50)
+            thread.join(rig.PATIENCE_S)
     assert failures == []
     assert len(results) == 2 * EACH
     assert {r.outcome for r in results.values()} == {"booked", "released"}
@@ -137,6 +137,6 @@ def test_housekeeping_by_git_during_demands_loses_nothing(bare: Path) -> None:
                 rig.book(generator, goal(number))
     finally:
         stop.set()
-        thread.join(20)
+        thread.join(rig.PATIENCE_S)
     assert len(rig.operations(bare)) == 15
     rig.assert_sound(bare, verify_last=5)
