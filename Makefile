@@ -15,8 +15,8 @@ PAGE_TESTS := tests/page
 DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
 KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py tests/ros/test_crash.py
-# More workers than cores, because a core is free while a test waits for another process.
-WORKERS := $(shell echo $$(($$(nproc) + 2)))
+# One worker more than cores, because one is busy with the tests of ROS, which mostly wait.
+WORKERS := $(shell echo $$(($$(nproc) + 1)))
 # The ROS nodes of the tests and the demo talk on this machine only.
 export ROS_AUTOMATIC_DISCOVERY_RANGE ?= LOCALHOST
 # Tests start many processes, and without bytecode files each would compile all modules anew.
@@ -24,7 +24,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-packages page faults e2e e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate docs wheel release clean
+.PHONY: help setup demo test test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate docs wheel release clean
 .PHONY: $(SYSTEM) go
 
 help:  ## List the targets
@@ -55,10 +55,19 @@ $(GO_DIR):
 demo: setup  ## Play the paper's experiment: eight demands over ROS 2 become eight commits
 	@$(PY) examples/experiment/demo.py
 
+FAST_TESTS := tests $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS) $(PAGE_TESTS) \
+  $(DOCS_TESTS) $(SIMULATION_TESTS) $(KILL_TESTS))
 test: system-test setup  ## Run all tests but the slow ones, which other targets run
-	@$(PY) -m pytest -n $(WORKERS) --dist worksteal tests \
-	  $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS) $(PAGE_TESTS) $(DOCS_TESTS) \
-	    $(SIMULATION_TESTS) $(KILL_TESTS))
+	@$(PY) -m pytest -n $(WORKERS) --dist worksteal -m 'not nightly' $(FAST_TESTS)
+
+# The marked tests run one after the other, because some of them compare times.
+test-nightly: export DEMANDOPS_EXAMPLES ?= 3
+test-nightly: system-test setup  ## Run the tests that `make test` leaves out, and all others with nine times as many examples
+	@$(PY) -m pytest -m nightly $(FAST_TESTS); marked=$$?; \
+	$(PY) -m pytest -n $(WORKERS) --dist worksteal -m 'not nightly' $(FAST_TESTS) && exit $$marked
+
+nightly:  ## Make all that the gate (.ci/run) leaves out, each part timed; about an hour
+	@.ci/run nightly
 
 test-packages: system-test setup  ## Run the tests that build the wheel and the colcon packages
 	@$(PY) -m pytest $(PACKAGE_TESTS)
@@ -74,6 +83,7 @@ CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden test
   $(addprefix --ignore=tests/unit/,cluster forge service staterepo demand/test_fuzz.py) \
   --ignore-glob='tests/unit/test_[!s]*'
 CORE_COVERAGE := 84
+coverage: export DEMANDOPS_EXAMPLES := 1
 coverage: export PYTEST_ADDOPTS := --cov-report=term-missing:skip-covered
 coverage: system-test setup  ## Report what the tests cover, then what the core's tests cover without Git
 	@PYTEST_ADDOPTS="$$PYTEST_ADDOPTS --cov=demandops --cov=demandops_ros" $(MAKE) --no-print-directory test
@@ -86,16 +96,21 @@ faults: system-faults setup  ## Kill generators; inject an error, a kill, a full
 	@$(PY) -m pytest -q -n auto $(KILL_TESTS)
 	@$(PY) -m tests.faults $(FAULTS)
 
+E2E := tests/e2e --ignore=tests/e2e/argocd
+E2E_PATH := tests/e2e/flux/test_experiment.py
 # If E2E_KUBECONFIG names a cluster, the tests use that cluster and start no programs of their own.
 e2e: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 e2e: system-e2e setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests on a real cluster with Flux (docs/e2e.md)
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools --for flux; fi
-	@$(PY) -m pytest -p no:cacheprovider tests/e2e --ignore tests/e2e/argocd -x -q
+	@$(PY) -m pytest -p no:cacheprovider $(E2E) -q
+
+e2e-path: E2E := $(E2E_PATH)
+e2e-path: e2e  ## Run one end-to-end path with Flux: demands become pods, change them and take them away
 
 e2e-argocd: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 e2e-argocd: system-e2e$(if $(E2E_KUBECONFIG),,-argocd) setup $(if $(E2E_KUBECONFIG),,go)  ## Run the end-to-end tests with Argo CD
 	@if [ -z "$$E2E_KUBECONFIG" ]; then $(PY) -m tests.e2e.rig.tools; fi
-	@$(PY) -m pytest -p no:cacheprovider tests/e2e/argocd -x -q
+	@$(PY) -m pytest -p no:cacheprovider tests/e2e/argocd -q
 
 # With FIGURES=1 the target also draws the plots of the docs: docs/figures
 experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)

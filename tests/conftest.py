@@ -22,20 +22,29 @@ from demandops.staterepo.pull_request.helm import HELM_BIN
 from tests.kit import repo, sync
 from tests.kit.cli import Ran, Run, runner
 from tests.kit.generator import running
+from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.processes import Drivers
 from tests.kit.repo import GitRepo, Person
+from tests.kit.second_try import SecondTry
 
-_LIMIT_S = 300.0
 _MEMORY = Path("/dev/shm")
 _ROOM_IN_MEMORY = 2 << 30
 
 
 def pytest_configure(config: pytest.Config) -> None:
     config.addinivalue_line(
-        "markers", f"limit(seconds): fail the test when it takes longer (default {_LIMIT_S:.0f})"
+        "markers",
+        f"limit(seconds): fail the test when it takes longer (default {LONGEST_TEST_S:.0f})",
     )
     config.addinivalue_line("markers", "synced: flush files to the disk, as the program does")
+    config.addinivalue_line(
+        "markers",
+        "nightly: waits for wall-clock time, compares times or takes long; not in the gate",
+    )
+    if (unsteady := os.environ.get("UNSTEADY")) and not hasattr(config, "workerinput"):
+        config.pluginmanager.register(SecondTry(Path(unsteady)))
     sync.force(False)
+    gc.disable()  # until everything is imported and collected
     _keep_files_in_memory()
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
         signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -51,11 +60,17 @@ def _keep_files_in_memory() -> None:
         os.environ["PYTEST_DEBUG_TEMPROOT"] = str(_MEMORY)
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Start with the tests of ROS, which mostly wait, so that others run meanwhile."""
+    items.sort(key=lambda item: "tests/ros/" not in item.nodeid)
+
+
 def pytest_collection_finish() -> None:
     """Exempt all present objects from garbage collection; this saves a seventh of the run time."""
     gc.collect()
     gc.freeze()
     gc.set_threshold(50_000, 20, 50)
+    gc.enable()
 
 
 def pytest_xdist_auto_num_workers() -> int:
@@ -103,7 +118,7 @@ def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
 def limited(request: pytest.FixtureRequest) -> Iterator[None]:
     """Fail a test that exceeds its time limit, and print the stack of every thread."""
     marker = request.node.get_closest_marker("limit")
-    seconds = float(marker.args[0]) if marker else _LIMIT_S
+    seconds = float(marker.args[0]) if marker else LONGEST_TEST_S
 
     def stop(number: int, frame: FrameType | None) -> None:
         faulthandler.dump_traceback(file=2)

@@ -13,8 +13,7 @@ import paho.mqtt.client as mqtt
 
 from tests.e2e.rig import launch
 from tests.e2e.rig.net import free_port
-
-_START_S = 10.0
+from tests.kit.limits import PATIENCE_S
 
 
 class Broker:
@@ -39,7 +38,7 @@ class Broker:
         self._counter.loop_start()
 
     def _connect(self) -> None:
-        deadline = time.monotonic() + _START_S
+        deadline = time.monotonic() + PATIENCE_S
         while True:
             try:
                 self._counter.connect("127.0.0.1", self.port)
@@ -57,4 +56,4 @@ class Broker:
         self._counter.disconnect()
         self._counter.loop_stop()
         self._process.terminate()
-        self._process.wait(10)
+        self._process.wait(PATIENCE_S)

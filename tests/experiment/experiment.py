@@ -21,6 +21,7 @@ from tests.e2e.common.ros import Client
 from tests.e2e.common.staterepo import StateRepo, demandops, environment
 from tests.e2e.rig import launch
 from tests.e2e.rig.cluster import Rig
+from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import reserved
 
 from . import fleet, routes
@@ -33,7 +34,6 @@ from .rules import Event, Near, causes, events_of, poses_in, predicted
 from .standins.image import image
 
 ROOT = Path(__file__).resolve().parents[2]
-_PATIENCE_S = 120.0
 _STAND_S = 0.5
 """How many seconds before an event's cause the vehicles stop, to wait for the event before it."""
 _CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
@@ -139,13 +139,13 @@ class Experiment:
         self._say(f"the vehicles have set off; the last one leaves after {happens[-1]:.0f} s")
         for number in range(1, len(happens) + 1):
             self._drive_until(_stand(happens, number))
-            patience = happens[-1] + _PATIENCE_S
+            patience = happens[-1] + PATIENCE_S
             self._wait(f"event {number}", lambda n=number: len(self._events()) >= n, patience)
             event = self._events()[number - 1]
-            if not self._reaches(lambda n=number: self._is_settled(n, first_commit), _PATIENCE_S):
+            if not self._reaches(lambda n=number: self._is_settled(n, first_commit), PATIENCE_S):
                 self._say(f"'{event}' did not have all its consequences; the drive goes on")
         self._wait("the last demands", lambda: self._released(first_commit, len(happens)))
-        self._wait_until_as_before(_PATIENCE_S)
+        self._wait_until_as_before(PATIENCE_S)
         time.sleep(2.0)  # time for messages that must not come
         over, left = time.time(), self._world.domain.lines()
         self._end(self._detector)
@@ -282,7 +282,7 @@ class Experiment:
                 stderr=log,
                 text=True,
             )
-        self._stack.callback(lambda: (process.kill(), process.wait(10)))
+        self._stack.callback(lambda: (process.kill(), process.wait(PATIENCE_S)))
         return process
 
     def _drive_until(self, moment: float) -> None:
@@ -292,7 +292,7 @@ class Experiment:
 
     def _end(self, process: Any) -> None:
         process.send_signal(signal.SIGTERM)
-        process.wait(30)
+        process.wait(PATIENCE_S)
 
     def _read(self) -> dict[str, Any]:
         line = self._participants.stdout.readline()
@@ -302,7 +302,7 @@ class Experiment:
     def _log(self, name: str) -> str:
         return (self._folder / f"{name}.log").read_text()
 
-    def _wait(self, what: str, holds: Callable[[], bool], seconds: float = _PATIENCE_S) -> None:
+    def _wait(self, what: str, holds: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
         assert self._reaches(holds, seconds), f"{what} did not come within {seconds:.0f} s"
 
     def _reaches(self, holds: Callable[[], bool], seconds: float) -> bool:

@@ -30,6 +30,7 @@ from urllib3.exceptions import HTTPError
 from tests.e2e.common.volumes import files
 from tests.e2e.rig import launch
 from tests.e2e.rig.kube import Kube, Manifest
+from tests.kit.limits import PATIENCE_S
 
 from .running_pod import Container, RunningPod, path_in_pod, program_of
 
@@ -261,7 +262,7 @@ class ProcessRunner:
             if process.poll() is None and time.monotonic() < deadline:
                 continue
             _signal(process, signal.SIGKILL)  # also ends the rest of its process group
-            process.wait(10)
+            process.wait(PATIENCE_S)
             self._ending.remove((process, deadline))
 
 

@@ -14,10 +14,11 @@ from tests.experiment import fleet, routes
 from tests.experiment.participants import Plan
 from tests.experiment.rules import poses_in
 from tests.kit.generator import wait_until
+from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import reserved
 
 
-@pytest.mark.parametrize("poses_only", [False, True])
+@pytest.mark.parametrize("poses_only", [False, pytest.param(True, marks=pytest.mark.nightly)])
 def test_the_vehicles_stand_until_they_may_drive_on(tmp_path: Path, poses_only: bool) -> None:
     record, ways = tmp_path / "poses.jsonl", routes.one(0, 1.0)
     with reserved() as domain:
@@ -49,7 +50,7 @@ def test_the_vehicles_stand_until_they_may_drive_on(tmp_path: Path, poses_only: 
         wait_until(lambda: stands_at(2.0), "the vehicles stand again")
         process.send_signal(signal.SIGTERM)
         said = json.loads(process.stdout.readline())
-        assert process.wait(30) == 0
+        assert process.wait(PATIENCE_S) == 0
     assert said["held"] > 0
     topics = {"/vehicles/vehicle00/pose"}
     if not poses_only:

@@ -17,6 +17,7 @@ from std_msgs.msg import String
 from tests.e2e.rig.net import free_port
 from tests.experiment.standins.image import image
 from tests.kit.generator import wait_until
+from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import reserved
 
 
@@ -75,5 +76,5 @@ def test_allowed_topics_cross_between_ros_domains_and_no_other(
         executor.shutdown(timeout_sec=1)
         for process in running:
             process.terminate()
-    assert [process.wait(30) for process in running] == [0, 0]
+    assert [process.wait(PATIENCE_S) for process in running] == [0, 0]
     assert set(heard) == {"/allowed"}

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from demandops.detection.rules.rule_file import RuleFile
 from demandops.migration.reference_map import ReferenceMap
 
 from tests.kit.goals import perception
+from tests.kit.limits import PATIENCE_S
 from tests.kit.mutations import Form, mutations
 from tests.kit.repo import hook
 from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS, own_goal, reference_goal
@@ -296,15 +296,12 @@ class TestYamlAttacks:
         before = state.tip
         for content in contents:
             file.write_text(content)
-            start = time.monotonic()
-            ran = demandops("request", file, "--state-repo", state.path)
-            taken_s, shown = time.monotonic() - start, repr(content[:24])
+            ran, shown = demandops("request", file, "--state-repo", state.path), repr(content[:24])
             assert (ran.code, ran.out) == (1, ""), (shown, ran.err)
             assert str(file) in ran.err, shown
             assert "fault of" not in ran.err, f"{shown} is the user's to fix"
             assert len(ran.err) < 5000, f"{shown}: a message that nobody reads"
             assert state.tip == before, shown
-            assert taken_s < 5, shown
 
     def test_brackets_without_end_crash_nothing(
         self, state: Any, tmp_path: Path, data_home: Path
@@ -315,7 +312,7 @@ class TestYamlAttacks:
             file.write_text("apps: " + opening * 40_000 + closing * 40_000)
         ran = subprocess.run(
             [sys.executable, "-c", EACH, str(state.path), *map(str, files)],
-            capture_output=True, text=True, timeout=60, check=True,
+            capture_output=True, text=True, timeout=PATIENCE_S, check=True,
         )  # fmt: skip
         assert ran.stdout == "1\n1\n"
         for file, said in zip(files, ran.stderr.splitlines(), strict=True):

@@ -260,7 +260,11 @@ class TestProposals:
 
 
 @pytest.mark.parametrize(
-    "command", ["decommission vehicle00 -m Sold", "rollback main~1 --drop-newer -m Wrong"]
+    "command",
+    [
+        "decommission vehicle00 -m Sold",
+        pytest.param("rollback main~1 --drop-newer -m Wrong", marks=pytest.mark.nightly),
+    ],
 )
 def test_a_person_sees_the_consequence_and_is_asked(joined: GitRepo, command: str) -> None:
     before, asked = joined.tip, (*command.split(), "--state-repo", joined.path)

@@ -200,7 +200,12 @@ def test_a_pipeline_that_knows_no_package_says_which_variable_to_set(
     )
 
 
-@pytest.mark.parametrize("sound", [True, False], ids=["sound", "faulty"])
+SOUND_OR_NOT = pytest.mark.parametrize(
+    "sound", [pytest.param(True, marks=pytest.mark.nightly), False], ids=["sound", "faulty"]
+)
+
+
+@SOUND_OR_NOT
 def test_github_checks_and_reports(
     checkout: Path, tmp_path: Path, github: dict[str, Any], sound: bool
 ) -> None:
@@ -223,7 +228,7 @@ def test_github_checks_and_reports(
     assert summary.read_text() == report
 
 
-@pytest.mark.parametrize("sound", [True, False], ids=["sound", "faulty"])
+@SOUND_OR_NOT
 def test_gitlab_checks_and_reports(
     checkout: Path, tmp_path: Path, gitlab: dict[str, Any], sound: bool
 ) -> None:

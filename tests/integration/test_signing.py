@@ -256,13 +256,13 @@ def test_a_key_that_is_gone_later_is_told_to_the_requester(
 
     generator = Generator(str(state.path), signing_key=key)
     try:
-        generator.submit(goal([], [connection("a")])).future.result(30)
+        generator.submit(goal([], [connection("a")])).future.result(rig.PATIENCE_S)
         before, hidden = state.tip, key.rename(tmp_path / "hidden")
         with pytest.raises(SigningFailed):
-            generator.submit(goal([], [connection("b")])).future.result(30)
+            generator.submit(goal([], [connection("b")])).future.result(rig.PATIENCE_S)
         assert state.tip == before
         hidden.rename(key)
-        generator.submit(goal([], [connection("c")])).future.result(30)
+        generator.submit(goal([], [connection("c")])).future.result(rig.PATIENCE_S)
     finally:
         assert generator.close(rig.PATIENCE_S)
 

@@ -26,6 +26,7 @@ from demandops.staterepo.git import remote_repository
 
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import perception
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo
 
 ROOT = Path(__file__).parents[2]
@@ -231,7 +232,9 @@ def test_a_dry_run_tells_all_and_writes_nothing(
     assert (data["outcome"], data["commit"], state.tip) == ("would-change", before, before)
 
 
-@pytest.mark.parametrize(("answer", "code"), [("n", 1), ("y", 0)])
+@pytest.mark.parametrize(
+    ("answer", "code"), [pytest.param("n", 1, marks=pytest.mark.nightly), ("y", 0)]
+)
 def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
     state: GitRepo, data_home: Path, answer: str, code: int
 ) -> None:
@@ -382,7 +385,7 @@ def test_a_running_generator_goes_on_for_the_other_controller(
     try:
         assert upgraded("--gitops", "argocd").code == 0
         after = len(state.commits())
-        assert generator.submit(perception()).future.result(15).commit == state.tip
+        assert generator.submit(perception()).future.result(PATIENCE_S).commit == state.tip
     finally:
         generator.close()
     assert len(state.commits()) == after + 1
@@ -434,11 +437,11 @@ def test_a_running_generator_stops_taking_demands_when_a_newer_one_takes_over(
 ) -> None:
     generator = Generator(str(state.path))
     try:
-        generator.submit(perception()).future.result(15)
+        generator.submit(perception()).future.result(PATIENCE_S)
         assert newer("upgrade").code == 0
         tip = state.tip
         with pytest.raises(StateRepoError) as told:
-            generator.submit(perception(id="second")).future.result(15)
+            generator.submit(perception(id="second")).future.result(PATIENCE_S)
         assert (str(told.value), state.tip) == (NEWER, tip)
     finally:
         generator.close()

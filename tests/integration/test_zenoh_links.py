@@ -18,8 +18,8 @@ import yaml
 import zenoh
 
 from tests.kit.golden import rendered
+from tests.kit.limits import PATIENCE_S
 
-DEADLINE_S = 30.0
 STEP = "2-station00-joins"
 """A step of the golden case `zenoh` in which the edge and the station have an endpoint."""
 
@@ -66,7 +66,7 @@ def sessions(configurations: dict[str, str]) -> Iterator[dict[str, Any]]:
 
 
 def wait(done: Callable[[], bool]) -> None:
-    until = time.monotonic() + DEADLINE_S
+    until = time.monotonic() + PATIENCE_S
     while not done():
         assert time.monotonic() < until
         time.sleep(0.05)

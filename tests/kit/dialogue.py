@@ -10,7 +10,7 @@ import sys
 import time
 from pathlib import Path
 
-from tests.kit.generator import PATIENCE_S
+from tests.kit.limits import PATIENCE_S
 
 CTRL_C = "\x03"
 _SILENCE_S = 5.0

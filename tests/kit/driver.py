@@ -32,6 +32,7 @@ from demandops.staterepo.write.journal import Journal
 from demandops.staterepo.write.proposal_branch import ProposalBranches
 
 from tests.kit import sync
+from tests.kit.limits import PATIENCE_S
 
 Demand = dict[str, Any]
 
@@ -186,7 +187,7 @@ def run(plan: dict[str, Any]) -> None:
     else:
         lanes.start()
     lanes.ended.wait()
-    tell(finished=generator.close())
+    tell(finished=generator.close(PATIENCE_S))
 
 
 def main() -> None:

@@ -13,9 +13,7 @@ from typing import Any
 from demandops.service import Generator, Receipt, Ticket
 
 from tests.kit.goals import Goal
-
-PATIENCE_S = 60.0
-"""How many seconds a test waits for an answer."""
+from tests.kit.limits import PATIENCE_S
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from tests.e2e.rig import githttp
 from tests.kit.http import running
+from tests.kit.limits import LONGEST_TEST_S
 
 _LOCK = threading.Lock()
 
@@ -30,6 +31,8 @@ class Faults:
     """Whether a push without an answer also sets ``away``."""
     hang: threading.Event | None = None
     """An event for which the server waits before it handles a request; None to wait for nothing."""
+    hanging: bool = False
+    """Whether a request has begun to wait for it."""
     cuts: Callable[[], bool] = lambda: False
     """Returns whether to cut the connection.
 
@@ -76,7 +79,8 @@ class _Handler(githttp.Handler):
         server, prefix = self.ordered
         faults = server.faults
         if faults.hang is not None:
-            faults.hang.wait(60)
+            faults.hanging = True
+            faults.hang.wait(LONGEST_TEST_S)
         self._received = b"".join(super().body())
         if self._cut(server):
             return

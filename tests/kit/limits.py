@@ -1,10 +1,14 @@
-"""A limit on the size of files, which acts on one process like a full disk."""
+"""How long tests wait for what must happen, and a limit on the size of files like a full disk's."""
 
 from __future__ import annotations
 
 import resource
 from collections.abc import Iterator
 from contextlib import contextmanager
+
+# These only end what hangs. They must be far above what anything takes on a busy machine.
+PATIENCE_S = 240.0
+LONGEST_TEST_S = 600.0
 
 
 @contextmanager

@@ -5,12 +5,13 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Container, Iterable, Iterator, Sequence
+from itertools import islice
 from typing import Any, NamedTuple
 
 import jsonschema_rs
 from demandops.errors import Fault
 
-from tests.kit.chance import TIMES
+from tests.kit.chance import IN_FULL, TIMES
 
 Place = tuple[str | int, ...]
 Schema = dict[str, Any]
@@ -67,6 +68,11 @@ class Mutation(NamedTuple):
 
 
 def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
+    """Yield mutations at each place of a document: all of them, or in `make test` every third."""
+    return islice(_mutations(document, limits), 0, None, 1 if IN_FULL else 3)
+
+
+def _mutations(document: Any, limits: Iterable[int]) -> Iterator[Mutation]:
     """Yield a mutation for each mistake at each place of a document.
 
     ``limits`` are tried in place of whole numbers. To save time, a place gets only one value of a

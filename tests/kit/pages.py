@@ -20,6 +20,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from tests.kit.limits import PATIENCE_S
+
 _TAG = re.compile(r"\s*<!-- (run|tested by [^>]*|not run: [^>]*) -->\s*")
 _FENCE = re.compile(r"(\s*)(`{3,})(\w*)(?: title=\"([^\"]*)\")?\s*")
 _SHELL = ("sh", "bash", "shell", "console")
@@ -123,7 +125,7 @@ def _ran(
         stderr=subprocess.STDOUT,
         text=True,
         check=False,
-        timeout=120,
+        timeout=PATIENCE_S,
     )
 
 

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.kit.goals import Goal
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GIT_ENVIRONMENT
 
 _CHECKOUT = Path(__file__).parents[2]
@@ -152,7 +153,7 @@ def listen_to_all(
     waited_for = threading.Barrier(len(runs), on_ready)
     with ThreadPoolExecutor(len(runs)) as pool:
         try:
-            return list(pool.map(lambda run: run.listen(lambda: waited_for.wait(60)), runs))
+            return list(pool.map(lambda run: run.listen(lambda: waited_for.wait(PATIENCE_S)), runs))
         except BaseException:
             drivers.kill_runs()  # otherwise the pool would wait for the runs for ever
             raise

@@ -2,7 +2,6 @@
 # ruff: noqa: F401
 
 from tests.kit.generator import (
-    PATIENCE_S,
     Gate,
     Proposed,
     Stages,
@@ -15,6 +14,7 @@ from tests.kit.generator import (
 )
 from tests.kit.goals import Goal, impossible, leave
 from tests.kit.goals import numbered as goal
+from tests.kit.limits import PATIENCE_S
 from tests.kit.memory import NOW, books_after
 from tests.kit.processes import Drivers, Run, Told, demand, listen_to_all
 from tests.kit.repo import (

@@ -31,11 +31,11 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from unique_identifier_msgs.msg import UUID
 
+from tests.kit.limits import PATIENCE_S
 from tests.kit.warm_commands import WarmCommand, WarmCommands
 
 Process = subprocess.Popen[str] | WarmCommand
 
-DEADLINE_S = 60.0
 STATUS = {
     GoalStatus.STATUS_SUCCEEDED: "succeeded",
     GoalStatus.STATUS_ABORTED: "aborted",
@@ -96,7 +96,7 @@ class Served:
         data: dict[str, Any] = json.loads(self.demandops("bookkeeping", "--output", "json"))
         return data
 
-    def wait_for(self, text: str, seconds: float = DEADLINE_S) -> None:
+    def wait_for(self, text: str, seconds: float = PATIENCE_S) -> None:
         """Wait until the log contains ``text``.
 
         If the text is late, or if the process ends without it, fail with :meth:`last_words`. The
@@ -128,7 +128,7 @@ class Served:
                     times = f"ran {ran:.1f} s, waited {waited:.1f} s for a processor"
                     lines.append(f"{name}: {times}, now in {waits}")
             self.process.send_signal(signal.SIGABRT)  # Python prints where each thread is
-            self.process.wait(30)
+            self.process.wait(PATIENCE_S)
         return "\n".join([*lines, self.log.read_text()])
 
     def _scheduled(self, thread: int) -> tuple[float, float]:
@@ -142,7 +142,7 @@ class Served:
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
         self.process.send_signal(number)
-        return self.process.wait(30)
+        return self.process.wait(PATIENCE_S)
 
 
 Serve = Callable[..., Served]
@@ -193,7 +193,7 @@ class Servers:
         for served in self._started:
             if served.process.poll() is None:
                 served.process.kill()
-                served.process.wait(10)
+                served.process.wait(PATIENCE_S)
 
 
 @dataclass
@@ -242,7 +242,7 @@ class Client:
             DEEP_QOS,
         )
 
-    def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
+    def wait(self, condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
         """Spin until a condition is true; fail the test after ``seconds``."""
         end = time.monotonic() + seconds
         while not condition():

@@ -11,7 +11,7 @@ from playwright.sync_api import Browser, expect
 
 from tests.kit import repo
 from tests.kit.browser import Visit, chromium
-from tests.kit.generator import PATIENCE_S
+from tests.kit.limits import PATIENCE_S
 from tests.kit.page_story import Story, story
 
 expect.set_options(timeout=PATIENCE_S * 1000)

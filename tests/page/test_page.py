@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import threading
-import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -80,17 +79,12 @@ def test_the_first_view_tells_why_since_when_and_who(visit: Visits) -> None:
     expect(cause).to_contain_text("edge/object_detection_fusion")
 
 
-def test_a_commit_is_on_the_page_within_a_second(visit: Visits, fleet: Story) -> None:
-    """The fastest of three commits counts, so that a busy machine does not fail the test."""
+def test_a_commit_is_on_the_page_at_once(visit: Visits, fleet: Story) -> None:
+    """The page changes because of an event; the benchmark measures how long that takes."""
     page = visit().open("/demands")
     expect(page.locator("#live")).to_have_text("live")
-    waits = []
-    for number in range(3):
-        book(fleet.generator, leased(f"arrival-{number}", "vehicle02", "40m"))
-        start = time.monotonic()
-        expect(page.locator("main")).to_contain_text(f"arrival-{number}")
-        waits.append(time.monotonic() - start)
-    assert min(waits) < 1.0, waits
+    book(fleet.generator, leased("arrival", "vehicle02", "40m"))
+    expect(page.locator("main")).to_contain_text("arrival")
 
 
 def test_an_update_of_the_page_keeps_the_focus_and_the_typed_text(

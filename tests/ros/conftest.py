@@ -11,6 +11,7 @@ from demandops_ros import DemandClient
 
 from tests.kit import sync
 from tests.kit.generator import wait_until
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import POLICY, GitRepo, init, read, tip
 from tests.kit.ros import Client, Serve, Served, Servers, reserved
 from tests.kit.warm_commands import WarmCommands
@@ -79,7 +80,7 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     with reserved() as domain:
         servers = Servers(folder, domain, DEMANDOPS_DATA_HOME=str(folder / "home"))
         served = servers.start(str(bare))
-        wait_until(lambda: tip(bare) != changed, "the node has followed the change", 60)
+        wait_until(lambda: tip(bare) != changed, "the node has followed the change")
         yield served
         servers.kill()
 
@@ -111,5 +112,5 @@ def caller(shared: Served) -> Iterator[Client]:
 @pytest.fixture(scope="session")
 def vehicle(shared: Served) -> Iterator[DemandClient]:
     """A client of the shared node for DemandOps' own action."""
-    with DemandClient("vehicle00", domain_id=shared.domain) as made:
+    with DemandClient("vehicle00", domain_id=shared.domain, timeout_s=PATIENCE_S) as made:
         yield made

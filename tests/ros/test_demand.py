@@ -25,8 +25,9 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 from tests.kit.cli import Run
 from tests.kit.generator import wait_until
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import POLICY, GitRepo, git, tip
-from tests.kit.ros import DEADLINE_S, Served
+from tests.kit.ros import Served
 
 POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 RECORDER: dict[str, Any] = {
@@ -159,7 +160,7 @@ def test_a_goal_that_is_sent_again_because_no_response_came_counts_once(
     shared: Served, vehicle: DemandClient, before: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vehicle._sender._wait_until_discovered(
-        time.monotonic() + DEADLINE_S
+        time.monotonic() + PATIENCE_S
     )  # the goal itself does not wait
     known, lost = vehicle._sender._await, [DemandError("timeout", "the response was lost")]
 
@@ -204,6 +205,7 @@ def short_leases(shared: Served) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("short_leases")
+@pytest.mark.nightly  # its leases last two seconds
 def test_a_demand_of_a_client_that_died_ends_and_one_that_is_renewed_does_not(
     shared: Served, vehicle: DemandClient, before: str
 ) -> None:
@@ -213,7 +215,7 @@ def test_a_demand_of_a_client_that_died_ends_and_one_that_is_renewed_does_not(
     with vehicle.demand("kept", connections=[link("kept")]) as kept:
         assert kept.answer is not None and kept.answer.lease_s == 2
         assert vehicle.put("left", connections=[link("left")]).lease_s == 2
-        wait_until(lambda: "expire" in operations(shared, before), "the lease has ended", 60)
+        wait_until(lambda: "expire" in operations(shared, before), "the lease has ended")
         assert booked() == {"kept"}, "the renewed demand must stay booked"
     assert booked() == set()
 
@@ -230,7 +232,7 @@ def test_the_bookkeeping_is_published_and_latched(
         raw.spin_once(0.1)
         return any(message.commit == commit for message in heard)
 
-    wait_until(is_latched, "the commit's bookkeeping is latched", 60)
+    wait_until(is_latched, "the commit's bookkeeping is latched")
     books = json.loads(heard[-1].bookkeeping_json)
     assert books["commit"] == commit and "latched" in books["connections"]
 
@@ -269,9 +271,9 @@ def test_the_command_line_sends_holds_and_gives_up(
         text=True,
     )
     held = ["put", "release", "put"]
-    wait_until(lambda: operations(shared, before) == held, "the demand is held", 60)
+    wait_until(lambda: operations(shared, before) == held, "the demand is held")
     holding.send_signal(signal.SIGINT)
-    out, err = holding.communicate(timeout=60)
+    out, err = holding.communicate(timeout=PATIENCE_S)
     assert holding.returncode == 0, err
     assert out.startswith("booked in ") and err.endswith("released\n")
     assert operations(shared, before) == [*held, "release"]
@@ -284,7 +286,7 @@ def test_an_answer_without_a_commit_names_none(capfd: pytest.CaptureFixture[str]
 
 def test_a_requester_without_permission_is_refused_with_the_rule(shared: Served) -> None:
     with (
-        DemandClient("stranger", domain_id=shared.domain) as stranger,
+        DemandClient("stranger", domain_id=shared.domain, timeout_s=PATIENCE_S) as stranger,
         pytest.raises(DemandError) as caught,
     ):
         stranger.put("d", connections=[link("d")])

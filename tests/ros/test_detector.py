@@ -27,6 +27,7 @@ from examples.experiment import paper
 from tests.kit.detection import POSE
 from tests.kit.generator import wait_until
 from tests.kit.goals import put
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import POLICY, GitRepo, git
 from tests.kit.ros import Served, Servers
 
@@ -106,7 +107,7 @@ class Fleet:
         return {pair.key: pair.value for pair in status.values}["entities"] if status else ""
 
     def until(self, true: Callable[[], object], what: str) -> None:
-        """Publish poses until `true()` holds; fail after 60 s, with `what` in the message."""
+        """Publish poses until `true()` holds; fail with `what` in the message."""
         next_look = [0.0]
 
         def spun() -> object:
@@ -119,7 +120,7 @@ class Fleet:
             next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles publish meanwhile
             return found
 
-        wait_until(spun, what, 60)
+        wait_until(spun, what)
 
     def close(self) -> None:
         self._executor.shutdown(timeout_sec=1)
@@ -150,6 +151,7 @@ def commits(served: Served) -> list[str]:
     return git(served.state_repo, "log", "--reverse", form, "main").split()
 
 
+@pytest.mark.nightly
 def test_vehicles_that_drive_through_the_intersection_form_the_demands_of_the_paper(
     servers: Servers, fleet: Fleet, new_repo: Callable[[str], Path], tmp_path: Path
 ) -> None:
@@ -214,6 +216,7 @@ def rules_of(**fields: Any) -> str:
     )
 
 
+@pytest.mark.nightly
 def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried_again(
     servers: Servers, fleet: Fleet, new_repo: Callable[[str], Path], tmp_path: Path
 ) -> None:
@@ -251,7 +254,7 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
     fleet.until(lambda: commits(served).count("renew") >= 3, "its lease is renewed")
     assert books in json.dumps(served.bookkeeping())
     detecting.process.send_signal(signal.SIGKILL)
-    detecting.process.wait(10)
+    detecting.process.wait(PATIENCE_S)
     fleet.until(lambda: commits(served)[-1] == "expire", "its lease ends without the detector")
     assert served.bookkeeping()["services"] == {}
 

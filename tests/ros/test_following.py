@@ -13,6 +13,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.action import ActionServer
 
 from tests.kit.goals import link as connection
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, git, read
 from tests.kit.ros import Client, Serve, Served
 
@@ -121,7 +122,7 @@ def test_a_push_that_the_webhook_reports_is_followed_at_once(
         r"listening for pushes at (http://127.0.0.1:[0-9]+/push)", served.log.read_text()
     )
     assert found is not None
-    with urllib.request.urlopen(found[1], data=b"{}", timeout=10) as answer:  # noqa: S310
+    with urllib.request.urlopen(found[1], data=b"{}", timeout=PATIENCE_S) as answer:  # noqa: S310
         assert answer.status == 202
     follow = "A person DemandOps generator"
     client.wait(lambda: git(bare, "log", "-1", "--format=%an %cn", "main") == follow)
@@ -138,7 +139,7 @@ def test_the_node_shows_its_state_repo_on_a_page(serve: Serve, client: Client, b
     assert found is not None
 
     def shown(view: str) -> str:
-        with urllib.request.urlopen(f"{found[1]}{view}", timeout=10) as answer:  # noqa: S310
+        with urllib.request.urlopen(f"{found[1]}{view}", timeout=PATIENCE_S) as answer:  # noqa: S310
             return str(answer.read().decode())
 
     assert "Nothing is demanded" in shown("")

@@ -35,13 +35,14 @@ from rosgraph_msgs.msg import Clock
 from examples.experiment import paper
 from tests.kit.goals import experiment
 from tests.kit.goals import link as connection
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import git, hook, tip
 from tests.kit.ros import Client, Serve, Served
 
 
 def held_remote(bare: Path) -> str:
     """Return the URL of a repository that delays every push until its folder has a file ``go``."""
-    hook(bare, "pre-receive", "for _ in $(seq 600); do [ -e go ] && exit; sleep 0.05; done")
+    hook(bare, "pre-receive", "for _ in $(seq 4800); do [ -e go ] && exit; sleep 0.05; done")
     return f"file://{bare}"
 
 
@@ -153,7 +154,7 @@ def test_a_process_ends_with_0_while_its_executor_has_much_to_do(end: str) -> No
         f"time.sleep(0.2); {end}"
     )
     command = [sys.executable, "-c", program]
-    ended = subprocess.run(command, check=False, capture_output=True, timeout=60)
+    ended = subprocess.run(command, check=False, capture_output=True, timeout=PATIENCE_S)
     assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"", b"")
 
 
@@ -290,7 +291,7 @@ def test_a_stopped_node_first_finishes_the_open_goals(
     (bare / "go").touch()
     client.wait(lambda: all(goal.answered for goal in goals))
     assert {goal.status for goal in goals} == {"succeeded"}, served.log.read_text()
-    assert served.process.wait(30) == 0
+    assert served.process.wait(PATIENCE_S) == 0
     assert git(bare, "rev-list", "--count", "main") == "6"
 
 
@@ -327,7 +328,7 @@ def test_calls_for_the_bookkeeping_are_answered_one_after_the_other(
     idle, most, answers = len(list(threads.iterdir())), 0, list[Any]()
     for _ in range(10):
         calls = [service.call_async(GetBookkeeping.Request(at=first)) for _ in range(5)]
-        end = time.monotonic() + 60
+        end = time.monotonic() + PATIENCE_S
         while not all(call.done() for call in calls):
             assert time.monotonic() < end
             caller.executor.spin_once(timeout_sec=0.001)

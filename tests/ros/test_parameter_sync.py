@@ -17,6 +17,7 @@ from demandops_ros.parameter_sync.parameter_file import parameters_of
 from rclpy.parameter import Parameter
 
 from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import Client, Served, Servers
 
 TARGET = "of_edge_fusion"
@@ -51,6 +52,7 @@ class Cluster:
         try:
             self.changes.get(timeout=10)
         except Empty:
+            self.reads -= 1  # after a watch that ended, the next read is no polling
             return Answer.json({})
         return Answer.json({"type": "MODIFIED", "object": self.item})
 
@@ -80,7 +82,7 @@ def start_fusion(tmp_path: Path, ros_domain: int) -> Iterator[StartFusion]:
         def start() -> subprocess.Popen[bytes]:
             log = stack.enter_context((tmp_path / "fusion.log").open("ab"))
             process = subprocess.Popen(command, env=environment, stdout=log, stderr=log)
-            stack.callback(lambda: (process.kill(), process.wait(10)))
+            stack.callback(lambda: (process.kill(), process.wait(PATIENCE_S)))
             return process
 
         yield start
@@ -157,7 +159,7 @@ def test_a_file_that_gives_a_node_nothing_is_refused(text: str, message: str) ->
 def test_a_kubeconfig_that_is_none_is_refused(servers: Servers, tmp_path: Path) -> None:
     (tmp_path / "kubeconfig").write_text("kind: Config")
     refused = start_sync(servers, tmp_path)
-    assert refused.process.wait(30) == 1
+    assert refused.process.wait(PATIENCE_S) == 1
     refused.wait_for(
         f"error: {tmp_path}/kubeconfig: --kubeconfig: cannot be used: Invalid kube-con"
     )
@@ -165,5 +167,5 @@ def test_a_kubeconfig_that_is_none_is_refused(servers: Servers, tmp_path: Path) 
 
 def test_a_parameter_that_is_not_set_is_named(servers: Servers) -> None:
     refused = servers.run("", "parameter-sync")
-    assert refused.process.wait(30) == 2
+    assert refused.process.wait(PATIENCE_S) == 2
     refused.wait_for("parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE")

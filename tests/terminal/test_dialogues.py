@@ -5,6 +5,8 @@ from __future__ import annotations
 import socket
 from pathlib import Path
 
+import pytest
+
 from tests.kit.dialogue import CTRL_C, Dialogue
 from tests.kit.http import kubeconfig
 from tests.kit.repo import GitRepo
@@ -36,6 +38,7 @@ def test_options_that_are_not_given_are_asked_for(checkout: Path) -> None:
     assert (checkout / "appdefs" / "tracking" / "values" / "tracker.yaml.j2").is_file()
 
 
+@pytest.mark.nightly  # sees whole seconds pass
 def test_a_slow_fetch_is_shown_while_it_lasts(state: GitRepo, tmp_path: Path) -> None:
     config = tmp_path / "gitconfig"
     config.write_text('[remote "origin"]\n\tuploadpack = sleep 1.5 && git-upload-pack\n')
@@ -49,6 +52,7 @@ def test_a_slow_fetch_is_shown_while_it_lasts(state: GitRepo, tmp_path: Path) ->
     assert not after.strip(), "the command printed rows although nothing is demanded"
 
 
+@pytest.mark.nightly  # sees whole seconds pass
 def test_a_cluster_that_does_not_answer_is_waited_for_until_ctrl_c_or_a_time_has_passed(
     state: GitRepo, tmp_path: Path
 ) -> None:

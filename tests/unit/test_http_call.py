@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import repeat
 from pathlib import Path
 
 import pytest
@@ -77,13 +78,11 @@ def test_an_answer_without_end_is_cut_off() -> None:
 
 def test_an_answer_that_drips_is_cut_off() -> None:
     head = b"HTTP/1.1 200 OK\r\n\r\n"
-    began = time.monotonic()
     with (
-        speaking(head, *[b"x"] * 60, pause=0.1) as url,
+        speaking(head, *repeat(b"x", 10_000), pause=0.1) as url,
         pytest.raises(NoAnswer, match=r"no complete answer within 0\.3 s; check that the server"),
     ):
         call(url, timeout=0.3)
-    assert time.monotonic() - began < 5
 
 
 @pytest.mark.parametrize(

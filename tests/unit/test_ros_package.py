@@ -8,6 +8,8 @@ import sys
 import demandops_ros
 import pytest
 
+from tests.kit.limits import PATIENCE_S
+
 IMPORT = """
 import sys
 import demandops_ros
@@ -19,7 +21,7 @@ assert "rclpy" in sys.modules
 
 
 def test_only_using_the_client_imports_rclpy() -> None:
-    subprocess.run([sys.executable, "-c", IMPORT], check=True, timeout=60)
+    subprocess.run([sys.executable, "-c", IMPORT], check=True, timeout=PATIENCE_S)
 
 
 def test_every_public_name_can_be_imported() -> None:

@@ -14,6 +14,7 @@ import yaml
 from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube, Manifest
 from tests.e2e.rig.kwok import NODE_ID_LABEL
+from tests.kit.limits import PATIENCE_S
 
 from .expected import FUSION
 
@@ -153,11 +154,11 @@ class Namespace:
 
     # --- waiting ----------------------------------------------------------------------------
 
-    def wait_lines(self, wanted: frozenset[str], timeout: float = 60.0) -> float:
+    def wait_lines(self, wanted: frozenset[str], timeout: float = PATIENCE_S) -> float:
         """Wait until `lines` returns just the wanted lines; return the time (`time.monotonic`)."""
         return self._wait_same(self.lines, wanted, timeout)
 
-    def wait_inventory(self, wanted: frozenset[str], timeout: float = 60.0) -> None:
+    def wait_inventory(self, wanted: frozenset[str], timeout: float = PATIENCE_S) -> None:
         """Wait until `inventory` returns exactly the wanted objects."""
         self._wait_same(self.inventory, wanted, timeout)
 

@@ -11,7 +11,8 @@ from collections.abc import Callable
 
 from tests.kit import ros
 from tests.kit.goals import Goal
-from tests.kit.ros import DEADLINE_S, Sent
+from tests.kit.limits import PATIENCE_S
+from tests.kit.ros import Sent
 
 
 class Client(ros.Client):
@@ -27,7 +28,7 @@ class Client(ros.Client):
         while not self._over.is_set():
             self.executor.spin_once()
 
-    def wait(self, condition: Callable[[], bool], seconds: float = DEADLINE_S) -> None:
+    def wait(self, condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
         end = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < end, "the condition did not hold in time"
@@ -45,7 +46,7 @@ class Client(ros.Client):
 
         A client still sees a killed server for a while, and goals to that server are lost.
         """
-        end = time.monotonic() + DEADLINE_S
+        end = time.monotonic() + PATIENCE_S
         under_way, since = self.send(sent), time.monotonic()
         while not under_way.accepted:
             assert time.monotonic() < end, "no node accepts the goal"
@@ -58,5 +59,5 @@ class Client(ros.Client):
     def close(self) -> None:
         self._over.set()
         self.executor.create_task(lambda: None)  # wakes the thread
-        self._thread.join(DEADLINE_S)
+        self._thread.join(PATIENCE_S)
         super().close()

@@ -20,6 +20,7 @@ from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube, Manifest
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import git
 from tests.kit.ros import Sent
 
@@ -31,7 +32,6 @@ from .timing import Times
 Domain = TypeVar("Domain", bound=Namespace)
 
 _READY = "taking demands on"
-_START_S = 60.0
 
 
 class Generator:
@@ -60,7 +60,7 @@ class Generator:
                 stdout=log,
                 stderr=subprocess.STDOUT,
             )
-        deadline = time.monotonic() + _START_S
+        deadline = time.monotonic() + PATIENCE_S
         while not (_READY in self._log_since(start) and self._client.reaches_a_node()):
             ended = self._process.poll() is not None
             if ended or time.monotonic() > deadline:

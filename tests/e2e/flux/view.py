@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 from tests.e2e.common.namespace import Namespace, name_of
 from tests.e2e.rig.errors import RigError
+from tests.kit.limits import PATIENCE_S
 
 SOURCE = "demandops"  # the GitRepository's name
 
@@ -63,15 +64,15 @@ class Domain(Namespace):
         # the new artifact of the source triggers the Kustomization
         self.kube.reconcile("GitRepository", SOURCE, self.namespace)
 
-    def wait_fetched(self, commit: str, timeout: float = 60.0) -> float:
+    def wait_fetched(self, commit: str, timeout: float = PATIENCE_S) -> float:
         self._wait_for(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit, timeout)
         return time.monotonic()
 
-    def wait_applied(self, commit: str, timeout: float = 60.0) -> float:
+    def wait_applied(self, commit: str, timeout: float = PATIENCE_S) -> float:
         self._wait_for(f"{commit[:10]} to be applied", lambda: self.applied() == commit, timeout)
         return time.monotonic()
 
-    def wait_attempted(self, commit: str, timeout: float = 60.0) -> None:
+    def wait_attempted(self, commit: str, timeout: float = PATIENCE_S) -> None:
         def attempted() -> bool:
             status = self._status("Kustomization", self.name)
             return _commit(status.get("lastAttemptedRevision")) == commit

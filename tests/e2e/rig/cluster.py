@@ -21,6 +21,8 @@ from pathlib import Path
 from types import ModuleType, TracebackType
 from typing import Literal
 
+from tests.kit.limits import PATIENCE_S
+
 from . import argocd, flux, githttp, kwok, pki, settings, tools
 from .controlplane import ControlPlane
 from .errors import RigError
@@ -150,7 +152,7 @@ class Rig:
             githttp.init_bare(path)
         return path
 
-    def add_nodes(self, node_ids: Iterable[str], timeout: float = 60.0) -> list[str]:
+    def add_nodes(self, node_ids: Iterable[str], timeout: float = PATIENCE_S) -> list[str]:
         """Create fake nodes with these `node_id` labels; return their names once all are Ready."""
         manifests = [kwok.manifest(node_id) for node_id in node_ids]
         names = [manifest["metadata"]["name"] for manifest in manifests]

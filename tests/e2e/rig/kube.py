@@ -22,6 +22,8 @@ from kubernetes.dynamic.client import DynamicClient
 from kubernetes.dynamic.exceptions import NotFoundError
 from urllib3.exceptions import HTTPError
 
+from tests.kit.limits import PATIENCE_S
+
 from .errors import RigError
 
 Manifest = dict[str, Any]
@@ -156,7 +158,7 @@ class Kube:
         self.patch(kind, name, {"metadata": {"annotations": annotations}}, namespace)
         return token
 
-    def wait(self, what: str, look: Callable[[], Seen | None], timeout: float = 60.0) -> Seen:
+    def wait(self, what: str, look: Callable[[], Seen | None], timeout: float = PATIENCE_S) -> Seen:
         """Return the first result of `look` that is neither None nor False.
 
         Raises RigError after `timeout` seconds, or at once if a part of the rig has died.
@@ -175,7 +177,12 @@ class Kube:
             time.sleep(_POLL_SECONDS)
 
     def wait_ready(
-        self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
+        self,
+        kind: str,
+        name: str,
+        namespace: str = "",
+        timeout: float = PATIENCE_S,
+        version: str = "",
     ) -> Manifest:
         """Wait until an object's newest generation is Ready; return the object."""
         last: list[str] = ["does not exist"]
@@ -192,12 +199,17 @@ class Kube:
             raise RigError(f"{error}; last seen: {last[0]}") from error
 
     def wait_gone(
-        self, kind: str, name: str, namespace: str = "", timeout: float = 60.0, version: str = ""
+        self,
+        kind: str,
+        name: str,
+        namespace: str = "",
+        timeout: float = PATIENCE_S,
+        version: str = "",
     ) -> None:
         what = f"{kind} {namespace}/{name} to go"
         self.wait(what, lambda: self.get(kind, name, namespace, version) is None, timeout)
 
-    def install_crds(self, files: Iterable[Path], timeout: float = 60.0) -> None:
+    def install_crds(self, files: Iterable[Path], timeout: float = PATIENCE_S) -> None:
         """Apply CRDs and wait until the server serves them."""
         crds = _documents([path.read_text() for path in files])
         self.apply(*crds)

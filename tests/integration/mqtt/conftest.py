@@ -19,12 +19,11 @@ import pytest
 import yaml
 
 from tests.e2e.rig import pki
+from tests.kit.limits import PATIENCE_S
 
 USER = "fleet 007"
 PASSWORD = "12345\"'{}#\\ é%"  # noqa: S105 - of a broker that lives as long as the test
 """A password with characters that would break YAML, a shell or a command line without quotes."""
-
-DEADLINE_S = 60.0
 
 
 def _program(name: str) -> str:
@@ -80,11 +79,11 @@ def broker(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Broker]:
         yield Broker(port, keys.authority)
     finally:
         process.terminate()
-        process.wait(DEADLINE_S)
+        process.wait(PATIENCE_S)
 
 
 def _wait_until_it_listens(process: subprocess.Popen[bytes], port: int, log: Path) -> None:
-    until = time.monotonic() + DEADLINE_S
+    until = time.monotonic() + PATIENCE_S
     while time.monotonic() < until:
         assert process.poll() is None, log.read_text()
         with socket.socket() as probe:
@@ -131,7 +130,7 @@ class Pod:
             [self._on_host(container, part) for part in command],
             capture_output=True,
             text=True,
-            timeout=60,
+            timeout=PATIENCE_S,
             check=False,
         )
         assert done.returncode == 0, done.stderr
@@ -196,7 +195,7 @@ class Client:
             qos=self.parameters.get(f"{prefix}.advanced.mqtt.qos", 0),
             retain=self.parameters.get(f"{prefix}.advanced.mqtt.retained", False),
         )
-        sent.wait_for_publish(DEADLINE_S)
+        sent.wait_for_publish(PATIENCE_S)
         assert sent.is_published()
 
     def ready(self) -> None:
@@ -206,7 +205,7 @@ class Client:
 
     def wait(self, done: Any) -> None:
         """Wait until `done` returns a true value; fail at the deadline."""
-        until = time.monotonic() + DEADLINE_S
+        until = time.monotonic() + PATIENCE_S
         while not done():
             assert time.monotonic() < until, (self.reason, self.arrived)
             time.sleep(0.01)

@@ -22,6 +22,7 @@ from demandops.staterepo.history import authorship
 from demandops.staterepo.load import snapshot, state_in_effect
 
 from tests.kit import rig
+from tests.kit.chance import IN_FULL
 from tests.kit.cli import Run
 from tests.kit.config import override
 from tests.kit.repo import FORGER
@@ -228,8 +229,7 @@ def includes(generator: Generator, commit: str) -> bool:
     return generator.includes(str(generator.snapshot.commit), commit)
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.limit(60)
+@pytest.mark.parametrize("seed", range(3 if IN_FULL else 1))
 def test_a_start_at_any_commit_finds_what_the_running_generator_has(
     bare: Path, person: Person, seed: int
 ) -> None:

@@ -23,6 +23,7 @@ from demandops.staterepo.load import problem_report
 from demandops.staterepo.write.journal import Journal
 
 from tests.kit import goals, rig
+from tests.kit.clock import Clock
 from tests.kit.git_over_http import Server
 from tests.kit.repo import read as file_of
 from tests.kit.rig import Person, Stages, goal, leave
@@ -305,7 +306,7 @@ def test_stopping_does_not_wait_for_a_look_that_hangs(http: str, server: Server)
     hang = server.faults.hang = threading.Event()
     try:
         rig.wait_until(lambda: generator._repository._process, "a fetch is under way and hangs")  # type: ignore[attr-defined]
-        assert generator.stop(timeout=60).result(10) is True
+        assert generator.stop(timeout=2 * rig.PATIENCE_S).result(rig.PATIENCE_S) is True
     finally:
         server.faults.hang = None
         hang.set()
@@ -404,21 +405,13 @@ def _kept(journal: Path) -> list[str]:
 
 
 def test_a_lease_that_ends_while_the_remote_is_away_goes_when_it_is_back(
-    http: str, server: Server, bare: Path, person: Person
+    http: str, server: Server, bare: Path
 ) -> None:
-    short = goals.put("short", lease=1)
-    domains = "policy/access-domains.yaml"
-    person.change(
-        {
-            domains: file_of(bare, domains)
-            .rstrip("\n")
-            .replace("name: perception\n", "name: perception\n    leases: {slack: 0s}\n")
-            + "\n"
-        }
-    )
-    with rig.running(http, fetch_interval=SOON_S) as generator:
-        rig.book(generator, short)
+    clock = Clock()
+    with rig.running(http, fetch_interval=SOON_S, runtime=clock) as generator:
+        rig.book(generator, goals.put("short", lease=600))
         server.faults.away = True
+        clock.pass_(700)
         refused = server.refused
         rig.wait_until(
             lambda: server.refused > refused + 3, "the generator has tried to end the lease"

@@ -38,7 +38,6 @@ def _client(lane: int) -> list[tuple[str, rig.Goal]]:
     return made
 
 
-@pytest.mark.limit(60)
 @pytest.mark.parametrize("seed", [20260301])
 def test_killed_at_random_moments_loses_and_doubles_nothing(
     drivers: Drivers, address: str, bare: Path, seed: int

@@ -17,6 +17,7 @@ from pathlib import Path
 import pytest
 
 from tests.kit import git_over_http, rig
+from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.rig import Drivers, Goal
 
 pytestmark = pytest.mark.synced
@@ -85,7 +86,8 @@ def _images(number: int) -> str:
     return "\n".join([f"# change {number}", *kept]) + "\n"
 
 
-@pytest.mark.limit(60 + DEMANDS)
+@pytest.mark.nightly
+@pytest.mark.limit(LONGEST_TEST_S + DEMANDS)
 def test_many_writers_end_where_one_would(
     drivers: Drivers,
     bare: Path,
@@ -114,7 +116,7 @@ def test_many_writers_end_where_one_would(
         finally:
             over.set()
         took = time.monotonic() - started
-        people.join(60)
+        people.join(rig.PATIENCE_S)
         cut = server.cut
     with capsys.disabled():
         _print(told, person, took, cut)

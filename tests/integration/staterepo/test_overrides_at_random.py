@@ -11,7 +11,6 @@ from contextlib import suppress
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
-import pytest
 from demandops.demand.claim import OVERRIDE_PREFIX
 from demandops.errors import DemandOpsError
 
@@ -62,7 +61,6 @@ POOL: dict[str, Write] = {
 }
 
 
-@pytest.mark.limit(120)
 def test_whatever_people_merge_history_verifies(address: str, bare: Path, tmp_path: Path) -> None:
     chance = random.Random(1 if address == str(bare) else 2)
     person = Person(bare, tmp_path / "person")

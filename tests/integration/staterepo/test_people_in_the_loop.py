@@ -19,6 +19,7 @@ from demandops.service import Generator
 
 from tests.kit import rig
 from tests.kit.config import override
+from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.repo import read as text
 from tests.kit.rig import Person
 
@@ -108,7 +109,8 @@ def story(bare: Path, engineer: Engineer) -> str:
     return generated
 
 
-@pytest.mark.limit(60 + FURTHER)
+@pytest.mark.nightly
+@pytest.mark.limit(LONGEST_TEST_S + FURTHER)
 def test_what_the_platform_engineer_merges_is_honoured_and_stays_so(
     bare: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
 from demandops.errors import Refused
 from demandops.staterepo import reader
@@ -43,7 +42,6 @@ def put(demand: str, application: str, vehicle: str) -> dict[str, Any]:
     return head | {"applications": [app]}
 
 
-@pytest.mark.limit(60)
 def test_no_node_gets_more_than_it_has_and_who_shares_gets_one_node(
     url: str, bare: Path, person: Person, tmp_path: Path
 ) -> None:

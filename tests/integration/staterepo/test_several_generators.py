@@ -35,7 +35,6 @@ def _assert_all_there(bare: Path) -> None:
     assert rig.books(bare) == rig.books_after(made for _, made in names)
 
 
-@pytest.mark.limit(60)
 def test_two_generators_in_one_process_lose_and_double_nothing(
     url: str, bare: Path, tmp_path: Path
 ) -> None:
@@ -65,7 +64,7 @@ def test_two_generators_in_one_process_lose_and_double_nothing(
         for thread in threads:
             thread.start()
         for thread in threads:
-            thread.join(50)
+            thread.join(rig.PATIENCE_S)
     assert failures == []
     assert len(results) == 2 * EACH
     assert {r.outcome for r in results.values()} == {"booked", "released"}
@@ -74,7 +73,6 @@ def test_two_generators_in_one_process_lose_and_double_nothing(
     assert {receipt.commit for receipt in results.values()} <= there
 
 
-@pytest.mark.limit(60)
 def test_two_processes_on_one_machine_lose_and_double_nothing(
     drivers: Drivers, bare: Path, data_home: Path
 ) -> None:
@@ -139,6 +137,6 @@ def test_housekeeping_by_git_during_demands_loses_nothing(bare: Path) -> None:
                 rig.book(generator, goal(number))
     finally:
         stop.set()
-        thread.join(20)
+        thread.join(rig.PATIENCE_S)
     assert len(rig.operations(bare)) == 15
     rig.assert_sound(bare, verify_last=5)

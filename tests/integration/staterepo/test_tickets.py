@@ -113,7 +113,7 @@ def test_closing_finishes_what_is_in_hand(address: str, bare: Path) -> None:
     tickets = [generator.submit(goal(0), "op-0", gate)]
     assert gate.reached.wait(rig.PATIENCE_S)
     tickets += [generator.submit(goal(n), f"op-{n}") for n in range(1, 30)]
-    stopped = generator.stop()
+    stopped = generator.stop(rig.PATIENCE_S)
     gate.open.set()
     assert stopped.result(rig.PATIENCE_S) is True
     assert all(ticket.future.done() for ticket in tickets)
@@ -122,7 +122,7 @@ def test_closing_finishes_what_is_in_hand(address: str, bare: Path) -> None:
 
 def test_a_demand_after_closing_is_told_so(bare: Path) -> None:
     generator = Generator(str(bare))
-    generator.close()
+    generator.close(rig.PATIENCE_S)
     ticket = generator.submit(goal(1))
     with pytest.raises(ShuttingDown) as error:
         rig.receipt(ticket)
@@ -133,10 +133,10 @@ def test_a_demand_after_closing_is_told_so(bare: Path) -> None:
 def test_stopping_again_ends_again(bare: Path) -> None:
     generator = Generator(str(bare))
     rig.book(generator, goal(1))
-    both = [generator.stop(), generator.stop()]
+    both = [generator.stop(rig.PATIENCE_S), generator.stop(rig.PATIENCE_S)]
     assert [one.result(rig.PATIENCE_S) for one in both] == [True, True]
     assert generator.close(rig.PATIENCE_S) is True
-    assert generator.stop().result(rig.PATIENCE_S) is True
+    assert generator.stop(rig.PATIENCE_S).result(rig.PATIENCE_S) is True
 
 
 def test_a_demand_handed_in_while_closing_is_answered_or_not_taken(bare: Path) -> None:

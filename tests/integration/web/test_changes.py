@@ -28,6 +28,7 @@ from starlette.testclient import TestClient
 from tests.integration.web.conftest import VIEWS, Look, causes
 from tests.kit import goals
 from tests.kit.generator import Proposed, book, running, wait_until
+from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, Person, away, git
 
 DENY = """apiVersion: demandops/v1
@@ -270,7 +271,9 @@ def _cover(one: map_layout.NodeCard, other: map_layout.NodeCard) -> bool:
     )
 
 
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize(
+    "stop", [pytest.param(signal.SIGINT, marks=pytest.mark.nightly), signal.SIGTERM]
+)
 def test_the_command_serves_the_page_until_it_is_stopped(bare: Path, stop: int) -> None:
     command = [sys.executable, "-m", "demandops.cli.main", "web"]
     process = subprocess.Popen(
@@ -281,10 +284,10 @@ def test_the_command_serves_the_page_until_it_is_stopped(bare: Path, stop: int) 
     )
     assert process.stdout is not None
     url = process.stdout.readline().strip()
-    with urllib.request.urlopen(url, timeout=10) as answer:  # noqa: S310 - the page
+    with urllib.request.urlopen(url, timeout=PATIENCE_S) as answer:  # noqa: S310 - the page
         assert b"Nothing is demanded" in answer.read()
     process.send_signal(stop)
-    out, err = process.communicate(timeout=20)
+    out, err = process.communicate(timeout=PATIENCE_S)
     assert (process.returncode, out, err) == (0, "", "stopped\n")
 
 

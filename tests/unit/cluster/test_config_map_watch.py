@@ -13,6 +13,7 @@ from demandops.cluster.config_map_watch import ConfigMapWatch
 from demandops.errors import InvalidInput
 
 from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.limits import PATIENCE_S
 
 ITEM = {"metadata": {"name": "of-params", "resourceVersion": "1"}, "data": {"params.yml": "a"}}
 NAME = "ConfigMap perception/of-params"
@@ -39,7 +40,7 @@ def test_data_of_a_deleted_config_map_stay_valid(
         watch = ConfigMapWatch(
             "perception", "of-params", lambda data: passed_on.append({**data}), config
         )
-        assert is_read.wait(30)
+        assert is_read.wait(PATIENCE_S)
         watch.close()
     assert passed_on == [{"params.yml": "a"}]
     assert [message for message in caplog.messages if "retrying" not in message] == [

@@ -21,6 +21,7 @@ from demandops.errors import InvalidInput
 from demandops.runtime import Runtime
 from kubernetes import client, config
 
+from tests.kit.chance import IN_FULL
 from tests.kit.http import Answer, Call, kubeconfig, serving
 from tests.kit.turns import Turns
 
@@ -240,7 +241,7 @@ def test_a_leader_ends_before_its_lease_also_if_calls_take_long(
     assert one.is_dead
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(4 if IN_FULL else 1))
 def test_never_do_two_lead(tmp_path: Path, seed: int) -> None:
     """At random, calls take long, calls fail with or without effect, and processes are killed."""
     chance = random.Random(seed)

@@ -2,31 +2,38 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health.release_health import ClusterDomain, Target
 from demandops.cluster.rollout_watcher import RolloutWatcher
 
+from tests.kit.clock import Clock
 from tests.kit.cluster import Letters
 from tests.kit.http import kubeconfig
+from tests.kit.limits import PATIENCE_S
+from tests.kit.memory import NOW
 
 AWAY = "http://127.0.0.1:1"
 
 
 def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: Path) -> None:
-    file = kubeconfig(tmp_path, AWAY)
-    status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
+    file, clock = kubeconfig(tmp_path, AWAY), Clock(NOW)
+    status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters(), runtime=clock)
     try:
         target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
-        start = time.monotonic()
-        health = status.follow("a" * 40, [target], "healthy", timeout=0.5).result(30)
-        assert time.monotonic() - start >= 0.5
+        late = status.follow("a" * 40, [target], "healthy", timeout=60)
+        soon = status.follow("a" * 40, [target], "healthy", timeout=10)
+        clock.pass_(11)
+        health = soon.result(PATIENCE_S)
+        assert not late.done()
+        clock.pass_(60)
+        assert late.result(PATIENCE_S).state == "waiting"
         assert (health.state, health.object) == ("waiting", "cluster away")
         assert health.reason.startswith("cannot be read: ")
         # a demand without a target on that cluster does not wait for the cluster
-        assert status.follow("a" * 40, [], "healthy", timeout=60).result(30).state == "healthy"
+        without = status.follow("a" * 40, [], "healthy", timeout=60)
+        assert without.result(PATIENCE_S).state == "healthy"
     finally:
         status.close()
 
@@ -48,4 +55,4 @@ def test_closing_answers_the_rollouts_that_are_still_followed(tmp_path: Path) ->
     target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
     followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
     status.close()
-    assert followed.result(10).state == "waiting"
+    assert followed.result(PATIENCE_S).state == "waiting"

@@ -279,6 +279,7 @@ def test_of_many_faults_the_first_are_told_and_the_others_counted() -> None:
     assert len(found) < 10_000
 
 
+@pytest.mark.nightly
 def test_similar_names_are_found_soon_however_many_words_are_unknown() -> None:
     names = [f"vehicle-{number:04}" for number in range(1000)]
     before = time.thread_time()

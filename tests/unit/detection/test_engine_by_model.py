@@ -8,9 +8,10 @@ from math import hypot
 from typing import Any
 
 from demandops.detection.events.detection_state import Observation
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.chance import examples
 from tests.kit.detection import Run, rule
 
 TICK = 0.5
@@ -110,7 +111,7 @@ who = st.sampled_from([(source, name) for source, names in NAMES.items() for nam
 moment = st.tuples(st.integers(0, 5), st.lists(st.tuples(who, coordinate, coordinate), max_size=6))
 
 
-@settings(max_examples=150, deadline=None)
+@examples(150)
 @given(st.lists(moment, max_size=12), st.lists(st.booleans(), min_size=12, max_size=12))
 def test_the_engine_gives_the_events_of_the_model(
     moments: list[tuple[int, list[Any]]], splits: list[bool]

@@ -18,7 +18,7 @@ from demandops.ledger.recent_shutdowns import SHUTDOWNS_ROOT
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from tests.kit.chance import TIMES, chances, examples, told
+from tests.kit.chance import IN_FULL, TIMES, chances, examples, told
 from tests.kit.goals import application, connection, goal, link
 from tests.kit.memory import MemoryRepo, ledger_in, outcome
 from tests.model.books import Books, Demand, Goal, Result
@@ -116,7 +116,7 @@ def test_bookkeeping_files_and_outcomes_are_the_models_after_every_request(
     walk.assert_rendered_from_the_files()
 
 
-@pytest.mark.parametrize("seed", range(2 * TIMES))
+@pytest.mark.parametrize("seed", range(2 * TIMES if IN_FULL else 1))
 def test_they_stay_the_models_over_a_long_time(seed: int) -> None:
     walk = Walk(Random(seed))
     for request in walk.maker.sequence(120):

@@ -16,9 +16,10 @@ from demandops.demand.demand_request import Expire
 from demandops.errors import Refused
 from demandops.ledger.claim_changes import ClaimChange
 from demandops.plan.nodes.capacity import whole_usage
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.chance import examples
 from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo
 from tests.scenarios.running import configuration
@@ -81,7 +82,7 @@ def used(repo: MemoryRepo) -> Counter[str]:
     return found
 
 
-@settings(max_examples=12, deadline=None)
+@examples(12)
 @given(st.randoms(use_true_random=False))
 def test_it_is_counted_by_what_changes_and_no_node_gets_more_than_it_has(random: Random) -> None:
     repo = MemoryRepo(state=recorders())

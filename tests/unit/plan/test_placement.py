@@ -23,9 +23,10 @@ from demandops.ledger.world import World
 from demandops.plan.nodes.capacity import Usage
 from demandops.plan.nodes.placement import with_chosen_nodes
 from demandops.staterepo.history import commit_message
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit.chance import examples
 from tests.kit.config import skeleton, state_of
 from tests.kit.memory import NOW, MemoryRepo
 from tests.scenarios.running import configuration
@@ -119,7 +120,7 @@ def has(node: Node, requirement: Requirement) -> bool:
     )
 
 
-@settings(max_examples=60, deadline=None)
+@examples(60)
 @given(st.randoms(use_true_random=False))
 def test_it_is_a_node_that_fits_the_same_in_any_order_and_stays(random: Random) -> None:
     config, ledger, others = chance(random), Ledger(), Counter[str]()
@@ -261,7 +262,7 @@ def with_limits(random: Random) -> MemoryRepo:
     return MemoryRepo(state=state_of(load(configuration(config=files))))
 
 
-@settings(max_examples=8, deadline=None)
+@examples(8)
 @given(st.randoms(use_true_random=False))
 def test_a_demand_is_refused_only_if_each_node_that_fits_refuses_it(random: Random) -> None:
     repo = with_limits(random)

@@ -36,7 +36,7 @@ recorded(os, "fdatasync")
 before = []
 goal = json.loads(sys.argv[2])
 ticket = generator.submit(goal, "op", lambda stage, text: before.append((stage, calls[-1][0])))
-ticket.future.result(30)
+ticket.future.result(240)
 generator.close()
 setting = pygit2.Repository(str(bare)).config["core.fsync"]
 options = [call[2:] for call in calls if call[:2] == ["option", Option.ENABLE_FSYNC_GITDIR]]
