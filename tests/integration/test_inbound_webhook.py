@@ -56,7 +56,7 @@ def impatient(heard: Heard, monkeypatch: pytest.MonkeyPatch) -> Iterator[PushWeb
 @pytest.fixture
 def patient(heard: Heard, monkeypatch: pytest.MonkeyPatch) -> Iterator[PushWebhook]:
     """A webhook that cuts off no connection for being slow."""
-    monkeypatch.setattr(push_webhook, "_TIMEOUT_S", 2 * LONGEST_TEST_S)
+    monkeypatch.setattr(http_server, "_STUCK_S", 2 * LONGEST_TEST_S)
     hook = PushWebhook("127.0.0.1:0", SECRET, heard)
     yield hook
     hook.close()

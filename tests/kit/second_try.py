@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+_MOST = 20  # more failures have one cause, and their second run would take too long
+
 
 class SecondTry:
     """A pytest plugin for a run that starts tests itself or through xdist's workers."""
@@ -29,7 +31,8 @@ class SecondTry:
     @pytest.hookimpl(wrapper=True, tryfirst=True)
     def pytest_sessionfinish(self, session: pytest.Session) -> Generator[None, object, object]:
         result = yield
-        if session.exitstatus == pytest.ExitCode.TESTS_FAILED:
+        is_few = len(self._failed) <= _MOST
+        if session.exitstatus == pytest.ExitCode.TESTS_FAILED and is_few:
             print(f"\n{len(self._failed)} failed, and run once more, alone", flush=True)
             command = [sys.executable, "-m", "pytest", "-x", "-p", "no:cacheprovider"]
             again = subprocess.run(
