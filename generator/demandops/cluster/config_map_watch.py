@@ -52,11 +52,15 @@ class ConfigMapWatch:
         self._data: dict[str, str] | None = None
         self._told = ""
         self._closed = runtime.event()
+        # Held while this calls on_data or the log, which both may call ROS. After `close` ROS ends,
+        # and a call of it from this thread would abort the process
+        self._calling = runtime.lock()
         runtime.keep_running("config-map", self._run)
 
     def close(self) -> None:
-        """Stop the watch. A call of ``on_data`` may still be running, but no other one follows."""
-        self._closed.set()
+        """Stop the watch; a call of ``on_data`` is waited for, and no other one follows."""
+        with self._calling:
+            self._closed.set()
 
     def _run(self) -> None:
         pause = _FIRST_PAUSE_S
@@ -97,14 +101,16 @@ class ConfigMapWatch:
     def _take(self, item: Any) -> None:  # noqa: ANN401 - the library has no types
         self._told = ""
         data = dict(item.data or {})
-        if data != self._data and not self._closed.is_set():
-            self._data = data
-            self._on_data(data)
+        with self._calling:
+            if data != self._data and not self._closed.is_set():
+                self._data = data
+                self._on_data(data)
 
     def _tell(self, text: str) -> None:
-        if text != self._told:
-            self._told = text
-            log.warning("%s %s", self._name, text)
+        with self._calling:
+            if text != self._told and not self._closed.is_set():
+                self._told = text
+                log.warning("%s %s", self._name, text)
 
 
 def _client(kubeconfig: Path | None) -> Any:  # noqa: ANN401 - the library has no types
