@@ -117,6 +117,14 @@ class Refused(InvalidInput):
     """Raised when a demand cannot be fulfilled; no part of it was booked."""
 
 
+class OverBudget(Exception):
+    """Raised within a decision that takes more work than one demand may cause.
+
+    It is no ``Refused``, so that nothing which looks for another way, such as another node, goes on
+    with the work. The decision turns it into a refusal with the code ``too-large``.
+    """
+
+
 class StateRepoError(DemandOpsError):
     """Raised when the state repo cannot be read or written; the message says how to fix it."""
 

@@ -57,25 +57,58 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         yield from (replace(each, field=one.place(each.field)) for each in found)
 
 
-def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault for each limit on items and parameters that the request exceeds."""
-    items = len(request.demanded) + len(request.own_requesters)
+def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
+    """Yield a fault if a goal, as plain data, is too long; the check ends where it is too long."""
+    length, left = 0, [goal]
+    while left and length <= limits.demand_characters:
+        value = left.pop()
+        if isinstance(value, dict):
+            left += value.keys()
+            left += value.values()
+        elif isinstance(value, list):
+            left += value
+        # a number has fewer digits than bits, and nothing is written with no character at all
+        length += len(value) if isinstance(value, str | list | dict) else 0
+        length += value.bit_length() // 4 if isinstance(value, int) else 0
+        length += 1
+    if length > limits.demand_characters:
+        size = f"has more than {limits.demand_characters} characters"
+        message = _too_large(size, "demandCharacters", limits.demand_characters)
+        yield fault("", message, code="too-large")
+
+
+def items_of(request: DemandRequest) -> int:
+    """Return how many things a request lists in total.
+
+    Each requester of an application or a connection holds each of its topics, so a topic counts
+    once for each of them.
+    """
+    items = len(request.own_requesters)
     items += len(request.positions) if isinstance(request, Put) else 0
     for one in request.demanded:
         held = one.held
-        items += len(one.requesters) if request.is_reference else 0
         if isinstance(held, Application):
-            items += len(held.all_inputs()) + len(held.deliver)
-            items += len(held.named) + (held.place.size if held.place else 0)
+            topics = sum(map(len, held.inputs.values()))
+            items += len(held.deliver) + len(held.named) + (held.place.size if held.place else 0)
         else:
-            items += len(held.topics)
+            topics = len(held.topics)
+        items += (1 + topics) * max(1, len(one.requesters))
+    return items
+
+
+def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
+    """Yield a fault for each limit on items and parameters that the request exceeds."""
+    for one in request.demanded:
+        held = one.held
         if isinstance(held, Application) and held.parameters:
             size = len(json.dumps(dict(held.parameters), default=str))
             if size > limits.parameter_bytes:
                 message = _too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
                 yield one.fault("parameters", message, code="too-large")
+    items = items_of(request)
     if items > limits.demand_items:
-        listed = f"lists {items} items (applications, connections, topics, requesters and so on)"
+        listed = f"lists {items} items (applications, connections, topics, requesters and so on, "
+        listed += "also of the connections that it needs)"
         message = _too_large(listed, "demandItems", limits.demand_items)
         yield fault("id" if request.is_reference else "demand", message, code="too-large")
 
