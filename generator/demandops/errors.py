@@ -11,6 +11,7 @@ from bisect import bisect
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import lru_cache
 
 from demandops.quoting import clipped, one_line
 
@@ -217,9 +218,13 @@ def _neighbors(word: str, names: list[str]) -> list[str]:
     """
     if len(names) <= _COMPARED:
         return names
-    found = []
-    for order in (slice(None), slice(None, None, -1)):
-        ordered = sorted(name[order] for name in names)
-        at = bisect(ordered, word[order])
-        found += [name[order] for name in ordered[max(0, at - 3) : at + 3]]
-    return found
+    at = bisect(names, word)
+    found = names[max(0, at - 3) : at + 3]
+    backwards = _backwards(tuple(names))
+    at = bisect(backwards, word[::-1])
+    return [*found, *(name[::-1] for name in backwards[max(0, at - 3) : at + 3])]
+
+
+@lru_cache(8)
+def _backwards(names: tuple[str, ...]) -> list[str]:
+    return sorted(name[::-1] for name in names)

@@ -126,7 +126,7 @@ def admit(
         *unclear,
         *not_placed,
         *paced(admission.faults(request, config), checkpoint),
-        *paced(permission.faults(request, config), checkpoint),
+        *permission_faults(request, config, checkpoint),
     ]
     # a list that could not be read must not be reported as empty
     unread = bool(malformed & {"apps", "applications", "connections"})
@@ -175,6 +175,14 @@ def paced(items: Iterable[_Item], checkpoint: Checkpoint) -> Iterator[_Item]:
     for item in items:
         checkpoint()
         yield item
+
+
+def permission_faults(
+    request: DemandRequest, config: Config, checkpoint: Checkpoint
+) -> Iterator[Fault]:
+    """Yield what is not allowed; ``checkpoint`` is called for each item, as rules may be many."""
+    for one in paced(request.demanded, checkpoint):
+        yield from permission.faults(replace(request, demanded=(one,)), config)
 
 
 def _refuse(faults: Iterable[Fault]) -> None:

@@ -22,6 +22,7 @@ from demandops.decision.admitted_request import (
     completed,
     leaves_nodes_open,
     paced,
+    permission_faults,
 )
 from demandops.decision.decision_notes import notes_on
 from demandops.decision.state import State
@@ -241,7 +242,9 @@ class _Trials:
                 "application, or split the demand"
             )
         request, config = completed(request, self._state), self._state.config
-        if any((*admission.faults(request, config), *permission.faults(request, config))):
+        if next(admission.faults(request, config), None) or next(
+            permission_faults(request, config, self._checkpoint), None
+        ):
             return False
         try:
             _booked(self._state, request, self._now, self._checkpoint)

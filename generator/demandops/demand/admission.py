@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
+from itertools import chain
 
 from demandops.config.appdef import ApplicationDefinition, Services
 from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
@@ -46,15 +47,22 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
             code="empty",
         )
     for one in request.demanded:
-        found = [*_id("id", one.held.id), *_requesters(one.requesters)]
+        found = chain(_id("id", one.held.id), _requesters(one.requesters))
         if isinstance(one.held, Application):
-            of_app = _application(one.held, config, request.adds_claims)
-            # the placement itself reports that it found no node, so an empty node is no fault then
-            placed = one.held.node or one.held.place is None
-            found += [each for each in of_app if placed or each.field != "node"]
+            found = chain(found, _application(one.held, config, request.adds_claims))
         else:
-            found += _connection(one.held, config, request.adds_claims)
-        yield from (replace(each, field=one.place(each.field)) for each in found)
+            found = chain(found, _connection(one.held, config, request.adds_claims))
+        for each in found:
+            # the placement itself reports that it found no node, so an empty node is no fault then
+            held = one.held
+            if (
+                each.field == "node"
+                and isinstance(held, Application)
+                and held.place
+                and not held.node
+            ):
+                continue
+            yield replace(each, field=one.place(each.field))
 
 
 def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
@@ -62,15 +70,13 @@ def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
     length, left = 0, [goal]
     while left and length <= limits.demand_characters:
         value = left.pop()
-        if isinstance(value, dict):
-            left += value.keys()
-            left += value.values()
-        elif isinstance(value, list):
-            left += value
-        # a number has fewer digits than bits, and nothing is written with no character at all
-        length += len(value) if isinstance(value, str | list | dict) else 0
-        length += value.bit_length() // 4 if isinstance(value, int) else 0
-        length += 1
+        if isinstance(value, str):
+            length += len(value)
+        elif isinstance(value, dict | list):
+            length += 2 * len(value)  # each part is at least a character and a comma
+            left += value if isinstance(value, list) else (*value.keys(), *value.values())
+        elif isinstance(value, int):
+            length += value.bit_length() // 4
     if length > limits.demand_characters:
         size = f"has more than {limits.demand_characters} characters"
         message = _too_large(size, "demandCharacters", limits.demand_characters)
@@ -92,6 +98,7 @@ def items_of(request: DemandRequest) -> int:
             items += len(held.deliver) + len(held.named) + (held.place.size if held.place else 0)
         else:
             topics = len(held.topics)
+        items += len(one.requesters) if request.is_reference else 0
         items += (1 + topics) * max(1, len(one.requesters))
     return items
 
