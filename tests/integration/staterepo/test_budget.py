@@ -50,6 +50,11 @@ def connections(name: str) -> dict[str, Any]:
     return large(name) | {"applications": []}
 
 
+def booked_in_time(name: str) -> dict[str, Any]:
+    """Return a demand that is admitted in time, and not rendered in time."""
+    return connections(name) | {"connections": connections(name)["connections"][: LOOKS // 2]}
+
+
 def too_many_topics(name: str) -> dict[str, Any]:
     made = connections(name)
     topics = [{"source": f"/t{number}"} for number in range(19_000)]
@@ -99,8 +104,8 @@ def test_a_demand_that_comes_meanwhile_is_next(bare: Path, monkeypatch: pytest.M
 
         send("first", rig.goal(1), gate)
         assert gate.reached.wait(rig.PATIENCE_S)
-        attacks = [send("a0", connections("a0"), busy)]
-        attacks += [send(f"a{number}", connections(f"a{number}")) for number in range(1, 4)]
+        attacks = [send("a0", booked_in_time("a0"), busy)]
+        attacks += [send(f"a{number}", booked_in_time(f"a{number}")) for number in range(1, 4)]
         gate.open.set()
         assert busy.reached.wait(rig.PATIENCE_S)
         other = send("other", rig.goal(0))

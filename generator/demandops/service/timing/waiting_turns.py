@@ -43,23 +43,26 @@ class WaitingTurns:
         if not self._is_tried(state) or not self._left:
             self._left = [one.demand for one in in_turn(state.ledger.waiting)]
         end = self._runtime.processor_s() + _LONGEST_ROUND_S
-        while self._left and self._runtime.processor_s() <= end:
-            waiting = commits.head.state.ledger.waiting.get(self._left.pop(0))
-            if waiting is None:
-                continue
-            state, now = commits.head.state, self._runtime.now()
-            checkpoint = within(state.config.repo_settings.limits, self._runtime)
-            try:
-                decision = decide(
-                    state, dict(waiting.goal), now, commits.read, checkpoint=checkpoint
-                )
-            except InvalidInput as error:
-                log.debug("demand %s still waits: %s", quoted(waiting.demand), error)
-                continue
-            if decision.outcome == "booked" and not decision.approval:
-                commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
-                log.info("demand %s no longer waits", quoted(waiting.demand))
+        while self._left:
+            self._book_if_it_fits(commits, self._left.pop(0))
+            if self._runtime.processor_s() > end:
+                break
         self._tried = commits.head.state
+
+    def _book_if_it_fits(self, commits: CommitBatch, demand: str) -> None:
+        state, now = commits.head.state, self._runtime.now()
+        waiting = state.ledger.waiting.get(demand)
+        if waiting is None:  # it was released meanwhile
+            return
+        checkpoint = within(state.config.repo_settings.limits, self._runtime)
+        try:
+            decision = decide(state, dict(waiting.goal), now, commits.read, checkpoint=checkpoint)
+        except InvalidInput as error:
+            log.debug("demand %s still waits: %s", quoted(demand), error)
+            return
+        if decision.outcome == "booked" and not decision.approval:
+            commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
+            log.info("demand %s no longer waits", quoted(demand))
 
     def follow(self, commits: CommitBatch, before: State) -> None:
         """Book waiting demands if the last demand freed room.
