@@ -325,12 +325,18 @@ def _domains_of_nodes(
         for pattern in domain.nodes:
             by_start[re.split("[*?]", pattern)[0]].setdefault(name, []).append(pattern)
     for node in nodes:
+        known = (
+            (name, pattern)
+            for end in range(len(node) + 1)
+            for name, patterns in by_start.get(node[:end], {}).items()
+            for pattern in patterns
+            if matches(node, (pattern,))
+        )
         matching: dict[str, str] = {}
-        for end in range(len(node) + 1):
-            for name, patterns in by_start.get(node[:end], {}).items():
-                if len(matching) <= _MOST_DOMAINS and matches(node, patterns):
-                    pattern = next(one for one in domains[name].nodes if matches(node, (one,)))
-                    matching.setdefault(name, pattern)
+        for name, pattern in known:
+            matching.setdefault(name, pattern)
+            if len(matching) > _MOST_DOMAINS:
+                break
         if len(matching) > 1:
             by = " and ".join(
                 f"'{name}' by {quoted(pattern)} in {reader.place_of(DOMAINS_FILE, name)[0]}"

@@ -373,7 +373,8 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
         )
         reader.add_fault(override.path, "node", message)
     if (
-        node in config.nodes.keys() - config.domain_of.keys()
+        node in config.nodes
+        and node not in config.domain_of
         and config.domains
         and reader.is_complete(DOMAINS_FILE)
         and not any(matches(node, domain.nodes) for domain in config.domains.values())

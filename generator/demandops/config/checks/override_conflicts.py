@@ -92,6 +92,8 @@ def _rivals(
     grows with the number of overrides, not with that of pairs, unless patterns hardly differ.
     """
 
+    shares = _shares_clients(config)
+
     def crowding(field: str) -> int:
         starts = Counter(
             s for o, _ in contenders for left in o.select for s in starts_of(left, field)
@@ -100,7 +102,9 @@ def _rivals(
 
     def starts_of(selector: Selector, field: str) -> set[str]:
         patterns = (
-            getattr(selector, field) if field in _separating_fields(*[selector] * 2, config) else ()
+            getattr(selector, field)
+            if field in _separating_fields(selector, selector, config, shares)
+            else ()
         )
         return {re.split("[*?]", pattern)[0] for pattern in patterns or ("",)}
 
@@ -120,7 +124,9 @@ def _rivals(
                         for pair in pairs
                     )
                     for one, left in near:
-                        if one.name not in met and _may_match_same_release(left, right, config):
+                        if one.name not in met and _may_match_same_release(
+                            left, right, config, shares
+                        ):
                             met[one.name] = one
                             if len(met) == _MOST_SHOWN:
                                 break
@@ -176,16 +182,20 @@ def may_select_same_release(
     one: Iterable[Selector], other: Iterable[Selector], config: Config
 ) -> bool:
     """Return whether some release, now or later, may match selectors of both overrides."""
-    others = list(other)
-    return any(_may_match_same_release(left, right, config) for left in one for right in others)
+    others, shares = list(other), _shares_clients(config)
+    return any(
+        _may_match_same_release(left, right, config, shares) for left in one for right in others
+    )
 
 
-def _may_match_same_release(one: Selector, other: Selector, config: Config) -> bool:
+def _may_match_same_release(
+    one: Selector, other: Selector, config: Config, shares_clients: bool
+) -> bool:
     if (one.connections and _selects_services(other)) or (
         other.connections and _selects_services(one)
     ):
         return False
-    for name in _separating_fields(one, other, config):
+    for name in _separating_fields(one, other, config, shares_clients):
         left, right = getattr(one, name), getattr(other, name)
         if left and right and not _any_overlap(left, right):
             return False
@@ -210,7 +220,13 @@ def _selects_services(selector: Selector) -> bool:
     return bool(selector.applications or selector.appdefs or selector.services)
 
 
-def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterator[str]:
+def _shares_clients(config: Config) -> bool:
+    return any(known.shares_clients(config) for known in connection_types.CONNECTION_TYPES)
+
+
+def _separating_fields(
+    one: Selector, other: Selector, config: Config, shares_clients: bool
+) -> Iterator[str]:
     """Yield the fields that can separate two selectors.
 
     If both selectors have one of these fields and do not overlap in it, no release matches both.
@@ -218,7 +234,7 @@ def _separating_fields(one: Selector, other: Selector, config: Config) -> Iterat
     yield from ("services", "nodes")
     if not any(_shared(one, other, services) for services in config.services.values()):
         yield from ("applications", "appdefs")
-    if not any(known.shares_clients(config) for known in connection_types.CONNECTION_TYPES):
+    if one.connections and other.connections and not shares_clients:
         yield "connections"
 
 
