@@ -65,21 +65,41 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
             yield replace(each, field=one.place(each.field))
 
 
+_NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
+"""Fields of goals whose lists have no items of their own (:func:`items_of`)."""
+_ITEMS = (
+    "items (applications, connections, topics, requesters and so on, also of the connections that "
+    "it needs)"
+)
+
+
 def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault if a goal, as plain data, is too long; the check ends where it is too long."""
-    length, left = 0, [goal]
-    while left and length <= limits.demand_characters:
-        value = left.pop()
+    """Yield a fault if a goal, as plain data, is far too large to be parsed at all.
+
+    The check ends where the goal is too large, whatever it contains.
+    """
+    length = items = 0
+    left: list[tuple[object, bool]] = [(goal, True)]
+    while left and length <= limits.demand_characters and items <= limits.demand_items:
+        value, counts = left.pop()
         if isinstance(value, str):
             length += len(value)
-        elif isinstance(value, dict | list):
+        elif isinstance(value, list):
             length += 2 * len(value)  # each part is at least a character and a comma
-            left += value if isinstance(value, list) else (*value.keys(), *value.values())
+            items += len(value) if counts else 0
+            left += [(part, counts) for part in value]
+        elif isinstance(value, dict):
+            length += sum(1 + len(key) if isinstance(key, str) else 1 for key in value)
+            left += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
         elif isinstance(value, int):
             length += value.bit_length() // 4
     if length > limits.demand_characters:
         size = f"has more than {limits.demand_characters} characters"
         message = _too_large(size, "demandCharacters", limits.demand_characters)
+        yield fault("", message, code="too-large")
+    if items > limits.demand_items:
+        size = f"lists more than {limits.demand_items} {_ITEMS}"
+        message = _too_large(size, "demandItems", limits.demand_items)
         yield fault("", message, code="too-large")
 
 
@@ -114,8 +134,7 @@ def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
                 yield one.fault("parameters", message, code="too-large")
     items = items_of(request)
     if items > limits.demand_items:
-        listed = f"lists {items} items (applications, connections, topics, requesters and so on, "
-        listed += "also of the connections that it needs)"
+        listed = f"lists {items} {_ITEMS}"
         message = _too_large(listed, "demandItems", limits.demand_items)
         yield fault("id" if request.is_reference else "demand", message, code="too-large")
 

@@ -85,6 +85,8 @@ def test_who_sends_what_takes_too_long_holds_up_others_for_one_demand(
             with pytest.raises(Refused) as refusal:
                 rig.receipt(ticket)
             assert {fault.code for fault in refusal.value.faults} == {"too-large"}
+            # what is too large is not even written to the journal
+            assert ticket.journaled.result() is (made is not too_many_topics)
         assert generator.operations == ()
         assert generator.unpublished == 0
     assert order.index("other") <= order.index("first") + 2
