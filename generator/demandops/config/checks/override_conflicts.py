@@ -39,10 +39,10 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
     An override is told only the first three others that it contradicts: a merge may bring
     thousands of overrides, each of which contradicts all others.
     """
-    contests = defaultdict[tuple[object, ...], list[tuple[Override, str]]](list)
+    contests = defaultdict[tuple[int, tuple[str, ...]], list[tuple[Override, str]]](list)
     for override in by_rank(config.overrides.values()):
         for what, token in _settings(override):
-            contests[(override.priority, *what)].append((override, token))
+            contests[override.priority, what].append((override, token))
     rivals = defaultdict[str, dict[str, Override]](dict)
     for contenders in contests.values():
         if len({token for _, token in contenders}) > 1:
@@ -76,9 +76,11 @@ def _settings(override: Override) -> Iterator[tuple[tuple[str, ...], str]]:
 
 
 def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, ...], str]]:
-    is_mapping = isinstance(patch, Mapping)
-    yield path, "mapping" if is_mapping else json.dumps(patch, sort_keys=True)
-    for key, value in patch.items() if is_mapping else ():
+    if not isinstance(patch, Mapping):
+        yield path, json.dumps(patch, sort_keys=True)
+        return
+    yield path, "mapping"
+    for key, value in patch.items():
         yield from _leaves((*path, key), value)
 
 
