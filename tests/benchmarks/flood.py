@@ -51,30 +51,38 @@ KINDS: dict[str, Callable[[str], Demand]] = {
     "nothing": lambda name: goals.leave(2),
     "1,000 placements and 4,000 connections, refused everywhere": lambda name: _demand(
         name,
-        [_app(f"{name}-{n}", connect="none") for n in range(1000)],
-        [*(_link(f"{name}-{n}") for n in range(3999)), _link(f"{name}-x", "vehicle01")],
+        [_app(f"{name}_{n}", connect="none") for n in range(1000)],
+        [*(_link(f"{name}_{n}") for n in range(3999)), _link(f"{name}_x", "vehicle01")],
     ),
     "1,000 placements, denied on ten nodes": lambda name: _demand(
-        name, [_app(f"{name}-{n}", connect="none") for n in range(1000)], []
+        name, [_app(f"{name}_{n}", connect="none") for n in range(1000)], []
     ),
     "25 placements, denied, and 4,000 connections": lambda name: _demand(
         name,
-        [_app(f"{name}-{n}", connect="none") for n in range(25)],
-        [_link(f"{name}-{n}") for n in range(4000)],
+        [_app(f"{name}_{n}", connect="none") for n in range(25)],
+        [_link(f"{name}_{n}") for n in range(4000)],
     ),
     "19,000 topics": lambda name: _demand(name, [_app(name, 19_000, node="edge")], []),
     "4,900 topics": lambda name: _demand(name, [_app(name, 4_900, node="edge")], []),
     "9,900 topics of a connection": lambda name: _demand(name, [], [_link(name, topics=9_900)]),
     "4,900 connections": lambda name: _demand(
-        name, [], [_link(f"{name}-{n}") for n in range(4_900)]
+        name, [], [_link(f"{name}_{n}") for n in range(4_900)]
     ),
     "9,000 deliveries": lambda name: _demand(
         name,
-        [_app(name, deliver=[{"output": f"o.o{n}", "node": "cloud"} for n in range(9_000)])],
+        [
+            _app(
+                name,
+                deliver=[
+                    {"output": "object-fusion.objects", "node": "cloud", "topic": f"/x{n}"}
+                    for n in range(9_000)
+                ],
+            )
+        ],
         [],
     ),
-    "99 requesters of 99 connections": lambda name: _demand(
-        name, [], [_link(f"{name}-{n}") for n in range(49)], *(f"r{n}" for n in range(98))
+    "99 requesters of 49 connections": lambda name: _demand(
+        name, [], [_link(f"{name}_{n}") for n in range(49)], *(f"r{n}" for n in range(98))
     ),
 }
 

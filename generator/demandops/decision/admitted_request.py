@@ -100,6 +100,8 @@ def admit(
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
         _refuse(admission.size_faults(parsed, limits))
+        if parsed.adds_claims:
+            checkpoint()
         parsed = separate_instance.with_separate_instances(parsed, config)
         parsed, unclear = chosen_domain.with_chosen_domains(parsed, config, ledger.held)
         request = output_topics.with_further_topics(parsed, ledger, config)

@@ -192,17 +192,20 @@ def _searched(
         return _decided(state, request, now, read, once, checkpoint)
     except Refused as refused:
         by_node = all(found.code in _BY_NODE for found in refused.faults) and not limits
-        if not by_node or not leaves_nodes_open(state, goal):
+        if not by_node:
             raise
-        # Look for nodes on which the demand is not refused. To try many nodes takes time, but only
-        # a demand that is refused on the nodes chosen first takes this time.
         try:
-            with suppress(Refused):
-                trials = _Trials(state, now, checkpoint)
-                request = admit(state, goal, throttle, trials.succeeds, checkpoint)
-                return _decided(state, request, now, read, once, checkpoint)
+            checkpoint()
+            # Look for nodes on which the demand is not refused. To try many nodes takes time, but
+            # only a demand that is refused on the nodes chosen first takes this time.
+            if leaves_nodes_open(state, goal):
+                checkpoint()
+                with suppress(Refused):
+                    trials = _Trials(state, now, checkpoint)
+                    request = admit(state, goal, throttle, trials.succeeds, checkpoint)
+                    return _decided(state, request, now, read, once, checkpoint)
         except OverBudget as spent:  # the first refusal says what stands in the way
-            raise Refused([*refused.faults, _too_large(spent)]) from None
+            raise Refused([_too_large(spent), *refused.faults]) from None
         raise
 
 
@@ -326,7 +329,7 @@ def _booked(
         Refused: if existing claims, an override, a quota or a topic clash forbid the booking.
     """
     checkpoint()
-    ledger, changes = _book(state, request, now)
+    ledger, changes = _book(state, request, now, checkpoint)
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
@@ -340,7 +343,9 @@ def _booked(
     return after, changes, keys
 
 
-def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+def _book(
+    state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
+) -> tuple[Ledger, Changes]:
     """Return the ledger with a request booked, and the changes.
 
     Claims of the request replace claims that overrides kept. Overrides may keep claims that the
@@ -356,7 +361,9 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
             state.ledger, replace(state, ledger=ledger), changes
         )
     after = replace(state, ledger=ledger)
+    checkpoint()
     refusals = list(denial.faults(request, after, changes))
+    checkpoint()
     refusals = refusals or list(quota.faults(state, after, changes))
     if refusals:
         raise Refused(refusals)
