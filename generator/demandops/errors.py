@@ -11,6 +11,7 @@ from bisect import bisect
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from functools import lru_cache
 
 from demandops.quoting import clipped, escaped, one_line
 
@@ -125,6 +126,14 @@ class Refused(InvalidInput):
     """Raised when a demand cannot be fulfilled; no part of it was booked."""
 
 
+class OverBudget(Exception):
+    """Raised within a decision that takes more work than one demand may cause.
+
+    It is no ``Refused``, so that nothing which looks for another way, such as another node, goes on
+    with the work. The decision turns it into a refusal with the code ``too-large``.
+    """
+
+
 class StateRepoError(DemandOpsError):
     """Raised when the state repo cannot be read or written; the message says how to fix it."""
 
@@ -228,9 +237,13 @@ def _neighbors(word: str, names: list[str]) -> list[str]:
     """
     if len(names) <= _COMPARED:
         return names
-    found = []
-    for order in (slice(None), slice(None, None, -1)):
-        ordered = sorted(name[order] for name in names)
-        at = bisect(ordered, word[order])
-        found += [name[order] for name in ordered[max(0, at - 3) : at + 3]]
-    return found
+    at = bisect(names, word)
+    found = names[max(0, at - 3) : at + 3]
+    backwards = _backwards(tuple(names))
+    at = bisect(backwards, word[::-1])
+    return [*found, *(name[::-1] for name in backwards[max(0, at - 3) : at + 3])]
+
+
+@lru_cache(8)
+def _backwards(names: tuple[str, ...]) -> list[str]:
+    return sorted(name[::-1] for name in names)

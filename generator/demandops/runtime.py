@@ -50,6 +50,10 @@ class Runtime:
         """Return the seconds of a clock that nobody can set; only differences have a meaning."""
         return time.monotonic()
 
+    def processor_s(self) -> float:
+        """Return the seconds of processor time that the calling thread has used so far."""
+        return time.thread_time()
+
     def sleep(self, seconds: float) -> None:
         """Block the calling thread."""
         time.sleep(seconds)

@@ -136,7 +136,9 @@ def _lay_down(
 ) -> int:
     """Make the repo, and return how many nodes it has."""
     files = configuration()
-    files["demandops.yaml"] += "limits: {demandItems: 100000, fileBytes: 10000000}\n"
+    limits = {"demandItems": 100_000, "demandCharacters": 10_000_000, "fileBytes": 10_000_000}
+    limits["decisionMilliseconds"] = 60_000
+    files["demandops.yaml"] += strict_yaml.dump({"limits": limits})
     files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster, vehicles + further)
     regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
     clusters = [{"name": region} for region in regions]

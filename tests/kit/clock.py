@@ -14,19 +14,26 @@ class Clock(Runtime):
     """A runtime whose clocks a test moves.
 
     With a ``start``, only the test moves the clocks, and ``uniform`` always returns its upper
-    bound. Without a ``start``, real time passes as well.
+    bound. Without a ``start``, real time passes as well. Each look at the processor time lets
+    ``look_s`` of it pass, and nothing else does, so no result depends on how fast a machine is.
     """
+
+    look_s = 0.0
 
     def __init__(self, start: datetime | None = None) -> None:
         super().__init__()
         self._start = start
-        self._passed = self._set = 0.0
+        self._passed = self._set = self._worked = 0.0
 
     def now(self) -> datetime:
         return (self._start or super().now()) + timedelta(seconds=self._passed + self._set)
 
     def monotonic(self) -> float:
         return self._passed if self._start else self._passed + super().monotonic()
+
+    def processor_s(self) -> float:
+        self._worked += self.look_s
+        return self._worked
 
     def uniform(self, low: float, high: float) -> float:
         return high if self._start else super().uniform(low, high)

@@ -47,7 +47,12 @@ source: demandops
 flux: {url: "https://git.example/fleet/state.git", interval: 1m, secret: git}
 argocd: {url: "https://git.example/fleet/state.git", namespace: argocd}
 proposals: {forge: gitlab, url: "https://git.example/fleet/state", labels: [demand]}
-limits: {demandItems: 400, parameterBytes: 90000, fileBytes: 900000}
+limits:
+  demandCharacters: 800000
+  demandItems: 400
+  parameterBytes: 90000
+  fileBytes: 900000
+  decisionMilliseconds: 400
 placement: spread
 """
 _PROPOSALS_BY_API = """

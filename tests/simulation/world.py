@@ -54,6 +54,9 @@ class Machine(Runtime):
         self.has_rejected = False
         """Whether the remote has rejected a push of this machine."""
 
+    def processor_s(self) -> float:
+        return 0.0
+
     def start_thread(self, name: str, target: Callable[[], object]) -> Any:
         self.threads.append(self.turns.start_thread(name, target))
         return self.threads[-1]

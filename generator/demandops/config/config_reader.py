@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -11,7 +11,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from demandops import strict_yaml
 from demandops.config.base_model import DnsLabel, faults_of, parse, parse_file
 from demandops.config.config import collection_of, place_of_collection
-from demandops.errors import Fault, InvalidInput, fault, field_path, suggestion
+from demandops.errors import MOST_FAULTS, Fault, InvalidInput, fault, field_path, suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
 Valid = TypeVar("Valid")
@@ -25,6 +25,7 @@ class ConfigReader:
     def __init__(self, files: Mapping[str, str]) -> None:
         self.files = files
         self.faults: list[Fault] = []
+        self._counts = Counter[str]()
         self._by_collection = defaultdict[str | None, list[str]](list)
         for path in sorted(files):
             self._by_collection[collection_of(path)].append(path)
@@ -34,6 +35,7 @@ class ConfigReader:
 
     def add_fault(self, file: str, field: str, message: str) -> None:
         """Add a fault to :attr:`faults`."""
+        self._counts[file] += 1
         self.faults.append(fault(field, message).within(file))
 
     def read_file(self, file: str, model: type[Model]) -> Model | None:
@@ -150,7 +152,9 @@ class ConfigReader:
         if self.is_missing(known_in, name):
             where = place_of_collection(known_in, self.files_of(known_in))
             where = where.replace("inventory/", "")
-            known = suggestion(name, self._places[known_in])
+            # thousands of names may be unknown, and only the first faults of a file are listed
+            is_listed = self._counts[file] < MOST_FAULTS
+            known = suggestion(name, self._places[known_in]) if is_listed else ""
             self.add_fault(file, field, f"'{name}' is not in {where}{known}")
 
     def _valid(

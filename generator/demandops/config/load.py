@@ -7,6 +7,7 @@ every fault of every file.
 from __future__ import annotations
 
 import re
+from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from pathlib import PurePosixPath
 from types import MappingProxyType
@@ -311,21 +312,36 @@ def _in_further_domains(
     return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
 
 
-def _pattern_of(node: str, domain: AccessDomain) -> str:
-    return next(pattern for pattern in domain.nodes if matches(node, (pattern,)))
+_MOST_DOMAINS = 3
+"""How many of the domains that match one node a message names."""
 
 
 def _domains_of_nodes(
     reader: ConfigReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
 ) -> Mapping[str, AccessDomain]:
     owner: dict[str, AccessDomain] = {}
+    # by the text before the first wildcard: both lists may be long, and hardly any pair matches
+    by_start = defaultdict[str, dict[str, list[str]]](dict)
+    for name, domain in domains.items():
+        for pattern in domain.nodes:
+            by_start[re.split("[*?]", pattern)[0]].setdefault(name, []).append(pattern)
     for node in nodes:
-        matching = [d for d in domains.values() if matches(node, d.nodes)]
+        known = (
+            (name, pattern)
+            for end in range(len(node) + 1)
+            for name, patterns in by_start.get(node[:end], {}).items()
+            for pattern in patterns
+            if matches(node, (pattern,))
+        )
+        matching: dict[str, str] = {}
+        for name, pattern in known:
+            matching.setdefault(name, pattern)
+            if len(matching) > _MOST_DOMAINS:
+                break
         if len(matching) > 1:
             by = " and ".join(
-                f"'{domain.name}' by {quoted(_pattern_of(node, domain))} in "
-                f"{reader.place_of(DOMAINS_FILE, domain.name)[0]}"
-                for domain in matching
+                f"'{name}' by {quoted(pattern)} in {reader.place_of(DOMAINS_FILE, name)[0]}"
+                for name, pattern in sorted(matching.items())[:_MOST_DOMAINS]
             )
             file, place = reader.place_of(NODES_FILE, node)
             reader.add_fault(
@@ -336,5 +352,5 @@ def _domains_of_nodes(
                 "node",
             )
         elif matching:
-            owner[node] = matching[0]
+            owner[node] = domains[next(iter(matching))]
     return MappingProxyType(owner)

@@ -6,7 +6,10 @@ apply to demands for these nodes.
 
 from __future__ import annotations
 
-from fnmatch import fnmatchcase
+import re
+from collections.abc import Callable
+from fnmatch import translate
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, StringConstraints, model_validator
@@ -33,7 +36,13 @@ Patterns = Annotated[tuple[Text, ...], Field(strict=False, min_length=1)]
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
     """Return whether a name matches any of ``patterns``; only ``*`` and ``?`` are special."""
-    return any(fnmatchcase(name, pattern.replace("[", "[[]")) for pattern in patterns)
+    return any(name == pattern or _compiled(pattern)(name) for pattern in patterns)
+
+
+@lru_cache(65_536)
+def _compiled(pattern: str) -> Callable[[str], object]:
+    """Return a function that matches one pattern; a policy may have thousands of them."""
+    return re.compile(translate(pattern.replace("[", "[[]"))).match
 
 
 class Rule(CamelModel):

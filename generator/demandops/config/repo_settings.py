@@ -124,15 +124,19 @@ class Proposals(FrozenModel):
 class Limits(CamelModel):
     """The sizes above which a demand is refused.
 
-    ``demand_items`` limits how many things (applications, connections, topics, requesters and so
-    on) the demand lists in total. ``parameter_bytes`` limits the parameters of an application,
-    written as JSON. ``file_bytes`` limits each file that the generator writes for the demand,
-    because Kubernetes stores no object above 1.5 MB.
+    ``demand_characters`` limits the length of the whole demand. ``demand_items`` limits how many
+    things (applications, connections, topics, requesters and so on) the demand lists in total,
+    together with the connections that it needs. ``parameter_bytes`` limits the parameters of an
+    application, written as JSON. ``file_bytes`` limits each file that the generator writes for the
+    demand, because Kubernetes stores no object above 1.5 MB. ``decision_milliseconds`` limits the
+    processor time in which a generator decides the demand, because other demands wait meanwhile.
     """
 
-    demand_items: Positive = 20_000
+    demand_characters: Positive = 1_000_000
+    demand_items: Positive = 10_000
     parameter_bytes: Positive = 100_000
     file_bytes: Positive = 1_000_000
+    decision_milliseconds: Positive = 500
 
 
 class RepoSettings(FileModel):

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from datetime import datetime
+from typing import TypeVar
 
 from demandops.config.config import Config
 from demandops.decision.state import State
@@ -29,6 +30,8 @@ _SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 """A function that yields faults if a request comes too soon after others of its requesters."""
+Checkpoint = Callable[[], None]
+"""A function that is called often during a decision, and raises ``OverBudget`` to end it."""
 
 
 def admitted(
@@ -36,7 +39,7 @@ def admitted(
     goal: object,
     now: datetime,
     throttle: Throttle,
-    trial: placement.Trial | None = None,
+    checkpoint: Checkpoint,
 ) -> DemandRequest:
     """Return the request that a goal becomes.
 
@@ -47,7 +50,7 @@ def admitted(
             demand that already holds claims never waits.
     """
     try:
-        return admit(state, goal, throttle, trial)
+        return admit(state, goal, throttle, None, checkpoint)
     except Refused as refused:
         if any(found.code != NO_ROOM for found in refused.faults):
             raise
@@ -60,7 +63,7 @@ def admitted(
         holds = state.ledger.claims_of_demand(parsed.demand)
         if not isinstance(parsed, Put) or holds or not mine:
             raise
-        if not placement.may_wait(parsed, state):
+        if not placement.may_wait(parsed, state, checkpoint):
             raise
         if faults := list(throttle(parsed, state.config)):
             raise Refused(faults) from None
@@ -75,11 +78,12 @@ def admit(
     goal: object,
     throttle: Throttle = lambda request, config: (),
     trial: placement.Trial | None = None,
+    checkpoint: Checkpoint = lambda: None,
 ) -> DemandRequest:
     """Return the request that a goal becomes, if the goal passes all checks.
 
     If ``trial`` is given, a node is chosen only if ``trial`` returns ``True`` for the request with
-    this node.
+    this node. ``checkpoint`` is that of :func:`demandops.decision.decision.decide`.
 
     Raises:
         Refused: with the limits that the goal exceeds, if it is too large. Otherwise with every
@@ -87,32 +91,44 @@ def admit(
             that ``throttle`` yields.
     """
     config, ledger = state.config, state.ledger
+    limits = config.repo_settings.limits
     not_placed: list[Fault] = []
     if isinstance(goal, dict) and Decommission.is_goal(goal):
         parsed_node = Decommission.parse(goal)
         return replace(parsed_node, nodes=config.nodes_of(parsed_node.id))
+    _refuse(admission.length_faults(goal, limits))
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
-        _refuse_large(parsed, config)
+        _refuse(admission.size_faults(parsed, limits))
+        if parsed.adds_claims:
+            checkpoint()
         parsed = separate_instance.with_separate_instances(parsed, config)
         parsed, unclear = chosen_domain.with_chosen_domains(parsed, config, ledger.held)
         request = output_topics.with_further_topics(parsed, ledger, config)
-        request, not_placed = placement.with_chosen_nodes(request, state, state.usage(), trial)
+        request, not_placed = placement.with_chosen_nodes(
+            request, state, state.usage(), trial, checkpoint
+        )
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
-        _refuse_large(wired, config)
+        _refuse(admission.size_faults(wired, limits))
         wired, unclear = chosen_domain.with_chosen_domains(wired, config, ledger.held)
-        request, not_placed = placement.with_chosen_nodes(wired, state, state.usage(), trial)
+        request, not_placed = placement.with_chosen_nodes(
+            wired, state, state.usage(), trial, checkpoint
+        )
+    checkpoint = checkpoint if request.adds_claims else lambda: None
+    checkpoint()
     request = completed(request, state)
+    _refuse(admission.size_faults(request, limits))  # derived connections count as well
+    checkpoint()
     malformed = {found.field for found in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
     content = [
         *unclear,
         *not_placed,
-        *admission.faults(request, config),
-        *permission.faults(request, config),
+        *paced(admission.faults(request, config), checkpoint),
+        *permission_faults(request, config, checkpoint),
     ]
     # a list that could not be read must not be reported as empty
     unread = bool(malformed & {"apps", "applications", "connections"})
@@ -153,10 +169,27 @@ def leaves_nodes_open(state: State, goal: object) -> bool:
     return request is not None and request.adds_claims and placement.needs_placement(request, state)
 
 
-def _refuse_large(request: DemandRequest, config: Config) -> None:
-    faults = list(admission.size_faults(request, config.repo_settings.limits))
-    if faults:
-        raise Refused(faults)
+_Item = TypeVar("_Item")
+
+
+def paced(items: Iterable[_Item], checkpoint: Checkpoint) -> Iterator[_Item]:
+    """Yield ``items``, and call ``checkpoint`` before each of them is used."""
+    for item in items:
+        checkpoint()
+        yield item
+
+
+def permission_faults(
+    request: DemandRequest, config: Config, checkpoint: Checkpoint
+) -> Iterator[Fault]:
+    """Yield what is not allowed; ``checkpoint`` is called for each item, as rules may be many."""
+    for one in paced(request.demanded, checkpoint):
+        yield from permission.faults(replace(request, demanded=(one,)), config)
+
+
+def _refuse(faults: Iterable[Fault]) -> None:
+    if found := list(faults):
+        raise Refused(found)
 
 
 def form_faults(goal: object) -> list[Fault]:

@@ -11,16 +11,18 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
-from functools import partial
 from typing import Literal
 
 from demandops.config.config import Config
 from demandops.decision.admitted_request import (
+    Checkpoint,
     Throttle,
     admit,
     admitted,
     completed,
     leaves_nodes_open,
+    paced,
+    permission_faults,
 )
 from demandops.decision.decision_notes import notes_on
 from demandops.decision.state import State
@@ -30,7 +32,7 @@ from demandops.demand import (
     permission,
 )
 from demandops.demand.demand_request import Decommission, DemandRequest
-from demandops.errors import Fault, Refused
+from demandops.errors import Fault, OverBudget, Refused, fault
 from demandops.ledger.apply import apply
 from demandops.ledger.claim_changes import Changes
 from demandops.ledger.kept_replicas import Instance
@@ -126,6 +128,7 @@ def decide(
     read: FileReader,
     on_stage: Callable[[Stage], None] = lambda stage: None,
     throttle: Throttle = lambda request, config: (),
+    checkpoint: Checkpoint = lambda: None,
 ) -> Decision:
     """Return the decision on a goal, or on a request that the generator makes itself.
 
@@ -142,13 +145,37 @@ def decide(
         throttle: called after all other checks of admission, and only if these find no fault. If
             ``throttle`` yields faults, the request is refused. It may be called twice for one goal,
             and is not called for a :class:`Decommission` and for the generator's own requests.
+        checkpoint: called often while a demand that may add claims is decided, and raises
+            :class:`OverBudget` to end the decision. It can only refuse a demand, never change what
+            is decided. What releases claims is decided without it, however long it takes.
 
     Raises:
-        Refused: with every fault, each with its field in the goal.
+        Refused: with every fault, each with its field in the goal; with the code ``too-large``, if
+            the demand takes too much work.
         InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
     """
     if isinstance(goal, DemandRequest):
         return _decided(state, goal, now, read, on_stage)
+    try:
+        return _searched(state, goal, now, read, on_stage, throttle, checkpoint)
+    except OverBudget as spent:
+        raise Refused([_too_large(spent)]) from None
+
+
+def _too_large(spent: OverBudget) -> Fault:
+    return fault("", str(spent), code="too-large")
+
+
+def _searched(
+    state: State,
+    goal: object,
+    now: datetime,
+    read: FileReader,
+    on_stage: Callable[[Stage], None],
+    throttle: Throttle,
+    checkpoint: Checkpoint,
+) -> Decision:
+    """Decide a goal; if it is refused on the nodes chosen first, look for others."""
     limits, told = list[Fault](), set[Stage]()
 
     def noted(request: DemandRequest, config: Config) -> list[Fault]:
@@ -161,16 +188,24 @@ def decide(
             on_stage(stage)
 
     try:
-        return _decided(state, admitted(state, goal, now, noted), now, read, once)
+        request = admitted(state, goal, now, noted, checkpoint)
+        return _decided(state, request, now, read, once, checkpoint)
     except Refused as refused:
         by_node = all(found.code in _BY_NODE for found in refused.faults) and not limits
-        if not by_node or not leaves_nodes_open(state, goal):
+        if not by_node:
             raise
-        # Look for nodes on which the demand is not refused. To try many nodes takes time, but only
-        # a demand that is refused on the nodes chosen first takes this time.
-        with suppress(Refused):
-            request = admit(state, goal, throttle, partial(_can_be_booked, state, now))
-            return _decided(state, request, now, read, once)
+        try:
+            checkpoint()
+            # Look for nodes on which the demand is not refused. To try many nodes takes time, but
+            # only a demand that is refused on the nodes chosen first takes this time.
+            if leaves_nodes_open(state, goal):
+                checkpoint()
+                with suppress(Refused):
+                    trials = _Trials(state, now, checkpoint)
+                    request = admit(state, goal, throttle, trials.succeeds, checkpoint)
+                    return _decided(state, request, now, read, once, checkpoint)
+        except OverBudget as spent:  # the first refusal says what stands in the way
+            raise Refused([_too_large(spent), *refused.faults]) from None
         raise
 
 
@@ -180,15 +215,45 @@ _BY_NODE = frozenset(
 """The codes of faults that might not occur if other nodes were chosen for the demand."""
 
 
-def _can_be_booked(state: State, now: datetime, request: DemandRequest) -> bool:
-    request, config = completed(request, state), state.config
-    if any((*admission.faults(request, config), *permission.faults(request, config))):
-        return False
-    try:
-        _booked(state, request, now)
-    except Refused:
-        return False
-    return True
+MOST_TRIALS = 64
+"""How many bookings one demand, or one drain of a node, may try while nodes are looked for.
+
+Each trial books all that is placed so far. So the trials of one demand together may also book no
+more items than the largest demand may list.
+"""
+
+
+class _Trials:
+    """The bookings that are tried, in memory only, while nodes are looked for."""
+
+    def __init__(self, state: State, now: datetime, checkpoint: Checkpoint) -> None:
+        self._state, self._now, self._checkpoint = state, now, checkpoint
+        self._tried = self._items = 0
+
+    def succeeds(self, request: DemandRequest) -> bool:
+        """Return whether a request, which names a node for each application, can be booked.
+
+        Raises:
+            OverBudget: if too much was tried already.
+        """
+        self._tried += 1
+        self._items += admission.items_of(request)
+        most = self._state.config.repo_settings.limits.demand_items
+        if self._tried > MOST_TRIALS or self._items > most:
+            raise OverBudget(
+                "too many nodes would have to be tried for this demand; name a node for each "
+                "application, or split the demand"
+            )
+        request, config = completed(request, self._state), self._state.config
+        if next(admission.faults(request, config), None) or next(
+            permission_faults(request, config, self._checkpoint), None
+        ):
+            return False
+        try:
+            _booked(self._state, request, self._now, self._checkpoint)
+        except Refused:
+            return False
+        return True
 
 
 def _decided(
@@ -197,22 +262,25 @@ def _decided(
     now: datetime,
     read: FileReader,
     on_stage: Callable[[Stage], None],
+    checkpoint: Checkpoint = lambda: None,
 ) -> Decision:
     config = state.config
+    if not request.adds_claims:  # what was booked must be released, however long that takes
+        checkpoint = _unlimited
     if isinstance(request, Drain):
-        request = relocation.with_moves(request, state, state.usage())
+        request = relocation.with_moves(request, state, state.usage(), MOST_TRIALS)
     if isinstance(request, Restoration):
         request = relocation.with_restored_moves(request, state)
         faults = list(restoration.faults(request, state))
         if faults:
             raise Refused(faults)
     on_stage("admitted")
-    after, changes, keys = _booked(state, request, now)
+    after, changes, keys = _booked(state, request, now, checkpoint)
     ledger = after.ledger
     if taken := list(name_clash.faults_in_files(request, changes, read)):
         raise Refused(taken)
     rendered = changeset.build_changeset(
-        state, after, changes, keys, state.evaluate, read, state.plans
+        state, after, changes, keys, state.evaluate, read, state.plans, checkpoint=checkpoint
     )
     differing = list(
         version_difference.differences(request, state, after, changes.claims, rendered.plans)
@@ -250,8 +318,12 @@ def _decided(
     )
 
 
+def _unlimited() -> None:
+    """Be the checkpoint of a decision without a budget."""
+
+
 def _booked(
-    state: State, request: DemandRequest, now: datetime
+    state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
 ) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
     """Return the state with a request booked, the changes, and the releases that may change.
 
@@ -259,12 +331,14 @@ def _booked(
         Refused: if existing claims, an override, a quota or a clash of topics or names forbid the
             booking.
     """
-    ledger, changes = _book(state, request, now)
+    checkpoint()
+    ledger, changes = _book(state, request, now, checkpoint)
+    checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
     ledger, kept = scale_downs.with_kept_replicas(state, after, keys, now)
     after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
-    clashes = list(topic_clash.faults(request, state, after, keys))
+    clashes = list(topic_clash.faults(request, state, after, paced(keys, checkpoint)))
     clashes += name_clash.faults(request, state, after, keys, changes, state.names())
     for change in changes.claims if isinstance(request, Restoration) else ():
         clashes += topic_clash.faults_of_claim(change.after, state, after) if change.after else ()
@@ -273,7 +347,9 @@ def _booked(
     return after, changes, keys
 
 
-def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+def _book(
+    state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
+) -> tuple[Ledger, Changes]:
     """Return the ledger with a request booked, and the changes.
 
     Claims of the request replace claims that overrides kept. Overrides may keep claims that the
@@ -289,7 +365,9 @@ def _book(state: State, request: DemandRequest, now: datetime) -> tuple[Ledger, 
             state.ledger, replace(state, ledger=ledger), changes
         )
     after = replace(state, ledger=ledger)
+    checkpoint()
     refusals = list(denial.faults(request, after, changes))
+    checkpoint()
     refusals = refusals or list(quota.faults(state, after, changes))
     if refusals:
         raise Refused(refusals)

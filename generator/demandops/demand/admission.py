@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import replace
+from itertools import chain
 
 from demandops.config.appdef import ApplicationDefinition, Services
 from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
@@ -46,36 +47,94 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
             code="empty",
         )
     for one in request.demanded:
-        found = [*_id("id", one.held.id), *_requesters(one.requesters)]
+        found = chain(_id("id", one.held.id), _requesters(one.requesters))
         if isinstance(one.held, Application):
-            of_app = _application(one.held, config, request.adds_claims)
-            # the placement itself reports that it found no node, so an empty node is no fault then
-            placed = one.held.node or one.held.place is None
-            found += [each for each in of_app if placed or each.field != "node"]
+            found = chain(found, _application(one.held, config, request.adds_claims))
         else:
-            found += _connection(one.held, config, request.adds_claims)
-        yield from (replace(each, field=one.place(each.field)) for each in found)
+            found = chain(found, _connection(one.held, config, request.adds_claims))
+        for each in found:
+            # the placement itself reports that it found no node, so an empty node is no fault then
+            held = one.held
+            if (
+                each.field == "node"
+                and isinstance(held, Application)
+                and held.place
+                and not held.node
+            ):
+                continue
+            yield replace(each, field=one.place(each.field))
+
+
+_NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
+"""Fields of goals whose lists have no items of their own (:func:`items_of`)."""
+_ITEMS = (
+    "items (applications, connections, topics, requesters and so on, also of the connections that "
+    "it needs)"
+)
+
+
+def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
+    """Yield a fault if a goal, as plain data, is far too large to be parsed at all.
+
+    The check ends where the goal is too large, whatever it contains.
+    """
+    length = items = 0
+    left: list[tuple[object, bool]] = [(goal, True)]
+    while left and length <= limits.demand_characters and items <= limits.demand_items:
+        value, counts = left.pop()
+        if isinstance(value, str):
+            length += len(value)
+        elif isinstance(value, list):
+            length += 2 * len(value)  # each part is at least a character and a comma
+            items += len(value) if counts else 0
+            left += [(part, counts) for part in value]
+        elif isinstance(value, dict):
+            length += sum(1 + len(key) if isinstance(key, str) else 1 for key in value)
+            left += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
+        elif isinstance(value, int):
+            length += value.bit_length() // 4
+    if length > limits.demand_characters:
+        size = f"has more than {limits.demand_characters} characters"
+        message = _too_large(size, "demandCharacters", limits.demand_characters)
+        yield fault("", message, code="too-large")
+    if items > limits.demand_items:
+        size = f"lists more than {limits.demand_items} {_ITEMS}"
+        message = _too_large(size, "demandItems", limits.demand_items)
+        yield fault("", message, code="too-large")
+
+
+def items_of(request: DemandRequest) -> int:
+    """Return how many things a request lists in total.
+
+    Each requester of an application or a connection holds each of its topics, so a topic counts
+    once for each of them.
+    """
+    items = len(request.own_requesters)
+    items += len(request.positions) if isinstance(request, Put) else 0
+    for one in request.demanded:
+        held = one.held
+        if isinstance(held, Application):
+            topics = sum(map(len, held.inputs.values()))
+            items += len(held.deliver) + len(held.named) + (held.place.size if held.place else 0)
+        else:
+            topics = len(held.topics)
+        items += len(one.requesters) if request.is_reference else 0
+        items += (1 + topics) * max(1, len(one.requesters))
+    return items
 
 
 def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
     """Yield a fault for each limit on items and parameters that the request exceeds."""
-    items = len(request.demanded) + len(request.own_requesters)
-    items += len(request.positions) if isinstance(request, Put) else 0
     for one in request.demanded:
         held = one.held
-        items += len(one.requesters) if request.is_reference else 0
-        if isinstance(held, Application):
-            items += len(held.all_inputs()) + len(held.deliver)
-            items += len(held.named) + (held.place.size if held.place else 0)
-        else:
-            items += len(held.topics)
         if isinstance(held, Application) and held.parameters:
             size = len(json.dumps(dict(held.parameters), default=str))
             if size > limits.parameter_bytes:
                 message = _too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
                 yield one.fault("parameters", message, code="too-large")
+    items = items_of(request)
     if items > limits.demand_items:
-        listed = f"lists {items} items (applications, connections, topics, requesters and so on)"
+        listed = f"lists {items} {_ITEMS}"
         message = _too_large(listed, "demandItems", limits.demand_items)
         yield fault("id" if request.is_reference else "demand", message, code="too-large")
 

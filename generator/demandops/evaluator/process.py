@@ -33,10 +33,10 @@ from demandops.templating.values import SchemaTask, ValuesTask
 
 log = logging.getLogger("demandops")
 
-DEMAND_S = 0.75
+DEMAND_S = 0.5
 """How many seconds of processor time the evaluations of one demand may take together.
 
-The values of a service with 8,000 topics take a third of it.
+The values of a service with 8,000 topics take half of it.
 """
 MEMORY_MIB = 512
 _MOST_IDLE = 2  # the worker's and the page's

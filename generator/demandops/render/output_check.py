@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
@@ -37,8 +37,12 @@ _BUILT_IN = frozenset(
 _API = re.compile(r"^apiVersion: (\S+)$", re.MULTILINE)
 
 
-def check_files(files: Mapping[str, str | None]) -> None:
+def check_files(
+    files: Mapping[str, str | None], checkpoint: Callable[[], None] = lambda: None
+) -> None:
     """Check files that are about to be committed. A file with the text ``None`` is removed.
+
+    ``checkpoint`` is called for each file; it may raise an exception to end the check.
 
     Raises:
         InvalidInput: if a file is not valid, or if an object of a cluster appears twice. The error
@@ -48,6 +52,7 @@ def check_files(files: Mapping[str, str | None]) -> None:
     faults: list[Fault] = []
     seen: dict[tuple[str, str, str, str], str] = {}
     for path, text in sorted(files.items()):
+        checkpoint()
         if not path.startswith(OWN_ROOTS) or ".." in path.split("/"):
             message = "is in no folder that the generator writes; report this bug"
             faults.append(fault("", message).within(path))

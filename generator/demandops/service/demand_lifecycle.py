@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import logging
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 from dataclasses import replace
 
 from demandops.errors import (
@@ -184,15 +184,16 @@ class Demands:
             room = min(limit - len(batch), len(self._queue))
             batch += [self._queue.popleft() for _ in range(room)]
 
-    def put_back(self, batch: list[Ticket]) -> None:
+    def put_back(self, batch: list[Ticket], served: Collection[Ticket]) -> None:
         """Move the demands of a batch back to the front of the queue, and empty the batch.
 
         A withdrawn demand does not go back; :meth:`answer_withdrawn` answers it.
         The next batch then takes turns between these demands and the demands that other requesters
-        sent meanwhile.
+        sent meanwhile. The requesters of ``served``, the demands that were evaluated, come last.
         """
         with self._changed:
-            self._queue.put_back([each for each in batch if each not in self._taken_back])
+            left = [each for each in batch if each not in self._taken_back]
+            self._queue.put_back(left, served)
             batch.clear()
 
     # ---- changes of state ----

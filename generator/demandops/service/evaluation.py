@@ -17,6 +17,7 @@ from demandops.service.approvals.proposal import is_release
 from demandops.service.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.service.rollout_targets import targets_of_decision
 from demandops.service.ticket import Receipt, Ticket, receipt_of
+from demandops.service.timing.budget import within
 from demandops.service.timing.rate_limit import RateLimit
 from demandops.staterepo.git.repository import StateRepository, disk_error
 from demandops.staterepo.git.signing import SigningFailed
@@ -56,9 +57,13 @@ class Evaluator:
             goal = ticket.goal
             if rollback_goal.is_rollback(goal):
                 goal = rollback_goal.to_restoration(goal, self._repository, commits.start)
+            state = commits.head.state
+            # of all services, once for each configuration; that is not this demand's work
+            state.usage()
+            state.names()
             with processor_time(each=DEMAND_S, together=DEMAND_S):
                 decision = decide(
-                    commits.head.state,
+                    state,
                     goal,
                     ticket.received,
                     commits.read,
@@ -66,6 +71,7 @@ class Evaluator:
                     lambda request, config: self._rate_limit.faults(
                         request, config, ticket.operation, ticket.received
                     ),
+                    within(state.config.repo_settings.limits, self._repository.runtime),
                 )
             if decision.approval:
                 return decision

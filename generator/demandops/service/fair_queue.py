@@ -13,7 +13,7 @@ whose turn it is, the queue returns the other demand first.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -68,13 +68,15 @@ class FairQueue:
         if queued.subjects is None:
             self._barriers.append(queued)
 
-    def put_back(self, tickets: Sequence[Ticket]) -> None:
+    def put_back(self, tickets: Sequence[Ticket], served: Iterable[Ticket] = ()) -> None:
         """Put demands back, each before the other demands of its requester.
 
-        The requesters of these demands get the next turns, one demand per turn.
+        The requesters of these demands get the next turns, one demand per turn. But a requester
+        who had a turn since, with one of the demands in ``served``, comes after all others.
 
         Args:
             tickets: in the order in which they left the queue.
+            served: the demands that left the queue with ``tickets`` and do not come back.
         """
         first = min((one.number for one in self._queued.values()), default=1) - len(tickets)
         again = {
@@ -83,6 +85,9 @@ class FairQueue:
         }
         lanes = dict.fromkeys(map(self._lane, tickets))
         self._lanes = {name: self._lanes.pop(name, deque()) for name in lanes} | self._lanes
+        for name in dict.fromkeys(map(self._lane, served)):
+            if name in self._lanes:
+                self._lanes[name] = self._lanes.pop(name)
         for queued in reversed(again.values()):
             self._lanes[self._lane(queued.ticket)].appendleft(queued)
             for subject in queued.subjects or ():

@@ -11,6 +11,7 @@ from pathlib import Path
 
 from demandops import settings, strict_yaml
 from demandops.config.config import Config
+from demandops.demand import admission
 from demandops.errors import Refused, fault
 from demandops.runtime import REAL, Runtime
 from demandops.service.approvals.approvals import Approvals
@@ -212,6 +213,10 @@ class Generator:
             message = f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} "
             message += "deep; give only text, numbers, true, false, null, lists and mappings"
             ticket.refuse(Refused([fault("", message)]))
+            return ticket
+        limits = self.snapshot.state.config.repo_settings.limits
+        if large := list(admission.length_faults(ticket.goal, limits)):
+            ticket.refuse(Refused(large))
             return ticket
         ticket.base = str(self.snapshot.commit)
         self._demands.arrive(ticket)

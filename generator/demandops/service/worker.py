@@ -284,7 +284,7 @@ class Worker:
                 return None
         if self._publish_commits(commits, results, independent):
             batch[:] = left
-            self._demands.put_back(batch)
+            self._demands.put_back(batch, [ticket for ticket, _ in results])
             backoff.published()
             return None
         log.info("another writer was first; evaluating %d demands again", len(results))

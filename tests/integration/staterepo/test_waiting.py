@@ -11,6 +11,7 @@ from demandops.staterepo.write.journal import JournalEntry
 from demandops.staterepo.write.slot import Slot
 
 from tests.kit import rig
+from tests.kit.clock import Clock
 from tests.kit.repo import read as file_of
 from tests.kit.rig import Person
 from tests.kit.turns import Turns
@@ -115,3 +116,21 @@ def test_a_waiting_demand_whose_answer_was_lost_is_answered_again(
     resumed = again._demands._tickets["op-2"].future
     turns.wait(again.stop().done)
     assert resumed.result().outcome == "waiting"
+
+
+def test_waiting_demands_are_tried_in_rounds_until_all_were_tried(
+    bare: Path, person: Person
+) -> None:
+    files = _with_room_for_one(bare)
+    settings = file_of(bare, "demandops.yaml")
+    files["demandops.yaml"] = f"{settings}limits: {{decisionMilliseconds: 1000000}}\n"
+    person.change(files, "One at a time")
+    clock = Clock()
+    with rig.running(bare.as_uri(), runtime=clock) as generator:
+        rig.book(generator, *(_put(name) for name in "abcdef"))
+        assert _runs(bare) == ["of-a"]
+        clock.look_s = 1.0  # so a round is over once it has tried one demand
+        nodes = file_of(bare, NODES).replace("{cpu: 1}", "{cpu: 9}")
+        person.change({NODES: nodes}, "Room for all")
+        generator.fetch_now()
+        rig.wait_until(lambda: len(_runs(bare)) == 6, "all waiting demands to be booked")

@@ -10,6 +10,7 @@ from demandops.config.config import Config
 from demandops.decision import rendered_files
 from demandops.demand.application import Requirement
 from demandops.ledger.operations.drain import Drain
+from demandops.plan.nodes.relocation import with_moves
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import all_keys
 from hypothesis import given
@@ -116,3 +117,39 @@ def test_what_leaves_a_node_is_spread_over_the_others() -> None:
     repo.state = state_of(with_nodes(config, "cloud"), ledger)
     moved = repo.decide(Drain("cloud")).state.ledger
     assert dict(moved.applications_on) == {"edge": 2, "vehicle01": 2}
+
+
+def test_a_drain_in_parts_moves_the_same_applications_and_skips_none() -> None:
+    repo = MemoryRepo()
+    config = with_nodes(repo.config)
+    configure(repo, config)
+    for number in range(5):
+        app = {
+            "id": f"app{number}",
+            "type": "object-detection-fusion",
+            "place": {"labels": ["node_id=cloud"]},
+            "inputs": {"ego_data": [{"topic": "/ego", "source": "cloud"}]},
+        }
+        goal = {"kind": "Demand", "demand": f"d{number}", "requesters": ["v"]}
+        repo.send(goal | {"applications": [app]})
+    stuck = ("app0", "app3")  # their demands ask for a label that no other node has
+    ledger = rebuilt(
+        one
+        if one.subject.id in stuck
+        else replace(one, held=replace(one.application, place=Requirement(role="edge")))
+        for one in repo.state.ledger
+    )
+    repo.state = state = state_of(with_nodes(config, "cloud"), ledger)
+    whole = with_moves(Drain("cloud"), state, state.usage())
+    assert len(whole.moved) == 3 and len(whole.stays) == 2 and not whole.last
+    parts, after = [], ""
+    while True:
+        part = with_moves(Drain("cloud", after=after), state, state.usage(), most=2)
+        parts.append(part)
+        after = part.last
+        if not after:
+            break
+    assert len(parts) > 1
+    stays = [text.split(",")[0] for part in parts for text in part.stays]
+    assert stays == [text.split(",")[0] for text in whole.stays]
+    assert sum(len(part.moved) for part in parts) == 3

@@ -78,6 +78,17 @@ def test_what_was_put_back_comes_first_and_requesters_take_turns_again() -> None
     assert left == ["b0", "a1", "c0", "a2", "a3"]
 
 
+def test_who_had_a_turn_comes_after_who_came_meanwhile() -> None:
+    queue = FairQueue()
+    for each in (*(ticket(f"a{n}", "a", f"x{n}") for n in range(3)), ticket("b0", "b", "y")):
+        queue.append(each)
+    taken = [queue.popleft() for _ in range(4)]
+    queue.append(ticket("c0", "c", "z"))
+    queue.put_back(taken[1:], served=taken[:1])
+    left = [queue.popleft().operation for _ in range(len(queue))]
+    assert left == ["b0", "c0", "a1", "a2"]
+
+
 @pytest.mark.parametrize("seed", range(20))
 def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> None:
     random = Random(seed)

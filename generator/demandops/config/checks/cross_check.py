@@ -377,10 +377,13 @@ def _check_moved_to(node: str, override: Override, config: Config, reader: Confi
             "its definition lists; change its definition, or remove 'node'"
         )
         reader.add_fault(override.path, "node", message)
-    in_none = node not in config.domain_of and not any(
-        matches(node, domain.nodes) for domain in config.domains.values()
-    )
-    if node in config.nodes and in_none and config.domains and reader.is_complete(DOMAINS_FILE):
+    if (
+        node in config.nodes
+        and node not in config.domain_of
+        and config.domains
+        and reader.is_complete(DOMAINS_FILE)
+        and not any(matches(node, domain.nodes) for domain in config.domains.values())
+    ):
         message = f"'{node}' is not in any access domain; add it to one in "
         message += config.place_of(DOMAINS_FILE)
         reader.add_fault(override.path, "node", message)

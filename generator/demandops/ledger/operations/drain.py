@@ -19,8 +19,14 @@ class Drain(DemandRequest):
 
     ``moves`` are the changes of claims. ``moved`` has a text about each application or service that
     moves. ``stays`` has a text about each application or service that cannot move.
+
+    A drain looks only for so many nodes. It begins with the application that follows ``after`` in
+    the order of ids. If applications are left for another drain, ``last`` is the last one before
+    them; otherwise it is empty.
     """
 
+    after: str = ""
+    last: str = ""
     moves: tuple[ClaimChange, ...] = ()
     moved: tuple[str, ...] = ()
     stays: tuple[str, ...] = ()

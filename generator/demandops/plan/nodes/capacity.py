@@ -9,7 +9,7 @@ demand depends on what the demand changes.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from rpds import HashTrieMap
@@ -149,10 +149,17 @@ class Room:
     """The room that nodes have left while the applications of a demand are placed one by one.
 
     The claims in ``given_back`` count as released, so the room that they took is free.
+    ``checkpoint`` is called before each step that plans releases; it may raise an exception.
     """
 
-    def __init__(self, world: World, usage: Usage, given_back: Iterable[Claim]) -> None:
-        self._world, self._usage = world, usage
+    def __init__(
+        self,
+        world: World,
+        usage: Usage,
+        given_back: Iterable[Claim],
+        checkpoint: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._world, self._usage, self._checkpoint = world, usage, checkpoint
         self._own: dict[tuple[Subject, str], dict[str, int]] = {}
         self.newly_placed: Counter[str] = Counter()
         """How many applications and services were placed on each node so far."""
@@ -248,6 +255,7 @@ class Room:
 
         With ``give_back``, the claims are released instead of booked.
         """
+        self._checkpoint()
         after, changes = self._booked(claims, give_back=give_back)
         try:
             return after, growth_by(self._world, after, changes)

@@ -13,6 +13,7 @@ from datetime import datetime, timezone
 from types import MappingProxyType
 
 from demandops.config.appdef import Service
+from demandops.connections.connection import Connection
 from demandops.demand import permission
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim, demand_id
@@ -44,8 +45,16 @@ The request contains only applications that have a node already.
 """
 
 
+_NOWHERE = Fault("no-node", "", "is refused whatever nodes are chosen")
+"""Stands for the faults of a demand whose fixed part is refused; the caller knows these faults."""
+
+
 def with_chosen_nodes(
-    request: AnyRequest, world: World, usage: Usage, trial: Trial | None = None
+    request: AnyRequest,
+    world: World,
+    usage: Usage,
+    trial: Trial | None = None,
+    checkpoint: Callable[[], None] = lambda: None,
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a node for each application and service that is to be placed.
 
@@ -60,7 +69,10 @@ def with_chosen_nodes(
         usage: what services request on each node in ``world``.
         trial: if given, a node is chosen only if ``trial`` returns ``True`` for the request with
             this node. It is not called for a node on which the application or service is booked
-            already, nor for one on which another application has a service to share.
+            already, nor for one on which another application has a service to share. First it is
+            called for all that the demand leaves no choice for. If it returns ``False`` then, or
+            for all nodes of an application or service, no more is placed.
+        checkpoint: called at each step; it may raise an exception to end the search.
 
     Returns:
         The request, and the faults: of each application or service that gets no node, and of each
@@ -70,7 +82,7 @@ def with_chosen_nodes(
         return request, []
     faults: list[Fault] = []
     if needs_placement(request, world):
-        request, faults = _placed(request, world, usage, trial)
+        request, faults = _placed(request, world, usage, trial, checkpoint)
     demanded = (
         replace(one, held=_overridden(one.held, world))
         if isinstance(one.held, Application)
@@ -116,7 +128,11 @@ def _overridden(app: Application, world: World) -> Application:
 
 
 def _placed(
-    request: AnyRequest, world: World, usage: Usage, trial: Trial | None
+    request: AnyRequest,
+    world: World,
+    usage: Usage,
+    trial: Trial | None,
+    checkpoint: Callable[[], None],
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with chosen nodes, and a fault for each choice that failed.
 
@@ -124,8 +140,11 @@ def _placed(
     """
     ledger, faults = world.ledger, list[Fault]()
     kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
-    room = Room(world, usage, [*ledger.claims_of_demand(request.demand), *kept])
+    room = Room(world, usage, [*ledger.claims_of_demand(request.demand), *kept], checkpoint)
     demanded = [_with_named_service_nodes(one, world) for one in request.demanded]
+    fixed = tuple(one for one in demanded if not _is_open(one.held))
+    if trial is not None and fixed and not trial(replace(request, demanded=fixed)):
+        return request, [_NOWHERE]
     for one in demanded:
         if isinstance(one.held, Application) and one.held.place is None:
             room.take(_claim(request, one))
@@ -137,6 +156,9 @@ def _placed(
 
     for index, one in enumerate(demanded):
         if isinstance(one.held, Application) and one.held.place is not None:
+            if faults and trial is not None:
+                return request, faults
+            checkpoint()
             claims = (_claim(request, one),)
             choice = Choice(one, one.held.place, world, room, claims, suits=suits(index))
             placed = _with_node(request, one, choice)
@@ -147,9 +169,19 @@ def _placed(
                 room.take(_claim(request, placed))
     for index, one in enumerate(demanded):
         if isinstance(one.held, Application) and one.held.node:
+            if faults and trial is not None:
+                return request, faults
+            checkpoint()
             demanded[index], more = _with_services(request, one, world, room, suits(index))
             faults += more
     return replace(request, demanded=tuple(demanded)), faults
+
+
+def _is_open(held: Application | Connection) -> bool:
+    """Return whether the generator chooses the node of an application or of one of its services."""
+    if not isinstance(held, Application):
+        return False
+    return held.place is not None or not all(held.services.values())
 
 
 def _so_far(
@@ -173,18 +205,19 @@ def _with_named_service_nodes(one: Demanded, world: World) -> Demanded:
     return replace(one, held=replace(one.held, services=MappingProxyType(services)))
 
 
-def may_wait(request: DemandRequest, world: World) -> bool:
+def may_wait(request: DemandRequest, world: World, checkpoint: Callable[[], None]) -> bool:
     """Return whether a demand that lacks only room may wait.
 
     For each application and service to place, there must be a node that would fit if it had room.
     The node's access domain must let demands wait, and must ask for no approval. A demand that
     needs approval cannot wait, because a person approves only what can be booked at once.
     """
-    return all(
-        any(_waits_for(node, request, choice) for node in choice.nodes())
-        for one in request.demanded
-        for choice in _choices(request, one, world)
-    )
+    for one in request.demanded:
+        for choice in _choices(request, one, world):
+            checkpoint()
+            if not any(_waits_for(node, request, choice) for node in choice.nodes()):
+                return False
+    return True
 
 
 def _waits_for(node: str, request: DemandRequest, choice: Choice) -> bool:

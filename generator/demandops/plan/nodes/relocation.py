@@ -11,6 +11,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial, reduce
+from itertools import islice
+from math import inf
 
 from demandops.config.appdef import Service
 from demandops.demand import admission, permission
@@ -27,6 +29,7 @@ from demandops.ledger.world import World
 from demandops.plan.checks import quota, topic_clash
 from demandops.plan.nodes.capacity import Room, Usage
 from demandops.plan.nodes.choice import (
+    MOST_TRIED,
     Choice,
     Chosen,
     joined,
@@ -43,17 +46,23 @@ from demandops.subject import Subject, SubjectKind
 _ANY = Requirement()
 
 
-def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
+def with_moves(request: Drain, world: World, usage: Usage, most: float = inf) -> Drain:
     """Return ``request`` with the moves of all applications and services that can leave the node.
 
     Args:
         request: the drain; its ``id`` is the node.
         world: the claims and the configuration.
         usage: what services request on each node in ``world``.
+        most: after so many tried nodes, the other applications are left for another drain.
     """
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
-    room = Room(world, usage, ())
+    room, tried, last = Room(world, usage, ()), 0, request.after
     for id in applications_of(world.ledger, request.id):
+        if id <= request.after:
+            continue
+        if tried >= most:
+            break
+        last = id
         for service in _placed_at(request.id, id, world):
             ids = _moving_with(id, service, request.id, world)
             claims = tuple(one for each in ids for one in world.ledger.application_claims(each))
@@ -61,8 +70,10 @@ def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
             what = [f"service '{service.name}' of {each}" for each in what] if service else what
             fixed = (_why_fixed(one, request.id, service) for one in claims)
             found: _Moved | str = next(filter(None, fixed), "")
+            tried += 1
             if not found:
-                found = _moved(world, claims, room, service)
+                found, count = _moved(world, claims, room, service)
+                tried += count
             if isinstance(found, str):
                 stays.append(f"{what[0]} stays, because {found}")
                 continue
@@ -72,8 +83,10 @@ def with_moves(request: Drain, world: World, usage: Usage) -> Drain:
                 room.book(world.ledger.application_claims(each))
             keys += touched
             moved += [f"{one} is placed on {quoted(chosen.node)}, {chosen.why}" for one in what]
+    else:
+        last = ""
     moves = claim_changes(start.ledger, world.ledger, keys)
-    return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays))
+    return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays), last=last)
 
 
 _Moved = tuple[World, Chosen, list[ClaimKey]]
@@ -133,11 +146,11 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
 
 def _moved(
     world: World, claims: tuple[Claim, ...], room: Room, service: Service | None
-) -> _Moved | str:
+) -> tuple[_Moved | str, int]:
     """Return the world with an application, or only its ``service``, moved to the best other node.
 
     The result also has the chosen node and the keys of the changed claims. If no move is possible,
-    the result is the reason as a text.
+    the result is the reason as a text. The second value is how many nodes were tried.
     """
     required = reduce(Requirement.united, (one.application.place or _ANY for one in claims))
     required = requirement_of(service) if service else required
@@ -151,7 +164,7 @@ def _moved(
     choice = Choice(demanded, required, world, room, claims, service)
     reasons: list[str] = []
     renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
-    for chosen in choice.candidates({}):
+    for chosen in islice(choice.candidates({}), MOST_TRIED):
         if route := renamed.get(chosen.node):
             names = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
             reasons.append(f"on {quoted(chosen.node)} {names}")
@@ -160,9 +173,9 @@ def _moved(
         after, changes = with_moved(world, claims, move)
         fault = next(_faults(world, after, changes), None)
         if fault is None:
-            return after, chosen, [change.key for change in changes]
+            return (after, chosen, [change.key for change in changes]), len(reasons) + 1
         reasons.append(f"on {quoted(chosen.node)} {fault.message}")
-    return sentences(reasons) or choice.none_fits({}).message
+    return sentences(reasons) or choice.none_fits({}).message, len(reasons)
 
 
 @dataclass(frozen=True, slots=True)

@@ -50,19 +50,24 @@ class _KnownTopics:
         """Yield a warning for each misspelled topic that an earlier call did not report."""
         if isinstance(held, Application):
             for role, one in held.all_inputs():
-                known = self._of(one.source) | self._usual(role, one.source)
-                yield from self._notes(f"application '{held.id}'", one.source, one.topic, known)
+                known = (self._of(one.source), self._usual(role, one.source))
+                yield from self._notes(f"application '{held.id}'", one.source, one.topic, *known)
             return
         for route in held.topics:
             sender, _ = route.sender_and_receiver(held.source, held.target)
             topic = route.read_topic
             yield from self._notes(f"connection '{held.id}'", sender, topic, self._of(sender))
 
-    def _notes(self, what: str, node: str, topic: str, known: frozenset[str]) -> Iterator[str]:
-        near = () if topic in known else sorted(one for one in known if _is_misspelling(topic, one))
-        if near and (node, topic) not in self._told:
+    def _notes(self, what: str, node: str, topic: str, *known: frozenset[str]) -> Iterator[str]:
+        # not united: a demand may list thousands of topics, and all of them may be known
+        if (node, topic) in self._told or any(topic in some for some in known):
+            return
+        near = min(
+            (one for some in known for one in some if _is_misspelling(topic, one)), default=""
+        )
+        if near:
             self._told.add((node, topic))
-            yield f"{what}: '{node}' is not known to publish {topic}; did you mean '{near[0]}'?"
+            yield f"{what}: '{node}' is not known to publish {topic}; did you mean '{near}'?"
 
     def _of(self, node: str) -> frozenset[str]:
         if node not in self._listed:
@@ -88,6 +93,8 @@ def _is_misspelling(one: str, other: str) -> bool:
     It is one if both differ only in a word of at least four letters. In this word, ``one`` must
     have one wrong, missing or additional letter, or two letters in the wrong order.
     """
+    if abs(len(one) - len(other)) > 1:
+        return False
     start = _common(one, other)
     end = _common(one[start:][::-1], other[start:][::-1])
     rest, known = one[start : len(one) - end], other[start : len(other) - end]

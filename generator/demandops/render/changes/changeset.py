@@ -73,7 +73,7 @@ class Changeset:
     """
 
 
-def build_changeset(  # noqa: PLR0913
+def build_changeset(  # noqa: PLR0913 - each is an input of its own
     before: World,
     after: World,
     changes: Changes,
@@ -83,6 +83,7 @@ def build_changeset(  # noqa: PLR0913
     plans: Mapping[ReleaseKey, Release] = MappingProxyType({}),
     *,
     keeps_late: bool = False,
+    checkpoint: Callable[[], None] = lambda: None,
 ) -> Changeset:
     """Return the changes in the state repo that follow from a change of the ledger.
 
@@ -96,15 +97,20 @@ def build_changeset(  # noqa: PLR0913
         plans: releases of ``before`` that the caller has planned already.
         keeps_late: whether a release whose values take too long to compute keeps its file, instead
             of OverLimit.
+        checkpoint: called for each file and release; it may raise an exception to end the work.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered, or if a file would not be
             valid (:func:`demandops.render.output_check.check_files`) or would be too large.
     """
-    files: dict[str, str | None] = {
-        claim_file.path_of(change.key): claim_file.text_of(change.after) if change.after else None
-        for change in changes.claims
-    }
+    files: dict[str, str | None] = {}
+    most = after.config.repo_settings.limits.file_bytes
+    for change in changes.claims:
+        checkpoint()
+        path = claim_file.path_of(change.key)
+        files[path] = claim_file.text_of(change.after) if change.after else None
+    # before anything is planned, because a claim's file is the smallest of the files that need it
+    _refuse_large(files, most, read)
     for digest in changes.shutdowns:
         shutdown = after.ledger.shutdowns.by_digest.get(digest)
         files[recent_shutdowns.path_of(digest)] = (
@@ -121,9 +127,13 @@ def build_changeset(  # noqa: PLR0913
     releases = []
     shaped: set[str] = set()
     blocked: list[str] = []
-    now = {key: plan(after, key) for key in keys}
-    former = {key: plans.get(key) or _plan_leniently(before, key) for key in now}
+    now, former = dict[ReleaseKey, Release | None](), dict[ReleaseKey, Release | None]()
+    for key in keys:  # all before any is rendered, because that takes longer
+        checkpoint()
+        now[key] = plan(after, key)
+        former[key] = plans.get(key) or _plan_leniently(before, key)
     for key, new in now.items():
+        checkpoint()
         old = former[key]
         old_path = path_of(old) if old else None
         new_path = path_of(new) if new else None
@@ -144,8 +154,8 @@ def build_changeset(  # noqa: PLR0913
             continue
         if old or new:
             releases.append(describe_change(old, new, current is not None))
-    check_files(files)
-    _refuse_large(files, after.config.repo_settings.limits.file_bytes, read)
+    _refuse_large(files, most, read)
+    check_files(files, checkpoint)
     releases.sort(key=lambda change: change.order)
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked), now, former)
 

@@ -26,11 +26,12 @@ The limit is higher than :data:`LIMIT_LOCAL`, because a push takes about 50 ms, 
 of a repository on this disk takes less than 1 ms.
 """
 
-LONGEST_EVALUATION_S = 1.0
-"""The longest time to evaluate the demands of a batch before the evaluated demands are published.
+LONGEST_EVALUATION_S = 0.25
+"""After this time no further demand of a batch is evaluated, and what was evaluated is published.
 
 The other demands of the batch go back to the queue. In the queue, requesters take turns, so a
-demand that arrived meanwhile may come first.
+demand that arrived meanwhile may come first. So it waits for this time and for one decision, which
+has a limit of its own (``limits.decisionMilliseconds``).
 """
 
 

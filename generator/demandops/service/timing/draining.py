@@ -12,6 +12,7 @@ from datetime import datetime, timedelta
 
 from demandops.config.config import Config
 from demandops.errors import InvalidInput
+from demandops.ledger.operations.drain import Drain
 from demandops.ledger.world import World
 from demandops.runtime import Runtime
 from demandops.staterepo.write.commit_batch import CommitBatch
@@ -29,6 +30,7 @@ class Draining:
         self._runtime = runtime
         self._tried: dict[str, tuple[Config, datetime]] = {}
         self._logged: dict[str, frozenset[str]] = {}
+        self._after: dict[str, str] = {}
 
     def move_due(self, commits: CommitBatch) -> None:
         """Commit the moves of placed applications away from drained nodes.
@@ -38,25 +40,38 @@ class Draining:
         now = self._runtime.now()
         for node in self._due(commits.head.state, now):
             tried = (commits.head.state.config, now)
+            after = self._after.pop(node, "")
             try:
-                decision = commits.drain(node, self._runtime.fresh_id(), now)
+                decision = commits.drain(node, after, self._runtime.fresh_id(), now)
             except InvalidInput as error:
                 self._tried[node] = tried
                 self._warn(node, map(str, error.faults))
                 continue
             # a commit may fail to be published, so only a try without commit is recorded
-            if not decision.files:
+            assert isinstance(decision.request, Drain)  # noqa: S101 - it was decided
+            if decision.request.last:
+                self._after[node] = decision.request.last
+            elif not decision.files:
                 self._tried[node] = tried
             for moved in decision.placed:
                 log.info("'%s' is drained: %s", node, moved)
-            self._warn(node, decision.warnings)
+            self._warn(node, decision.warnings, continued=bool(after))
 
-    def _warn(self, node: str, stays: Iterable[str]) -> None:
+    @property
+    def has_more(self) -> bool:
+        """Whether the last call left applications for later, which are to be moved soon."""
+        return bool(self._after)
+
+    def postpone(self) -> None:
+        """Begin again with all applications later, because a fetch or a publication failed."""
+        self._after.clear()
+
+    def _warn(self, node: str, stays: Iterable[str], *, continued: bool = False) -> None:
         """Log why applications stay on a drained node; repeat no text of the last try."""
-        texts = frozenset(stays)
-        for text in sorted(texts - self._logged.get(node, frozenset())):
+        texts, logged = frozenset(stays), self._logged.get(node, frozenset())
+        for text in sorted(texts - logged):
             log.warning("'%s' is drained: %s", node, text)
-        self._logged[node] = texts
+        self._logged[node] = texts | logged if continued else texts
 
     def is_due(self, world: World) -> bool:
         """Return whether applications are to be moved off a node now."""

@@ -41,6 +41,8 @@ class OwnWork:
         """
         self._override_expiry.postpone(self._runtime.now())
         self._scale_down.postpone(self._runtime.now())
+        self._draining.postpone()
+        self._waiting_turns.postpone()
 
     def is_due(self, state: State) -> bool:
         """Return whether any of the generator's own work is due now."""
@@ -55,8 +57,11 @@ class OwnWork:
     def seconds_until_due(self, state: State, longest: float) -> float:
         """Return the seconds until the next check of overrides and replicas.
 
-        It is at least one, but never above ``longest``.
+        It is at least one, but never above ``longest``. It is zero if other work was left off, so
+        that demands which arrived meanwhile come first.
         """
+        if self._draining.has_more or self._waiting_turns.has_more:
+            return 0.0
         now = self._runtime.now()
         seconds = self._override_expiry.seconds_until_due(state, now, longest)
         return self._scale_down.seconds_until_due(state.ledger, now, seconds)

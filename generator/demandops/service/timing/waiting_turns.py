@@ -11,11 +11,16 @@ import logging
 from demandops.decision import State, decide
 from demandops.errors import InvalidInput
 from demandops.ledger.waiting import in_turn
+from demandops.ledger.world import World
 from demandops.quoting import quoted
 from demandops.runtime import Runtime
+from demandops.service.timing.budget import within
 from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
+
+_LONGEST_ROUND_S = 0.25
+"""After this processor time the other waiting demands are tried later, so that new demands come."""
 
 
 class WaitingTurns:
@@ -23,27 +28,41 @@ class WaitingTurns:
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
-        self._tried: State | None = None
+        self._tried: World | None = None
+        self._left: list[str] = []
 
     def book_due(self, commits: CommitBatch) -> None:
         """Commit each waiting demand that fits and needs no approval, in its turn.
 
-        The turns are those of :func:`in_turn`.
+        The turns are those of :func:`in_turn`. After some time, the others are left for later.
         Do nothing if all waiting demands were already tried on this state.
         """
-        if not self.is_due(commits.head.state):
+        state = commits.head.state
+        if not self.is_due(state):
             return
-        for waiting in in_turn(commits.head.state.ledger.waiting):
-            now = self._runtime.now()
-            try:
-                decision = decide(commits.head.state, dict(waiting.goal), now, commits.read)
-            except InvalidInput as error:
-                log.debug("demand %s still waits: %s", quoted(waiting.demand), error)
-                continue
-            if decision.outcome == "booked" and not decision.approval:
-                commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
-                log.info("demand %s no longer waits", quoted(waiting.demand))
+        if not self._is_tried(state) or not self._left:
+            self._left = [one.demand for one in in_turn(state.ledger.waiting)]
+        end = self._runtime.processor_s() + _LONGEST_ROUND_S
+        while self._left:
+            self._book_if_it_fits(commits, self._left.pop(0))
+            if self._runtime.processor_s() > end:
+                break
         self._tried = commits.head.state
+
+    def _book_if_it_fits(self, commits: CommitBatch, demand: str) -> None:
+        state, now = commits.head.state, self._runtime.now()
+        waiting = state.ledger.waiting.get(demand)
+        if waiting is None:  # it was released meanwhile
+            return
+        checkpoint = within(state.config.repo_settings.limits, self._runtime)
+        try:
+            decision = decide(state, dict(waiting.goal), now, commits.read, checkpoint=checkpoint)
+        except InvalidInput as error:
+            log.debug("demand %s still waits: %s", quoted(demand), error)
+            return
+        if decision.outcome == "booked" and not decision.approval:
+            commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
+            log.info("demand %s no longer waits", quoted(demand))
 
     def follow(self, commits: CommitBatch, before: State) -> None:
         """Book waiting demands if the last demand freed room.
@@ -52,13 +71,24 @@ class WaitingTurns:
         """
         if commits.frees:
             commits.frees = False
+            self._tried = None
             self.book_due(commits)
         elif self._tried is before:  # the last demand freed no room, so the tries are still valid
             self._tried = commits.head.state
 
+    @property
+    def has_more(self) -> bool:
+        """Whether the last round left demands for later, which are to be tried soon."""
+        return bool(self._left)
+
+    def postpone(self) -> None:
+        """Begin again with all waiting demands later, because a fetch or a publication failed."""
+        self._left.clear()
+
     def is_due(self, state: State) -> bool:
         """Return whether there are waiting demands that were not yet tried on this state."""
+        return bool(state.ledger.waiting) and (bool(self._left) or not self._is_tried(state))
+
+    def _is_tried(self, state: World) -> bool:
         tried = self._tried
-        return bool(state.ledger.waiting) and not (
-            tried is not None and tried.ledger is state.ledger and tried.config is state.config
-        )
+        return tried is not None and tried.ledger is state.ledger and tried.config is state.config

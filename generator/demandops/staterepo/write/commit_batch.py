@@ -268,15 +268,16 @@ class CommitBatch:
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
         return text.partition("\n")[0]
 
-    def drain(self, node: str, operation: str, now: datetime) -> Decision:
+    def drain(self, node: str, after: str, operation: str, now: datetime) -> Decision:
         """Commit the move of placed applications off a drained node, and return the decision.
 
+        It begins with the application that follows ``after`` (:class:`Drain`).
         If no application can be moved, there is no commit. The commit's author is the person who
         last changed the node's file, or the generator if there is no such person.
 
         Raises Refused or InvalidInput if the state after the move cannot be planned or rendered.
         """
-        decision = decide(self.head.state, Drain(node), now, self.read)
+        decision = decide(self.head.state, Drain(node, after=after), now, self.read)
         if decision.files:
             config = decision.state.config
             file = config.file_of(NODES_FILE, config.host_of(node))

@@ -1,0 +1,161 @@
+"""A demand that takes too long is refused, also after a kill, and holds up nobody else.
+
+The processor time is that of a clock which moves with each look at it.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from demandops.errors import Refused
+from demandops.service import worker
+
+from tests.kit import rig
+from tests.kit.clock import Clock
+from tests.kit.rig import Gate
+
+LOOKS = 400
+"""After so many looks at the clock, the time of a decision is over."""
+
+
+class Ticking(Clock):
+    look_s = 0.5 / LOOKS
+
+
+def large(name: str) -> dict[str, Any]:
+    """Return a demand with 1,000 placements and 1,000 connections."""
+    inputs = {"ego_data": [{"topic": "/ego", "source": "vehicle00"}]}
+    app = {"type": "object-detection-fusion", "place": {"role": "edge"}, "inputs": inputs}
+    link = {"type": "mqtt", "source": "vehicle00", "target": "edge"}
+    return {
+        "kind": "Demand",
+        "demand": name,
+        "requesters": ["attacker"],
+        "applications": [app | {"id": f"{name}-{number}"} for number in range(1000)],
+        "connections": [
+            link | {"id": f"{name}-{number}", "topics": [{"source": f"/{name}/t{number}"}]}
+            for number in range(1000)
+        ],
+    }
+
+
+def connections(name: str) -> dict[str, Any]:
+    return large(name) | {"applications": []}
+
+
+def booked_in_time(name: str) -> dict[str, Any]:
+    """Return a demand that is admitted in time, and not rendered in time."""
+    return connections(name) | {"connections": connections(name)["connections"][: LOOKS // 2]}
+
+
+def too_many_topics(name: str) -> dict[str, Any]:
+    made = connections(name)
+    topics = [{"source": f"/t{number}"} for number in range(19_000)]
+    return made | {"connections": [made["connections"][0] | {"topics": topics}]}
+
+
+@pytest.mark.parametrize("made", [large, connections, too_many_topics])
+def test_who_sends_what_takes_too_long_holds_up_others_for_one_demand(
+    bare: Path, made: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 0.0)
+    order: list[str] = []
+    gate = Gate()
+    with rig.running(str(bare), runtime=Ticking()) as generator:
+
+        def send(name: str, goal: Any, *listener: Any) -> Any:
+            ticket = generator.submit(goal, name, *listener)
+            ticket.future.add_done_callback(lambda _: order.append(name))
+            return ticket
+
+        first = send("first", rig.goal(1) | {"id": "attacker's"}, gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        attacks = [send(f"a{number}", made(f"a{number}")) for number in range(4)]
+        other = send("other", rig.goal(0))
+        gate.open.set()
+        assert rig.receipt(first).outcome == rig.receipt(other).outcome == "booked"
+        for ticket in attacks:
+            with pytest.raises(Refused) as refusal:
+                rig.receipt(ticket)
+            assert {fault.code for fault in refusal.value.faults} == {"too-large"}
+            # what is too large is not even written to the journal
+            assert ticket.journaled.result() is (made is not too_many_topics)
+        assert generator.operations == ()
+        assert generator.unpublished == 0
+    assert order.index("other") <= order.index("first") + 2
+    rig.assert_sound(bare)
+
+
+def test_a_demand_that_comes_meanwhile_is_next(bare: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(worker, "LONGEST_EVALUATION_S", 0.0)
+    order: list[str] = []
+    gate, busy = Gate(), Gate()
+    with rig.running(str(bare), runtime=Ticking()) as generator:
+
+        def send(name: str, goal: Any, *listener: Any) -> Any:
+            ticket = generator.submit(goal, name, *listener)
+            ticket.future.add_done_callback(lambda _: order.append(name))
+            return ticket
+
+        send("first", rig.goal(1), gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        attacks = [send("a0", booked_in_time("a0"), busy)]
+        attacks += [send(f"a{number}", booked_in_time(f"a{number}")) for number in range(1, 4)]
+        gate.open.set()
+        assert busy.reached.wait(rig.PATIENCE_S)
+        other = send("other", rig.goal(0))
+        rig.wait_until_queued([*attacks, other])
+        busy.open.set()
+        rig.receipt(other)
+        for ticket in attacks:
+            with pytest.raises(Refused):
+                rig.receipt(ticket)
+    assert order[:3] == ["first", "a0", "other"]
+
+
+DIES = f"""
+import json, os, signal, sys
+from demandops.runtime import Runtime
+from demandops.service import Generator
+
+class Dying(Runtime):
+    looks = 0
+
+    def processor_s(self):
+        self.looks += 1
+        if self.looks > {LOOKS} // 2:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return 0.0
+
+generator = Generator(sys.argv[1], runtime=Dying())
+generator.submit(json.load(sys.stdin), "op-large").future.result(60)
+"""
+
+
+@pytest.mark.parametrize("made", [large, connections])
+def test_after_a_kill_in_the_middle_it_is_refused_and_leaves_the_journal(
+    bare: Path, made: Any, caplog: pytest.LogCaptureFixture
+) -> None:
+    killed = subprocess.run(
+        [sys.executable, "-c", DIES, str(bare)],
+        input=json.dumps(made("d")),
+        text=True,
+        check=False,
+        timeout=rig.PATIENCE_S,
+    )
+    assert killed.returncode == -signal.SIGKILL
+    with caplog.at_level(logging.INFO), rig.running(str(bare), runtime=Ticking()) as generator:
+        assert "resuming demand op-large from the journal" in caplog.text
+        assert rig.book(generator, rig.goal(0))[0].outcome == "booked"
+        rig.wait_until(lambda: not generator.operations, "the large demand to be answered")
+        assert generator.unpublished == 0
+    assert "demand op-large ('d') from the journal: refused: too-large" in caplog.text
+    assert rig.restart(bare)
+    assert [commit.one("Operation") for commit in rig.commits(bare)] == ["join"]

@@ -1,0 +1,253 @@
+"""One demand causes a bounded amount of work, however it is made.
+
+Work is counted in calls of functions and in looks at the clock, so the tests need no clock.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from itertools import pairwise
+from typing import Any
+
+import pytest
+import yaml
+from demandops.decision import decide
+from demandops.decision.decision import MOST_TRIALS
+from demandops.errors import OverBudget, Refused
+
+from tests.kit.config import override, skeleton
+from tests.kit.goals import Goal, application, connection, goal
+from tests.kit.memory import MemoryRepo
+
+ENDS = ("vehicle00", "edge")
+
+
+def repo(edges: int = 0, files: dict[str, str] | None = None, **limits: int) -> MemoryRepo:
+    """Return a repo with so many edges more, e000 and so on, and with these limits."""
+    settings = yaml.safe_load(skeleton()["demandops.yaml"]) | {"limits": limits}
+    nodes = [{"id": f"e{n:03}", "type": "edge", "cluster": "c-its"} for n in range(edges)]
+    more = {"apiVersion": "demandops/v1", "kind": "Nodes", "nodes": nodes}
+    return MemoryRepo(
+        {"demandops.yaml": yaml.safe_dump(settings)}
+        | ({"inventory/nodes/edges.yaml": yaml.safe_dump(more)} if nodes else {})
+        | (files or {})
+    )
+
+
+def app(number: int, topics: int = 1, **more: Any) -> dict[str, Any]:
+    names = (f"/t{number}/n{index}" for index in range(topics))
+    inputs = {"ego_data": [{"topic": name, "source": "vehicle00"} for name in names]}
+    made = {"id": f"a{number}", "type": "object-detection-fusion", "inputs": inputs}
+    return made | ({} if "node" in more else {"place": {"role": "edge"}}) | more
+
+
+def link(number: int, ends: tuple[str, str] = ENDS, topics: int = 1, **more: Any) -> dict[str, Any]:
+    listed = [{"source": f"/c{number}/n{index}"} for index in range(topics)]
+    made = {"id": f"c{number}", "type": "mqtt", "source": ends[0], "target": ends[1]}
+    return made | {"topics": listed} | more
+
+
+def demand(
+    apps: Iterable[dict[str, Any]] = (),
+    links: Iterable[dict[str, Any]] = (),
+    who: Iterable[str] = ("attacker",),
+    **more: Any,
+) -> Goal:
+    made = {"kind": "Demand", "demand": "d", "requesters": [*who]}
+    return made | {"applications": [*apps], "connections": [*links]} | more
+
+
+def codes(answer: object) -> set[str]:
+    assert isinstance(answer, Refused)
+    return {fault.code for fault in answer.faults}
+
+
+@contextmanager
+def counted(calls: list[int]) -> Iterator[None]:
+    def count(*_: object) -> None:
+        calls[0] += 1
+
+    sys.setprofile(count)
+    try:
+        yield
+    finally:
+        sys.setprofile(None)
+
+
+def work_of(books: MemoryRepo, made: Goal) -> tuple[int, int, object]:
+    """Return all calls of a decision, the most between two looks at the clock, and the answer."""
+    calls, looks = [0], list[int]()
+    answer: object
+    with counted(calls):
+        try:
+            answer = decide(
+                *(books.state, made, books.now, books.files.get),
+                checkpoint=lambda: looks.append(calls[0]),
+            )
+        except Refused as refused:
+            answer = refused
+    ends = [0, *looks, calls[0]]
+    return calls[0], max(b - a for a, b in pairwise(ends)), answer
+
+
+REFUSED_ANYWHERE: dict[str, Callable[[MemoryRepo], list[dict[str, Any]]]] = {
+    "a connection that contradicts another": lambda books: [link(0, ("vehicle01", "edge"))],
+    "a connection without a broker": lambda books: [link(1, ("vehicle00", "vehicle01"))],
+}
+
+
+@pytest.mark.parametrize("case", REFUSED_ANYWHERE)
+def test_what_no_node_changes_is_not_tried_on_each_node(case: str) -> None:
+    work = []
+    for edges, count in ((2, 40), (30, 40), (30, 80)):
+        books = repo(edges)
+        books.send(goal([], [connection("c0", ends=ENDS)]))
+        listed = [*REFUSED_ANYWHERE[case](books), *(link(n) for n in range(5, 5 + count))]
+        calls, _, answer = work_of(
+            books, demand([app(n, connect="none") for n in range(count)], listed)
+        )
+        assert codes(answer) in ({"conflict"}, {"no-broker"})
+        work.append(calls)
+    few, many, twice = work
+    assert many < 1.5 * few, "more nodes cost more, although none of them was worth a trial"
+    assert twice < 2.5 * many, "the cost must grow with the demand and not faster"
+
+
+DENIED = {"overrides/no.yaml": override({"nodes": [f"e{n:03}" for n in range(10)]}, deny=True)}
+
+
+def test_trials_are_bounded_by_number_and_the_answer_has_the_first_refusal_too() -> None:
+    books = repo(12, DENIED)
+    few = MOST_TRIALS // 11  # each application is denied on ten nodes and booked on the eleventh
+    assert books.decide(demand(app(n, connect="none") for n in range(few))).outcome == "booked"
+    refusal = books.take(demand(app(n, connect="none") for n in range(few + 2)))
+    assert codes(refusal) == {"denied", "too-large"}
+
+
+def test_trials_are_bounded_by_what_they_book_together() -> None:
+    made = demand([app(0, connect="none")], [link(n) for n in range(30)])
+    assert repo(12, DENIED).decide(made).outcome == "booked"
+    assert codes(repo(12, DENIED, demandItems=300).take(made)) == {"denied", "too-large"}
+
+
+LARGE = {
+    "placements": demand(app(n) for n in range(200)),
+    "placements that nothing saves": demand(
+        (app(n) for n in range(200)), (link(n, ("vehicle00", "vehicle01")) for n in range(800))
+    ),
+    "topics": demand([app(0, 980, node="edge")]),
+    "topics without connections": demand([app(0, 1900, node="edge", connect="none")]),
+    "topics of a connection": demand([], [link(0, topics=1900)]),
+    "connections": demand([], [link(n) for n in range(980)]),
+    "unknown nodes": demand([], [link(n, (f"vehicle{n}x", "edge")) for n in range(980)]),
+    "unknown outputs": demand(
+        [app(0, deliver=[{"output": f"object-fusion.o{n}", "node": "cloud"} for n in range(1800)])]
+    ),
+    "services": demand([app(0, node="edge", services={f"s{n}": "edge" for n in range(1900)})]),
+    "parameters": demand([app(0, node="edge", parameters={f"p{n}": n for n in range(1900)})]),
+    "requesters": demand([], [link(n) for n in range(40)], [f"r{n}" for n in range(40)]),
+    "goals of the reference": goal(
+        [application(f"a{n}", who=["attacker"]) for n in range(300)],
+        [connection(f"c{n}", topics=[f"/t{n}"], broker="") for n in range(300)],
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_the_clock_is_looked_at_again_before_much_is_done(name: str) -> None:
+    books = repo(4, demandItems=2_000)
+    books.decide(demand([app(0)], [link(0)]))  # templates are compiled once
+    _, longest, _ = work_of(books, LARGE[name])
+    assert longest < 600_000, "about a tenth of a second"
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_a_demand_that_takes_too_long_is_refused_and_nothing_else(name: str) -> None:
+    books, looks = repo(4, demandItems=2_000), 0
+
+    def checkpoint() -> None:
+        nonlocal looks
+        looks += 1
+        if looks > 3:
+            raise OverBudget("too long")
+
+    with pytest.raises(Refused) as refusal:
+        decide(books.state, LARGE[name], books.now, books.files.get, checkpoint=checkpoint)
+    assert "too-large" in codes(refusal.value)
+    assert looks <= 5, "no other way may be tried"
+
+
+def test_what_was_booked_is_released_however_long_it_takes() -> None:
+    def checkpoint() -> None:
+        raise OverBudget("too long")
+
+    books = repo()
+    books.send(demand([app(0)], [link(n) for n in range(20)]))
+    release = {"kind": "Demand", "operation": "release", "demand": "d", "requesters": ["attacker"]}
+    made = decide(books.state, release, books.now, books.files.get, checkpoint=checkpoint)
+    assert made.outcome == "released"
+    books.send(release)
+    books.send(goal([application()], [connection()]))
+    leave = goal([application()], [connection()], shutdown=True)
+    made = decide(books.state, leave, books.now, books.files.get, checkpoint=checkpoint)
+    assert made.outcome == "released"
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        demand([app(0, 19_000, node="edge")]),
+        goal([], [connection(topics=[f"/t{n}" for n in range(19_000)])]),
+        demand([], [link(n) for n in range(120)], [f"r{n}" for n in range(120)]),
+        demand([app(0, node="edge", parameters={"x": "y" * 1_100_000})]),
+        demand([app(0, node="edge", parameters={"x": [[]] * 600_000})]),
+        {"kind": "Demand", "demand": "d" * 1_100_000},
+    ],
+    ids=["topics", "routes", "requesters of connections", "text", "lists", "id"],
+)
+def test_the_size_of_a_demand_is_checked_before_anything_is_planned(made: Goal) -> None:
+    calls, _, answer = work_of(repo(), made)
+    assert codes(answer) == {"too-large"}
+    assert calls < 3_000_000
+
+
+def test_derived_connections_count_before_they_are_booked() -> None:
+    assert codes(repo(demandItems=100).take(demand([app(0, 60, node="edge")]))) == {"too-large"}
+    books = repo(demandItems=100)
+    assert books.send(demand([app(0, 60, node="edge", connect="none")])).outcome == "booked"
+
+
+def test_a_claim_that_is_too_large_for_its_file_is_refused_before_a_release_is_planned() -> None:
+    some, more = demand([app(0, 400, node="edge")]), demand([app(0, 800, node="edge")])
+    limited = repo(fileBytes=20_000)
+    some_calls, _, answer = work_of(limited, some)
+    assert codes(answer) == {"too-large"}
+    calls, _, _ = work_of(limited, more)
+    assert calls < 2.5 * some_calls
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        lambda n: demand([app(0, n, node="edge")]),
+        lambda n: demand([], [link(0, topics=n)]),
+        lambda n: demand([app(i) for i in range(n // 4)]),
+        lambda n: demand([], [link(i) for i in range(n // 4)]),
+        lambda n: demand([], [link(i, (f"vehicle{i}x", "edge")) for i in range(n)]),
+    ],
+    ids=["topics", "routes", "placements", "connections", "unknown nodes"],
+)
+def test_the_work_grows_with_the_demand_and_not_faster(made: Callable[[int], Goal]) -> None:
+    books = repo(4)
+    work_of(books, made(4))
+    once, twice = work_of(books, made(400))[0], work_of(books, made(800))[0]
+    assert twice < 2.5 * once
+    again, other = made(400), made(800)
+    for size, goal_ in ((400, again), (800, other)):  # the same, once others hold it already
+        held = repo(4)
+        held.take(goal_ | {"demand": "of others", "requesters": ["others"]})
+        calls = work_of(held, goal_)[0]
+        once, twice = (calls, twice) if size == 400 else (once, calls)
+    assert twice < 2.5 * once
