@@ -23,7 +23,9 @@ from demandops.staterepo.pull_request import confined
 HELM_BIN = "HELM_BIN"
 """The environment variable that names the program, instead of ``helm`` on ``PATH``."""
 
-# More than the processor time of confined.CPU_SECONDS, which ends a chart that loops.
+# helm renders a chart in a tenth of a second. The limit of processor time ends a chart that loops,
+# also on a busy machine; the other one ends a helm that waits.
+_CPU_SECONDS = 30
 _SECONDS = 300
 _MOST_OUTPUT = 16 << 20
 # Patterns search the text of a message, whose length is the author's choice.
@@ -97,11 +99,12 @@ class Helm:
             "KUBECONFIG": os.devnull,
             "HELM_PLUGINS": str(home / "plugins"),
         }
+        command = [sys.executable, "-IS", confined.__file__, str(_CPU_SECONDS), self.program]
         files = home / "out", home / "err"
         with files[0].open("wb") as out, files[1].open("wb") as err:
             try:
                 code = subprocess.run(
-                    [sys.executable, "-ISs", confined.__file__, self.program, *arguments],
+                    [*command, *arguments],
                     cwd=home,
                     env=environment,
                     stdin=subprocess.DEVNULL,
@@ -113,7 +116,7 @@ class Helm:
             except subprocess.TimeoutExpired:
                 code = -1
         if code not in (0, 1):  # a signal, or 2 from Go, for example if it gets no memory
-            limits = f"{confined.CPU_SECONDS} s or {confined.MEMORY >> 30} GiB"
+            limits = f"{_CPU_SECONDS} s or {confined.MEMORY >> 30} GiB"
             return -1, "", f"Error: helm crashed, or took more than {limits}"
         if files[0].stat().st_size > _MOST_OUTPUT:
             return -1, "", f"Error: helm printed more than {_MOST_OUTPUT >> 20} MiB"

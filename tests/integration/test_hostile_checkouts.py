@@ -1,0 +1,340 @@
+"""`demandops check` on checkouts whose author is hostile.
+
+It writes nothing outside its own temporary folder, fetches nothing, runs nothing of the author's,
+and ends with a verdict. The helm of these tests is a stand-in that is greedier than any helm; the
+real one is used too if the rig of the end-to-end tests has built it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import sys
+import tarfile
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from demandops.cli.main import run
+from demandops.staterepo.pull_request.helm import HELM_BIN
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.kit import greedy_helm
+from tests.kit.chance import examples
+from tests.kit.cli import Ran
+from tests.kit.http import Server, serving
+
+CHARTS = "appdefs/object-detection-fusion/charts"
+CHART = f"{CHARTS}/object-fusion"
+LIBRARY = "appdefs/charts/ros-service"
+FILES = [
+    f"{CHART}/Chart.yaml",
+    f"{CHART}/values.yaml",
+    f"{CHART}/templates/service.yaml",
+    f"{LIBRARY}/Chart.yaml",
+    f"{LIBRARY}/values.schema.json",
+    "appdefs/object-detection-fusion/appdef.yaml",
+    "registry/charts.yaml",
+    "inventory/nodes.yaml",
+    "demandops.yaml",
+]
+FOLDERS = [
+    "appdefs",
+    LIBRARY,
+    CHART,
+    f"{CHART}/charts",
+    f"{CHART}/templates",
+    "ledger",
+    "overrides",
+]
+Picture = dict[str, tuple[object, ...]]
+
+
+class Lab:
+    """A folder with a checkout, a temporary folder, a home folder, and files to protect."""
+
+    def __init__(self, top: Path, url: str) -> None:
+        self.top, self.url = top, url
+        self.checkout, self.scratch = top / "checkout", top / "scratch"
+
+    def check(self) -> Ran:
+        """Check the checkout, and assert that everything else is as it was."""
+        before = self._picture()
+        ran = self._run()
+        assert ran.code in (0, 1), ran
+        assert "demandops itself" not in ran.err
+        assert "Traceback" not in ran.out + ran.err
+        assert "GREEDY" not in ran.out + ran.err
+        assert "hunter2" not in ran.out + ran.err
+        assert self._picture() == before
+        assert [*self.scratch.iterdir()] == []
+        return ran
+
+    def _picture(self) -> Picture:
+        found: Picture = {}
+        for folder, folders, names in os.walk(self.top):
+            for path in (Path(folder, name) for name in (*folders, *names)):
+                status = path.lstat()
+                content = path.read_bytes() if path.is_file() and status.st_size < 1 << 20 else b""
+                changed = 0 if path == self.scratch else status.st_mtime_ns
+                found[str(path)] = (status.st_mode, status.st_nlink, changed, content)
+        return found
+
+    def _run(self) -> Ran:
+        self.capture.readouterr()
+        code = run(["check", str(self.checkout), "--require-helm"])
+        return Ran(code, *self.capture.readouterr())
+
+    capture: pytest.CaptureFixture[str]
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    with serving() as started:
+        yield started
+
+
+@pytest.fixture
+def lab(
+    _checkout_template: Path,
+    tmp_path: Path,
+    server: Server,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Callable[[], Lab]:
+    """Return a function that sets a lab up anew."""
+    program = tmp_path / "helm"
+    program.write_text(f"#!{sys.executable} -IS\n" + Path(greedy_helm.__file__).read_text())
+    program.chmod(0o755)
+    monkeypatch.setenv(HELM_BIN, str(program))
+    monkeypatch.setenv("A_SECRET", "hunter2")
+
+    def made() -> Lab:
+        top = tmp_path / "top"
+        shutil.rmtree(top, ignore_errors=True)
+        lab = Lab(top, server.url)
+        lab.capture = capsys
+        shutil.copytree(_checkout_template, lab.checkout)
+        for folder in (lab.scratch, top / "home", top / "sentinel"):
+            folder.mkdir()
+        (top / "sentinel" / "secret").write_text("hunter2\n")
+        (top / "sentinel" / "Chart.yaml").write_text("name: hunter2\nversion: 1.0.0\n")
+        monkeypatch.setenv("HOME", str(top / "home"))
+        monkeypatch.setattr(tempfile, "tempdir", str(lab.scratch))
+        return lab
+
+    return made
+
+
+def put(lab: Lab, path: str, text: str | bytes, mode: int = 0o644) -> None:
+    """Write a file of the checkout, unless another hostile step is in its way."""
+    file = lab.checkout / path
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)
+        file.write_bytes(text.encode() if isinstance(text, str) else text)
+        file.chmod(mode)
+    except OSError:
+        return
+
+
+def chart(lab: Lab, folder: str, **metadata: object) -> None:
+    data = {"apiVersion": "v2", "name": folder.rpartition("/")[2], "version": "0.1.0", **metadata}
+    put(lab, f"{folder}/Chart.yaml", json.dumps(data))
+
+
+def clear(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)
+
+
+# ---- what a hostile author does; each step takes a lab and a word ----
+
+
+def names_a_dependency(lab: Lab, word: str) -> None:
+    local = "file://../../../charts/ros-service"
+    chart(lab, CHART, dependencies=[{"name": word, "version": "1.0.0", "repository": local}])
+
+
+def names_an_alias(lab: Lab, word: str) -> None:
+    local = {"name": "ros-service", "repository": "file://../../../charts/ros-service"}
+    chart(lab, CHART, name=word, dependencies=[{**local, "alias": word, "import-values": [word]}])
+
+
+def names_a_repository(lab: Lab, word: str) -> None:
+    for repository in (word, f"file://{word}"):
+        chart(lab, CHART, dependencies=[{"name": "ros-service", "repository": repository}])
+
+
+def names_a_folder(lab: Lab, word: str) -> None:
+    file = lab.checkout / "registry" / "charts.yaml"
+    if file.is_file() and not file.is_symlink():
+        text = file.read_text().replace(f"folder: {CHART}", f"folder: {json.dumps(word)}")
+        put(lab, "registry/charts.yaml", text)
+
+
+def links(lab: Lab, word: str) -> None:
+    for path in FOLDERS[len(word) % len(FOLDERS) :][:2]:
+        if (lab.checkout / path).parent.is_dir():
+            clear(lab.checkout / path)
+            (lab.checkout / path).symlink_to(word.replace("\0", "") or "..")
+
+
+def links_files(lab: Lab, word: str) -> None:
+    path = FILES[len(word) % len(FILES)]
+    if (lab.checkout / path).parent.is_dir():
+        clear(lab.checkout / path)
+        (lab.checkout / path).symlink_to(lab.top / "sentinel" / "secret")
+    if (lab.checkout / CHART).is_dir():
+        clear(lab.checkout / CHART / "hard")
+        (lab.checkout / CHART / "hard").hardlink_to(lab.top / "sentinel" / "Chart.yaml")
+
+
+def leaves_a_pipe(lab: Lab, word: str) -> None:
+    path = lab.checkout / FILES[len(word) % len(FILES)]
+    if path.parent.is_dir():
+        clear(path)
+        os.mkfifo(path)
+
+
+def packs_an_archive(lab: Lab, word: str) -> None:
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w:gz") as archive:
+        for name in ("part/Chart.yaml", "part/values.schema.json", word, f"../../../{word}"):
+            text = json.dumps({"name": "part", "version": "0.1.0", "$ref": f"{lab.url}/x"}).encode()
+            entry = tarfile.TarInfo(name.replace("\0", "") or "x")
+            entry.size, entry.mode = len(text), 0o755
+            archive.addfile(entry, io.BytesIO(text))
+    for folder in (f"{CHART}/charts", f"{LIBRARY}/charts", f"{CHART}/charts/part/charts"):
+        put(lab, f"{folder}/part-0.1.0.tgz", packed.getvalue())
+
+
+def refers_elsewhere(lab: Lab, word: str) -> None:
+    targets = [f"{lab.url}/schema", f"file://{lab.top}/sentinel/secret", word]
+    schema = {"$ref": targets[len(word) % 3], "$schema": targets[(len(word) + 1) % 3]}
+    text = json.dumps({"$id": f"{lab.url}/id/", **schema, "allOf": [{"$ref": "other"}]})
+    for folder in (CHART, LIBRARY, f"{CHART}/charts/part"):
+        put(lab, f"{folder}/values.schema.json", text)
+    chart(lab, f"{CHART}/charts/part")
+
+
+def makes_a_circle(lab: Lab, word: str) -> None:
+    for each, other in (("a", "b"), ("b", "c"), ("c", "a")):
+        needed = {"name": other, "repository": f"file://../{other}", "alias": word or other}
+        chart(lab, f"{CHARTS}/{each}", dependencies=[needed])
+    chart(lab, CHART, dependencies=[{"name": "a", "repository": "file://../a"}])
+    chart(
+        lab,
+        f"{CHART}/charts/self",
+        dependencies=[{"name": "self", "repository": "file://../.."}],
+    )
+
+
+def doubles(lab: Lab, word: str) -> None:
+    for number in range(30):
+        repository = f"file://../l{number + 1}"
+        twice = [{"name": name, "repository": repository} for name in ("x", "y")]
+        chart(lab, f"{CHARTS}/l{number}", dependencies=twice)
+    chart(lab, CHART, dependencies=[{"name": "l0", "repository": "file://../l0"}])
+
+
+def nests_git(lab: Lab, word: str) -> None:
+    touch = f"touch {lab.top}/ran"
+    put(lab, ".gitattributes", "* filter=x diff=x textconv=x\n")
+    put(lab, ".gitmodules", f'[submodule "x"]\n\tpath = {word}\n\turl = {lab.url}\n')
+    for folder in (CHART, "overrides", "ledger"):
+        put(lab, f"{folder}/.git/config", f"[core]\n\tfsmonitor = {touch}\n\thooksPath = ../x\n")
+        put(lab, f"{folder}/.gitattributes", "* filter=x\n")
+    put(lab, f"{CHART}/.helmignore", f"{word}\n!**\n")
+    put(lab, f"{CHART}/templates/run.sh", f"#!/bin/sh\n{touch}\n", 0o755)
+
+
+def digs(lab: Lab, word: str) -> None:
+    put(lab, f"{CHART}/{'d/' * 300}x", word)
+    put(lab, f"{CHART}/charts/{'charts/a/' * 20}Chart.yaml", "name: a")
+    for name in (b"\xff" * 250, b"a\nb", b"a\\b", b"\xe2\x80\xae.yaml", b"~", b"x" * 255):
+        put(lab, f"{CHART}/templates/{os.fsdecode(name)}", word)
+    with suppress(OSError), (lab.checkout / CHART / "huge").open("wb") as file:
+        file.truncate(1 << 40)
+
+
+def writes_odd_metadata(lab: Lab, word: str) -> None:
+    texts = ["[]", "x", f"name: {'[' * 90}", "version: 1", "\0", "dependencies: {a: [1]}"]
+    texts += [f"dependencies: [{json.dumps(word)}, null, [], {{name: 7}}, {{name: {{}}}}]"]
+    put(lab, FILES[len(word) % len(FILES)], texts[len(word) % len(texts)])
+
+
+def writes_hostile_templates(lab: Lab, word: str) -> None:
+    text = (
+        f'{{{{ .Files.Get "../../../../../../sentinel/secret" }}}}{{{{ getHostByName "{word}" }}}}'
+        '{{ lookup "v1" "Secret" "" "" }}{{ (.Files.Glob "/**").AsSecrets }}{{ fail "templates/x:9" }}'
+    )
+    put(lab, f"{CHART}/templates/{len(word)}.yaml", text)
+    put(lab, f"{CHART}/crds/{len(word)}.yaml", word)
+
+
+STEPS = [
+    names_a_dependency,
+    names_an_alias,
+    names_a_repository,
+    names_a_folder,
+    links,
+    links_files,
+    leaves_a_pipe,
+    packs_an_archive,
+    refers_elsewhere,
+    makes_a_circle,
+    doubles,
+    nests_git,
+    digs,
+    writes_odd_metadata,
+    writes_hostile_templates,
+]
+WORDS = st.sampled_from(
+    [
+        "../../..",
+        "../../../../../../sentinel",
+        "../../../../../..",
+        "/etc",
+        "/",
+        "/dev/zero",
+        "/proc/self",
+        ".",
+        "..",
+        "",
+        "a\0b",
+        "a/b",
+        "..\\..",
+        "-x",
+        "--post-renderer=/bin/sh",
+        "~",
+        "null",
+        "x" * 300,
+        "Ros-Service",
+        "oci://127.0.0.1:1/x",
+        "http://127.0.0.1:1/x",
+        "appdefs/./charts",
+        "appdefs",
+        "\u202e",
+        "{{ .Values }}",
+    ]
+)
+
+
+@examples(40)
+@given(st.lists(st.tuples(st.sampled_from(STEPS), WORDS), min_size=1, max_size=4))
+def test_check_leaves_everything_around_it_alone_and_ends(
+    lab: Callable[[], Lab], server: Server, steps: list[tuple[Callable[[Lab, str], None], str]]
+) -> None:
+    made = lab()
+    for step, word in steps:
+        step(made, word)
+    made.check()
+    assert server.calls == []
