@@ -241,7 +241,7 @@ def doubles(lab: Lab, word: str) -> None:
     for number in range(30):
         repository = f"file://../l{number + 1}"
         twice = [{"name": name, "repository": repository} for name in ("x", "y")]
-        chart(lab, f"{CHARTS}/l{number}", dependencies=twice)
+        chart(lab, f"{CHARTS}/l{number}", dependencies=twice if number < 29 else [])
     chart(lab, CHART, dependencies=[{"name": "l0", "repository": "file://../l0"}])
 
 
@@ -274,7 +274,8 @@ def writes_odd_metadata(lab: Lab, word: str) -> None:
 def writes_hostile_templates(lab: Lab, word: str) -> None:
     text = (
         f'{{{{ .Files.Get "../../../../../../sentinel/secret" }}}}{{{{ getHostByName "{word}" }}}}'
-        '{{ lookup "v1" "Secret" "" "" }}{{ (.Files.Glob "/**").AsSecrets }}{{ fail "templates/x:9" }}'
+        '{{ lookup "v1" "Secret" "" "" }}{{ (.Files.Glob "/**").AsSecrets }}'
+        '{{ fail "templates/x:9" }}'
     )
     put(lab, f"{CHART}/templates/{len(word)}.yaml", text)
     put(lab, f"{CHART}/crds/{len(word)}.yaml", word)
@@ -338,3 +339,115 @@ def test_check_leaves_everything_around_it_alone_and_ends(
         step(made, word)
     made.check()
     assert server.calls == []
+
+
+# ---- what was found ----
+
+
+@pytest.fixture
+def told(lab: Callable[[], Lab]) -> Callable[..., list[str]]:
+    """Return a function that takes steps in a new lab and returns the errors of the check."""
+
+    def check(*steps: Callable[[Lab], object]) -> list[str]:
+        made = lab()
+        for step in steps:
+            step(made)
+        lines = made.check().err.splitlines()
+        return [line.removeprefix("error: ") for line in lines if "is still 0.1.0" not in line]
+
+    return check
+
+
+@pytest.mark.parametrize("word", ["../../../../../../sentinel", "..", ".", "", "/tmp", "a/b", None])
+@pytest.mark.parametrize("field", ["name", "alias"])
+def test_the_name_of_a_dependency_is_no_path(
+    told: Callable[..., list[str]], field: str, word: str | None
+) -> None:
+    entry = {"name": "ros-service", "repository": "file://../../../charts/ros-service"}
+    if field == "alias" and not word:
+        return  # without an alias, the name counts
+    lines = told(lambda lab: chart(lab, CHART, dependencies=[entry | {field: word}]))
+    assert [line for line in lines if line.startswith(f"{CHART}/Chart.yaml:1: dependencies[0].")]
+
+
+def test_names_in_libraries_are_checked_too(told: Callable[..., list[str]]) -> None:
+    entry = {"name": "../x", "repository": "file://../x"}
+    (line,) = told(lambda lab: chart(lab, LIBRARY, version="1.0.0", dependencies=[entry]))
+    assert line.startswith(f"{LIBRARY}/Chart.yaml:1: dependencies[0].name: ")
+
+
+def test_libraries_that_need_each_other_are_named(told: Callable[..., list[str]]) -> None:
+    (line,) = told(lambda lab: makes_a_circle(lab, ""))
+    assert line.startswith(f"{CHARTS}/c/Chart.yaml:1: dependencies[0]: ")
+    assert f"{CHARTS}/a → {CHARTS}/b → {CHARTS}/c → {CHARTS}/a;" in line
+
+
+def test_copies_of_libraries_are_bounded(told: Callable[..., list[str]]) -> None:
+    (line,) = told(lambda lab: doubles(lab, ""))
+    assert line.startswith(f"{CHART}/Chart.yaml:1: dependencies: ")
+
+
+def test_an_archive_is_refused(told: Callable[..., list[str]]) -> None:
+    lines = told(lambda lab: packs_an_archive(lab, "x"))
+    assert {line.partition(": ")[0] for line in lines} == {
+        f"{CHART}/charts/part-0.1.0.tgz",
+        f"{CHART}/charts/part/charts/part-0.1.0.tgz",
+        f"{LIBRARY}/charts/part-0.1.0.tgz",
+    }
+
+
+@pytest.mark.parametrize("root", ["overrides", "ledger", "registry", "appdefs/charts"])
+def test_a_linked_folder_is_not_looked_into(told: Callable[..., list[str]], root: str) -> None:
+    def link(lab: Lab) -> None:
+        shutil.rmtree(lab.checkout / root, ignore_errors=True)
+        (lab.checkout / root).symlink_to(lab.top / "sentinel")
+
+    lines = told(link)
+    assert [line for line in lines if line.startswith(f"{root}: is a symbolic link")]
+    assert not [line for line in lines if line.startswith((f"{root}/Chart", f"{root}/secret"))]
+
+
+@pytest.mark.parametrize(
+    ("path", "make"),
+    [
+        (f"{CHART}/files/pipe", os.mkfifo),
+        (f"{CHART}/files/.git", Path.mkdir),
+        (f"{CHART}/files/.GIT", Path.touch),
+        (f"{CHART}/files/huge", lambda path: path.write_bytes(b"") or os.truncate(path, 1 << 40)),
+        (f"{CHART}/{'d/' * 60}deep", Path.mkdir),
+    ],
+    ids=["pipe", "nested repository", "submodule", "huge", "deep"],
+)
+def test_what_is_no_plain_file_is_refused(
+    told: Callable[..., list[str]], path: str, make: Callable[[Path], object]
+) -> None:
+    def add(lab: Lab) -> None:
+        (lab.checkout / path).parent.mkdir(parents=True)
+        make(lab.checkout / path)
+
+    (line,) = told(add)
+    assert line.startswith(f"{path[:3000]}: ")
+
+
+def test_helm_gets_no_schema_and_the_schema_of_a_library_counts(
+    told: Callable[..., list[str]],
+) -> None:
+    def require(lab: Lab) -> None:
+        schema = {"type": "object", "required": ["level"]}
+        put(lab, f"{CHART}/charts/part/values.schema.json", json.dumps(schema))
+        chart(lab, f"{CHART}/charts/part")
+        metadata = lab.checkout / CHART / "Chart.yaml"
+        entry = "  - {name: part, version: 0.1.0}\n"
+        put(lab, f"{CHART}/Chart.yaml", metadata.read_text() + entry)
+
+    (line,) = told(require)
+    assert "level" in line
+    assert line.startswith(f"{CHART}/values.yaml")
+
+    def set_level(lab: Lab) -> None:
+        require(lab)
+        values = lab.checkout / CHART / "values.yaml"
+        put(lab, f"{CHART}/values.yaml", values.read_text() + "\npart: {level: 1}\n")
+        (lab.checkout / CHART / "values.schema.json").unlink()  # it allows no such values
+
+    assert told(set_level) == []

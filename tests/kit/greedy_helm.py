@@ -33,7 +33,7 @@ def main() -> None:
                 done.append("validates")
                 for address in re.findall(r"(?:http|file)://[^\"]+", path.read_text()):
                     with suppress(Exception):
-                        urllib.request.urlopen(address, timeout=1)
+                        urllib.request.urlopen(address, timeout=1)  # noqa: S310 - greedy
     Path("written").write_text("into the working directory")
     Path.home().joinpath("written").write_text("into the home folder")
     if done:
