@@ -67,11 +67,12 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
 
     Only libraries with a :attr:`Dependency.folder` are included, even if the folder is missing.
     """
-    found = [folder]
-    for one in found:
-        for dependency in dependencies(one, files):
-            if dependency.folder and dependency.folder not in found:
-                found.append(dependency.folder)
+    found, waiting = {folder: None}, [folder]
+    for one in waiting:
+        needed = (each.folder for each in dependencies(one, files))
+        new = [each for each in dict.fromkeys(needed) if each and each not in found]
+        found |= dict.fromkeys(new)
+        waiting += new
         if len(found) > _MOST_LIBRARIES:  # with_libraries refuses such a chart
             break
     return tuple(found)
@@ -184,23 +185,16 @@ def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]
 
 
 def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield the faults in the dependencies of a chart, and of the libraries that it needs.
+    """Yield the faults in the metadata of a chart or library.
 
     Such a fault is a name that Helm does not allow; a library that is not in the folder which
     ``file://…`` names for it; and an exact version that is not the library's. Libraries with
     another kind of ``repository`` are not checked.
     """
-    for needed in folders(folder, files):
-        path = f"{needed}/Chart.yaml"
-        for place, name in _metadata(needed, files.get(path, ""))[1]:
-            message = (
-                f"{name} is not a name that Helm allows; use letters, digits, '-', '_' and '.'"
-            )
-            yield fault(place, message).within(path)
-        yield from _library_faults(needed, files)
-
-
-def _library_faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
+    path = f"{folder}/Chart.yaml"
+    for place, name in _metadata(folder, files.get(path, ""))[1]:
+        message = f"{name} is not a name that Helm allows; use letters, digits, '-', '_' and '.'"
+        yield fault(place, message).within(path)
     for one in dependencies(folder, files):
         if not one.repository.startswith(_LOCAL):
             continue

@@ -200,5 +200,5 @@ def author_of(folder: Path) -> str:
     try:
         repo = Repository(str(folder))
         return str(repo.head.peel(Commit).author.name)
-    except (pygit2.GitError, KeyError, ValueError):
+    except (pygit2.GitError, LookupError, ValueError):  # also an encoding that nobody knows
         return ""

@@ -120,9 +120,12 @@ class Helm:
             return -1, "", f"Error: helm crashed, or took more than {limits}"
         if files[0].stat().st_size > _MOST_OUTPUT:
             return -1, "", f"Error: helm printed more than {_MOST_OUTPUT >> 20} MiB"
-        with files[1].open("rb") as err:
-            said = err.read(_MOST_LINT).decode("utf-8", "replace")
-        return code, files[0].read_text("utf-8", "replace"), said
+        texts = []
+        for file in files:
+            with file.open("rb") as opened:
+                text = opened.read(_MOST_OUTPUT).decode("utf-8", "replace")
+            texts.append(text.replace(f"{home.parent}/chart/", ""))
+        return code, texts[0], texts[1]
 
 
 def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:

@@ -156,12 +156,12 @@ def check(
             files, start, edited, author_of(folder)
         )
         faults, result = [*faults, *manual], replace(result, suggestions=suggestions)
+    ordered = sorted(dict.fromkeys(faults), key=lambda fault: fault.file)
     # an InvalidInput has only so many faults of one file
-    ordered = InvalidInput(sorted(dict.fromkeys(faults), key=lambda fault: fault.file)).faults
     return replace(
         result,
-        faults=tuple(with_lines(ordered, files.get)),
-        warnings=tuple(with_lines(result.warnings, files.get)),
+        faults=tuple(with_lines(InvalidInput(ordered).faults, files.get)),
+        warnings=tuple(with_lines(InvalidInput(result.warnings).faults, files.get)),
     )
 
 
