@@ -11,7 +11,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from demandops import strict_yaml
 from demandops.config.base_model import DnsLabel, faults_of, field_path, parse, parse_file
 from demandops.config.config import collection_of, place_of_collection
-from demandops.errors import Fault, InvalidInput, fault, suggestion
+from demandops.errors import MOST_FAULTS, Fault, InvalidInput, fault, suggestion
 
 Model = TypeVar("Model", bound=BaseModel)
 Valid = TypeVar("Valid")
@@ -150,7 +150,8 @@ class ConfigReader:
         if self.is_missing(known_in, name):
             where = place_of_collection(known_in, self.files_of(known_in))
             where = where.replace("inventory/", "")
-            known = suggestion(name, self._places[known_in])
+            few = len(self.faults) <= MOST_FAULTS  # further ones are only counted
+            known = suggestion(name, self._places[known_in]) if few else ""
             self.add_fault(file, field, f"'{name}' is not in {where}{known}")
 
     def _valid(
