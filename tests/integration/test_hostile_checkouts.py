@@ -11,6 +11,7 @@ import io
 import json
 import os
 import shutil
+import stat
 import sys
 import tarfile
 import tempfile
@@ -81,7 +82,8 @@ class Lab:
         for folder, folders, names in os.walk(self.top):
             for path in (Path(folder, name) for name in (*folders, *names)):
                 status = path.lstat()
-                content = path.read_bytes() if path.is_file() and status.st_size < 1 << 20 else b""
+                readable = stat.S_ISREG(status.st_mode) and status.st_size < 1 << 20
+                content = path.read_bytes() if readable else b""
                 changed = 0 if path == self.scratch else status.st_mtime_ns
                 found[str(path)] = (status.st_mode, status.st_nlink, changed, content)
         return found
@@ -137,15 +139,15 @@ def lab(
 
 
 def put(lab: Lab, path: str, text: str | bytes, mode: int = 0o644) -> None:
-    """Write a file of the checkout, unless another hostile step is in its way."""
+    """Write a file of the checkout, unless a link or file is in the way to it."""
     file = lab.checkout / path
-    try:
+    if any(each.is_symlink() for each in file.parents):
+        return
+    with suppress(OSError):
         file.parent.mkdir(parents=True, exist_ok=True)
         file.unlink(missing_ok=True)
         file.write_bytes(text.encode() if isinstance(text, str) else text)
         file.chmod(mode)
-    except OSError:
-        return
 
 
 def chart(lab: Lab, folder: str, **metadata: object) -> None:
@@ -153,11 +155,15 @@ def chart(lab: Lab, folder: str, **metadata: object) -> None:
     put(lab, f"{folder}/Chart.yaml", json.dumps(data))
 
 
-def clear(path: Path) -> None:
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)
+def put_other(lab: Lab, path: str, make: Callable[[Path], object]) -> None:
+    """Replace a file or folder of the checkout, unless a link is in the way to it."""
+    at = lab.checkout / path
+    if any(each.is_symlink() for each in at.parents) or not at.parent.is_dir():
+        return
+    if at.is_dir() and not at.is_symlink():
+        shutil.rmtree(at)
+    at.unlink(missing_ok=True)
+    make(at)
 
 
 # ---- what a hostile author does; each step takes a lab and a word ----
@@ -187,26 +193,18 @@ def names_a_folder(lab: Lab, word: str) -> None:
 
 def links(lab: Lab, word: str) -> None:
     for path in FOLDERS[len(word) % len(FOLDERS) :][:2]:
-        if (lab.checkout / path).parent.is_dir():
-            clear(lab.checkout / path)
-            (lab.checkout / path).symlink_to(word.replace("\0", "") or "..")
+        put_other(lab, path, lambda at: at.symlink_to(word.replace("\0", "") or ".."))
 
 
 def links_files(lab: Lab, word: str) -> None:
-    path = FILES[len(word) % len(FILES)]
-    if (lab.checkout / path).parent.is_dir():
-        clear(lab.checkout / path)
-        (lab.checkout / path).symlink_to(lab.top / "sentinel" / "secret")
-    if (lab.checkout / CHART).is_dir():
-        clear(lab.checkout / CHART / "hard")
-        (lab.checkout / CHART / "hard").hardlink_to(lab.top / "sentinel" / "Chart.yaml")
+    target = word * 9 if word.startswith("x") else lab.top / "sentinel" / "secret"
+    put_other(lab, FILES[len(word) % len(FILES)], lambda at: at.symlink_to(target))
+    hard = lab.top / "sentinel" / "Chart.yaml"
+    put_other(lab, f"{CHART}/hard", lambda at: at.hardlink_to(hard))
 
 
 def leaves_a_pipe(lab: Lab, word: str) -> None:
-    path = lab.checkout / FILES[len(word) % len(FILES)]
-    if path.parent.is_dir():
-        clear(path)
-        os.mkfifo(path)
+    put_other(lab, FILES[len(word) % len(FILES)], os.mkfifo)
 
 
 def packs_an_archive(lab: Lab, word: str) -> None:

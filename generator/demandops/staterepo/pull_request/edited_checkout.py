@@ -75,7 +75,7 @@ def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
         StateRepoError: the folder is not a checked-out state repo; or a file cannot be read; or the
             files are too many or too large.
     """
-    if not (folder / "demandops.yaml").is_file():
+    if not os.path.lexists(folder / "demandops.yaml"):  # is_file follows a link, and may fail
         if (folder / "HEAD").is_file():
             raise StateRepoError(
                 f"{folder} is a bare repository, which has no files to edit; clone it, and use the "
