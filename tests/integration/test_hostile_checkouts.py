@@ -19,6 +19,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import pygit2
 import pytest
 from demandops.cli.main import run
 from demandops.staterepo.pull_request.helm import HELM_BIN
@@ -30,6 +31,7 @@ from tests.kit import greedy_helm
 from tests.kit.chance import examples
 from tests.kit.cli import Ran
 from tests.kit.http import Server, serving
+from tests.kit.repo import git
 
 CHARTS = "appdefs/object-detection-fusion/charts"
 CHART = f"{CHARTS}/object-fusion"
@@ -431,6 +433,23 @@ def test_what_is_no_plain_file_is_refused(
 
     (line,) = told(add)
     assert line.startswith(f"{path}: ")
+
+
+def test_settings_that_are_a_link_to_nowhere(told: Callable[..., list[str]]) -> None:
+    lines = told(lambda lab: put_other(lab, "demandops.yaml", lambda at: at.symlink_to("x" * 999)))
+    assert [line for line in lines if line.startswith("demandops.yaml: is a symbolic link")]
+
+
+def test_an_author_in_an_unknown_encoding(lab: Callable[[], Lab]) -> None:
+    made = lab()
+    put(made, "bootstrap/c-its.yaml", "edited: true\n")
+    git(made.checkout, "add", "--all")
+    tree, head = git(made.checkout, "write-tree"), git(made.checkout, "rev-parse", "HEAD")
+    raw = f"tree {tree}\nparent {head}\nauthor \xff <a> 1 +0000\ncommitter \xff <a> 1 +0000\n"
+    objects = pygit2.Repository(str(made.checkout))
+    text = f"{raw}encoding none-such\n\nx\n".encode("latin-1")
+    objects.set_head(objects.odb.write(pygit2.enums.ObjectType.COMMIT, text))
+    assert made.check().code == 1
 
 
 def test_helm_gets_no_schema_and_the_schema_of_a_library_counts(
