@@ -105,31 +105,30 @@ def with_libraries(
     waiting: list[tuple[str, tuple[str, ...]]] = [("", (folder,))]
     for prefix, line in waiting:  # line: the chart, and libraries that each need the next
         here = line[-1]
-        metadata = f"{here}/Chart.yaml"
         for path in below(here, paths):
             found[prefix + path[len(here) + 1 :]] = path
             characters += len(files[path])
         libraries = {one.name: one for one in dependencies(here, files) if one.folder}
-        for name, library in libraries.items():
-            where = f"dependencies[{library.index}]"
-            place = f"{prefix}charts/{name}/"
-            found = {path: of for path, of in found.items() if not path.startswith(place)}
-            if library.folder in line:
-                circle = " → ".join((*line[line.index(library.folder) :], library.folder))
-                message = f"these charts need each other: {circle}; remove one of the dependencies"
-                raise InvalidInput.at(where, message, file=metadata)
-            waiting.append((place, (*line, str(library.folder))))
         if (
-            len(waiting) > _MOST_LIBRARIES
+            len(waiting) + len(libraries) > _MOST_LIBRARIES
             or len(found) > _MOST_FILES
             or characters > _MOST_CHARACTERS
         ):
             message = (
-                f"with its libraries, the chart has more than {_MOST_LIBRARIES} libraries, "
+                f"with its libraries, the chart has more than {_MOST_LIBRARIES} charts, "
                 f"{_MOST_FILES:,} files or {_MOST_CHARACTERS:,} characters, counting a library "
                 "once for each chart that needs it; take some out"
             )
             raise InvalidInput.at("dependencies", message, file=f"{folder}/Chart.yaml")
+        for name, library in libraries.items():
+            place = f"{prefix}charts/{name}/"
+            found = {path: of for path, of in found.items() if not f"{path}/".startswith(place)}
+            if library.folder in line:
+                circle = " → ".join((*line[line.index(library.folder) :], library.folder))
+                message = f"these charts need each other: {circle}; remove one of the dependencies"
+                where = f"dependencies[{library.index}]"
+                raise InvalidInput.at(where, message, file=f"{here}/Chart.yaml")
+            waiting.append((place, (*line, str(library.folder))))
         for one in dependencies(here, files):
             if not one.folder and f"{prefix}charts/{one.name}/Chart.yaml" not in found:
                 missing = missing or one.name

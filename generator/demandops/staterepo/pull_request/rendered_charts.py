@@ -221,6 +221,10 @@ class _Run:
             if one.optional or not isinstance(own, dict | None):
                 continue
             library = one.folder or f"{folder}/charts/{one.name}"
+            try:
+                chart_files.defaults(library, self._files)
+            except InvalidInput:  # YAML that only Helm reads, for example with anchors
+                continue
             inner = {"global": above.get("global", {}), **(own or {})}
             source = ChartSource.model_construct(version=one.version, folder=library)
             output_check.check_values(inner, source, config, f"{folder}/values.yaml")
