@@ -203,7 +203,7 @@ def closest(word: str, known: Iterable[str]) -> str | None:
 
     If many words are known, only some of them are compared, so a similar word may be missed.
     """
-    close = get_close_matches(word, _neighbors(word, sorted(known)), n=1)
+    close = get_close_matches(word, _neighbors(word, tuple(known)), n=1)
     return close[0] if close else None
 
 
@@ -218,8 +218,9 @@ def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
     Otherwise return ``; known: …`` with at most ``most`` known words. Return an empty string if no
     words are known.
     """
-    names = sorted(known)
-    close = closest(word, names)
+    words = tuple(known)
+    names = _orders(words)[0]
+    close = closest(word, words)
     if close:
         return f"; did you mean '{close}'?"
     if not names:
@@ -228,22 +229,23 @@ def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
     return f"; known: {listed}"
 
 
-def _neighbors(word: str, names: list[str]) -> list[str]:
+def _neighbors(word: str, names: tuple[str, ...]) -> list[str]:
     """Return the names that are worth comparing with a word.
 
     These are the word's neighbors in two orders: the alphabetical order, and the alphabetical order
     of the names read backwards. If there are few names, all are returned. To compare a word with
     thousands of names is slow, and one file or goal may have thousands of unknown words.
     """
+    forwards, backwards = _orders(names)
     if len(names) <= _COMPARED:
-        return names
-    at = bisect(names, word)
-    found = names[max(0, at - 3) : at + 3]
-    backwards = _backwards(tuple(names))
-    at = bisect(backwards, word[::-1])
-    return [*found, *(name[::-1] for name in backwards[max(0, at - 3) : at + 3])]
+        return forwards
+    found = []
+    for ordered, step in ((forwards, 1), (backwards, -1)):
+        at = bisect(ordered, word[::step])
+        found += [name[::step] for name in ordered[max(0, at - 3) : at + 3]]
+    return found
 
 
-@lru_cache(8)
-def _backwards(names: tuple[str, ...]) -> list[str]:
-    return sorted(name[::-1] for name in names)
+@lru_cache(maxsize=8)  # thousands of unknown words are looked for among the same names
+def _orders(names: tuple[str, ...]) -> tuple[list[str], list[str]]:
+    return sorted(names), sorted(name[::-1] for name in names)

@@ -9,7 +9,8 @@ from __future__ import annotations
 
 import posixpath
 import re
-from collections.abc import Iterator, Mapping
+from bisect import bisect_left
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -20,28 +21,45 @@ from demandops.quoting import quoted
 
 _LOCAL = "file://"
 _EXACT = re.compile(r"\d+\.\d+\.\d+")
+# Names become folders in charts/, so they have the characters that Helm allows, and no others.
+_NAME = re.compile(r"(?!\.{1,2}$)[A-Za-z0-9._-]{1,250}")
+
+_ARCHIVE = re.compile(r"(?i)(?:^|/)charts/[^/]+\.tgz$")
+# Charts of the examples have one library and fewer than 20 files. Libraries that depend twice on
+# the next library double the copies at each step.
+_MOST_LIBRARIES = 100
+_MOST_FILES = 5_000
+_MOST_CHARACTERS = 20_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class Dependency:
     """An entry of a chart's ``dependencies``.
 
-    ``index`` is the entry's place in the list. ``folder`` is the folder in ``appdefs/`` that
-    ``repository`` names, or None if it names no such folder. The folder may be missing in the state
-    repo. ``imports`` lists those names in the library's ``exports`` whose values the chart imports.
+    ``index`` is the entry's place in the list. ``name`` and ``alias`` are names as Helm allows
+    them, so they are safe in a path. ``folder`` is the folder in ``appdefs/`` that ``repository``
+    names, or None if it names no such folder. The folder may be missing in the state repo.
+    ``imports`` lists those names in the library's ``exports`` whose values the chart imports.
+    ``optional`` says that values decide whether the chart has the dependency.
     """
 
     index: int
     name: str
+    alias: str
     version: str
     repository: str
     folder: str | None
     imports: tuple[str, ...]
+    optional: bool
 
 
 def dependencies(folder: str, files: Mapping[str, str]) -> tuple[Dependency, ...]:
-    """Return the dependencies of a chart; empty if its ``Chart.yaml`` cannot be read."""
-    return _dependencies(folder, files.get(f"{folder}/Chart.yaml", ""))
+    """Return the dependencies of a chart; empty if its ``Chart.yaml`` cannot be read.
+
+    A dependency with a name that Helm does not allow is left out; :func:`faults` has a fault for
+    it.
+    """
+    return _metadata(folder, files.get(f"{folder}/Chart.yaml", ""))[0]
 
 
 def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
@@ -49,12 +67,83 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
 
     Only libraries with a :attr:`Dependency.folder` are included, even if the folder is missing.
     """
-    found = [folder]
-    for one in found:
-        for dependency in dependencies(one, files):
-            if dependency.folder and dependency.folder not in found:
-                found.append(dependency.folder)
+    found, waiting = {folder: None}, [folder]
+    for one in waiting:
+        needed = (each.folder for each in dependencies(one, files))
+        new = [each for each in dict.fromkeys(needed) if each and each not in found]
+        found |= dict.fromkeys(new)
+        waiting += new
+        if len(found) > _MOST_LIBRARIES:  # with_libraries refuses such a chart
+            break
     return tuple(found)
+
+
+def below(folder: str, paths: Sequence[str]) -> Sequence[str]:
+    """Return those of the sorted ``paths`` that are in a folder."""
+    return paths[bisect_left(paths, f"{folder}/") : bisect_left(paths, f"{folder}0")]
+
+
+def with_libraries(
+    folder: str, files: Mapping[str, str], paths: Sequence[str]
+) -> tuple[dict[str, str], str]:
+    """Return the files of a chart, with the files of its libraries in ``charts/``.
+
+    Args:
+        folder: the folder of the chart.
+        files: the files of the state repo, as path → text.
+        paths: the sorted paths of ``files``.
+
+    Returns:
+        The files as path in the chart → path in the state repo, and the name of a dependency that
+        is neither in the state repo nor in ``charts/``, or an empty text.
+
+    Raises:
+        InvalidInput: if libraries depend on each other in a circle, if the copies of libraries are
+            too many or too large, or if there is an archive in ``charts/``.
+    """
+    found, missing, characters = dict[str, str](), "", 0
+    waiting: list[tuple[str, tuple[str, ...]]] = [("", (folder,))]
+    for prefix, line in waiting:  # line: the chart, and libraries that each need the next
+        here = line[-1]
+        for path in below(here, paths):
+            found[prefix + path[len(here) + 1 :]] = path
+            characters += len(files[path])
+        libraries = {one.name: one for one in dependencies(here, files) if one.folder}
+        if (
+            len(waiting) + len(libraries) > _MOST_LIBRARIES
+            or len(found) > _MOST_FILES
+            or characters > _MOST_CHARACTERS
+        ):
+            message = (
+                f"with its libraries, the chart has more than {_MOST_LIBRARIES} charts, "
+                f"{_MOST_FILES:,} files or {_MOST_CHARACTERS:,} characters, counting a library "
+                "once for each chart that needs it; take some out"
+            )
+            raise InvalidInput.at("dependencies", message, file=f"{folder}/Chart.yaml")
+        for name, library in libraries.items():
+            place = f"{prefix}charts/{name}/"
+            found = {path: of for path, of in found.items() if not f"{path}/".startswith(place)}
+            if library.folder in line:
+                circle = " → ".join((*line[line.index(library.folder) :], library.folder))
+                message = f"these charts need each other: {circle}; remove one of the dependencies"
+                where = f"dependencies[{library.index}]"
+                raise InvalidInput.at(where, message, file=f"{here}/Chart.yaml")
+            waiting.append((place, (*line, str(library.folder))))
+        for one in dependencies(here, files):
+            if not one.folder and f"{prefix}charts/{one.name}/Chart.yaml" not in found:
+                missing = missing or one.name
+    archives = [
+        fault(
+            "",
+            "is an archive, which hides what the chart has; unpack it (`tar -xzf`) into a folder "
+            "of charts/, and remove it",
+        ).within(path)
+        for place, path in found.items()
+        if _ARCHIVE.search(place)
+    ]
+    if archives:
+        raise InvalidInput(archives)
+    return found, missing
 
 
 def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
@@ -108,11 +197,16 @@ def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
 
 
 def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield a fault for each library that is not in the folder which ``file://…`` names for it.
+    """Yield the faults in the metadata of a chart or library.
 
-    Also yield a fault if the chart requires an exact version and the library has another version.
-    Libraries with another kind of ``repository`` are not checked.
+    Such a fault is a name that Helm does not allow; a library that is not in the folder which
+    ``file://…`` names for it; and an exact version that is not the library's. Libraries with
+    another kind of ``repository`` are not checked.
     """
+    path = f"{folder}/Chart.yaml"
+    for place, name in _metadata(folder, files.get(path, ""))[1]:
+        message = f"{name} is not a name that Helm allows; use letters, digits, '-', '_' and '.'"
+        yield fault(place, message).within(path)
     for one in dependencies(folder, files):
         if not one.repository.startswith(_LOCAL):
             continue
@@ -140,21 +234,42 @@ def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
             yield fault(f"{place}.version", message).within(f"{folder}/Chart.yaml")
 
 
-@lru_cache(maxsize=256)
-def _dependencies(folder: str, text: str) -> tuple[Dependency, ...]:
-    listed = _mapping(text).get("dependencies")
-    return tuple(
-        Dependency(
-            index,
-            str(one.get("name")),
-            str(one.get("version")),
-            str(one.get("repository") or ""),
-            _local_folder(folder, str(one.get("repository") or "")),
-            _imports(one.get("import-values")),
+@lru_cache(maxsize=4096)
+def _metadata(folder: str, text: str) -> tuple[tuple[Dependency, ...], tuple[tuple[str, str], ...]]:
+    """Return the dependencies in a ``Chart.yaml``, and field and value of each wrong name."""
+    metadata = _mapping(text)
+    listed = metadata.get("dependencies")
+    found, wrong = list[Dependency](), list[tuple[str, str]]()
+    if not _is_name(metadata.get("name", "unnamed")):
+        wrong.append(("name", quoted(str(metadata["name"]))))
+    for index, one in enumerate(listed if isinstance(listed, list) else ()):
+        if not isinstance(one, dict):
+            continue
+        name, alias = one.get("name"), one.get("alias") or one.get("name")
+        names = {"name": name, "alias": alias}
+        bad = [field for field, value in names.items() if not _is_name(value)]
+        if bad:
+            value = quoted(str(names[bad[0]]))
+            wrong.append((f"dependencies[{index}].{bad[0]}", value))
+            continue
+        repository = str(one.get("repository") or "")
+        found.append(
+            Dependency(
+                index,
+                str(name),
+                str(alias),
+                str(one.get("version")),
+                repository,
+                _local_folder(folder, repository),
+                _imports(one.get("import-values")),
+                bool(one.get("condition") or one.get("tags")),
+            )
         )
-        for index, one in enumerate(listed if isinstance(listed, list) else ())
-        if isinstance(one, dict)
-    )
+    return tuple(found), tuple(wrong)
+
+
+def _is_name(value: object) -> bool:
+    return isinstance(value, str) and _NAME.fullmatch(value) is not None
 
 
 def _imports(listed: object) -> tuple[str, ...]:

@@ -54,9 +54,14 @@ class ValuesTask:
 
 @dataclass(frozen=True, slots=True)
 class SchemaTask:
-    """A ``values.schema.json`` that is checked by itself. The task has no values."""
+    """A chart's ``values.schema.json`` that is checked, with values that ``origin`` gives, if any.
+
+    The result is empty.
+    """
 
     file: str
+    values: Mapping[str, Any] | None = None
+    origin: str = ""
 
 
 Evaluate = Callable[[Mapping[str, str], ValuesTask | SchemaTask], dict[str, Any]]
@@ -70,6 +75,9 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
     """Return the values of a task, computed in this process and without limits."""
     if isinstance(task, SchemaTask):
         validator(files[task.file], task.file)
+        if task.values is not None:
+            chart = task.file.rpartition("/")[0]
+            _check(task.values, chart, files, task.origin, "the values")
         return {}
     lines = None
     try:
@@ -157,7 +165,7 @@ def _mapping(text: str, template: str) -> dict[str, Any]:
 
 
 def _check(
-    values: dict[str, Any], chart: str, files: Mapping[str, str], origin: str, author: str
+    values: Mapping[str, Any], chart: str, files: Mapping[str, str], origin: str, author: str
 ) -> None:
     """Raise InvalidInput if values do not match a chart's schema.
 

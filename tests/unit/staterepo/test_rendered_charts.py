@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 from demandops.render.trial_render import trial_releases
-from demandops.staterepo.pull_request.helm import Helm, Report
+from demandops.staterepo.pull_request.helm import Report
 from demandops.staterepo.pull_request.rendered_charts import _Run
 
 from tests.kit.config import edited
@@ -44,7 +42,7 @@ def test_what_to_do_about_a_kind(field: str, kind: tuple[str, str], remedy: str)
     )
     state = MemoryRepo(files).state
     release = next(one for found in trial_releases(state.config).values() for one in found)
-    run = _Run(Helm("helm", Path()), Path(), state)
+    run = _Run(None, state)
     (fault,) = run._refused(Report((kind,)), release)
     assert fault.message == (
         f"renders a {kind[1]}, which is not among the kinds of access domain 'perception', so the "

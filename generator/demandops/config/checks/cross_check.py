@@ -130,6 +130,10 @@ def _check_charts(config: Config, reader: ConfigReader) -> None:
         _check_chart(file, place, chart, config, reader)
         for channel, source in chart.channels.items():
             _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
+    tops = (source.folder for chart in config.charts.values() for source in chart.sources())
+    needed = (one for top in tops if top for one in chart_files.folders(top, config.files))
+    for folder in dict.fromkeys(needed):
+        reader.faults += chart_files.faults(folder, config.files)
 
 
 def _check_chart(
@@ -159,7 +163,6 @@ def _check_chart(
             if version is None
             else f"is {chart.version}, but {path} says {version}; make them equal",
         )
-    reader.faults += chart_files.faults(chart.folder, config.files)
 
 
 def _check_services(config: Config, reader: ConfigReader) -> None:

@@ -11,14 +11,14 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from itertools import groupby
+from itertools import groupby, islice
 
 from demandops.charts import chart_files
 from demandops.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.config.policy import AccessDomain, matches
 from demandops.connections.connection import Connection
 from demandops.demand.permission import PEERS, needed_access
-from demandops.errors import Fault, fault
+from demandops.errors import MOST_FAULTS, Fault, fault
 from demandops.ledger.operations.drain import Drain
 from demandops.ledger.world import World
 from demandops.plan.nodes.capacity import overcommitted, whole_usage
@@ -26,7 +26,7 @@ from demandops.plan.nodes.choice import lacks, requirement_of, unmet
 from demandops.plan.nodes.relocation import following_overrides, with_moves
 from demandops.quoting import quoted
 
-_KIND = re.compile(r"^kind:[ \t]*(?P<kind>[^#\n]*)", re.MULTILINE)
+_KIND = re.compile(r"kind:[ \t]*(?P<kind>[^#]*)")
 _PLAIN = re.compile(r"\"?([A-Z][A-Za-z0-9]*)\"?")
 _TEMPLATE = re.compile(r"(.*/)?templates/(?!tests/).*\.(ya?ml|tpl)")
 _MOST_NODES = 3
@@ -155,15 +155,19 @@ def _charts(config: Config) -> Iterator[Fault]:
     There is also a warning for each kind that cannot be read from the chart's files. Only charts
     and libraries in the state repo are read.
     """
+    paths = sorted(config.files)
     for folder, domains in sorted(_domains_of_charts(config).items()):
         yield from _dependencies(folder, config.files)
-        texts = {path: text for path, text in config.files.items() if path.startswith(f"{folder}/")}
-        for path in sorted(texts):
+        for path in chart_files.below(folder, paths):
             name = path.removeprefix(f"{folder}/")
             if _CRDS.fullmatch(name):
                 yield from _refused(path, None, "CustomResourceDefinition", domains, config)
             elif _TEMPLATE.fullmatch(name):
-                yield from _template(path, texts[path], domains, config)
+                template = _template(path, config.files[path], domains, config)
+                found = [*islice(template, MOST_FAULTS + 1)]
+                yield from found[:MOST_FAULTS]
+                if len(found) > MOST_FAULTS:
+                    yield Fault("more", "", "has more objects of such kinds", path)
 
 
 def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
@@ -189,8 +193,11 @@ def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
 
 
 def _template(path: str, text: str, domains: list[AccessDomain], config: Config) -> Iterator[Fault]:
-    for match in _KIND.finditer(text):
-        value, line = match["kind"].strip(), text.count("\n", 0, match.start()) + 1
+    for line, words in enumerate(text.split("\n"), start=1):
+        match = _KIND.match(words)
+        if match is None:
+            continue
+        value = match["kind"].strip()
         plain = _PLAIN.fullmatch(value)
         if plain:
             yield from _refused(path, line, plain[1], domains, config)

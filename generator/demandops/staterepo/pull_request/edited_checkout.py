@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,6 +28,10 @@ from demandops.staterepo.load import state_in_effect
 
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
+# A fleet of 20,000 nodes has fewer; more would fill the memory of the machine that checks.
+_MOST_BYTES = 16 << 20
+_MOST_BYTES_IN_ALL = 1 << 30
+_MOST_FILES = 500_000
 _SHALLOW = (
     "this clone is shallow and lacks the commit that the edit started from; fetch all commits: "
     "git fetch --unshallow origin (in a pipeline, set fetch-depth: 0 or GIT_DEPTH: 0)"
@@ -64,12 +69,16 @@ class Base:
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
-    """Return the state repo's files as path → text, and a fault for each symbolic link.
+    """Return the state repo's files as path → text, and a fault for each entry that is not read.
+
+    Only plain files inside of the folder are read: no links, devices or pipes, and nothing of a
+    repository in the repository. No other code of the check reads the checkout.
 
     Raises:
-        StateRepoError: the folder is not a checked-out state repo, or a file cannot be read.
+        StateRepoError: the folder is not a checked-out state repo; or a file cannot be read; or the
+            files are too many or too large.
     """
-    if not (folder / "demandops.yaml").is_file():
+    if not os.path.lexists(folder / "demandops.yaml"):  # is_file follows a link, and may fail
         if (folder / "HEAD").is_file():
             raise StateRepoError(
                 f"{folder} is a bare repository, which has no files to edit; clone it, and use the "
@@ -79,20 +88,46 @@ def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
             f"{folder} is not a state repo, because it has no demandops.yaml; name a checkout of "
             "one, or make one with `demandops init`"
         )
-    files, faults = dict[str, str](), list[Fault]()
-    for root in _ROOTS:
-        top = folder / root
-        for path in [top, *sorted(top.rglob("*"))]:
-            name = os.fsencode(path.relative_to(folder)).decode("utf-8", "backslashreplace")
-            if path.is_symlink():  # it may point to a file that the report must not show
-                message = "is a symbolic link, which is not followed; replace it by a file"
+    files, faults, size = dict[str, str](), list[Fault](), 0
+    waiting = [folder / root for root in reversed(_ROOTS)]
+    while waiting:
+        path = waiting.pop()
+        parts = path.relative_to(folder)
+        name = os.fsencode(parts).decode("utf-8", "backslashreplace")
+        try:
+            status = path.lstat()
+            if message := _refused(path.name, len(parts.parts), status):
                 faults.append(fault("", message).within(name))
-            elif path.is_file():
-                try:
-                    files[name] = path.read_bytes().decode("utf-8", "replace")
-                except OSError as error:
-                    raise StateRepoError(f"{path} cannot be read: {error.strerror}") from None
+            elif stat.S_ISDIR(status.st_mode):
+                waiting += sorted(path.iterdir(), reverse=True)
+            else:
+                files[name] = path.read_bytes().decode("utf-8", "replace")
+                size += status.st_size
+        except FileNotFoundError:  # one of _ROOTS
+            continue
+        except OSError as error:
+            raise StateRepoError(f"{path} cannot be read: {error.strerror}") from None
+        if size > _MOST_BYTES_IN_ALL or len(files) + len(waiting) > _MOST_FILES:
+            raise StateRepoError(
+                f"{folder} has more than {_MOST_FILES:,} files or {_MOST_BYTES_IN_ALL >> 20} MiB "
+                "to check; take some out"
+            )
     return files, faults
+
+
+def _refused(name: str, depth: int, status: os.stat_result) -> str:
+    """Return why an entry of a checkout is not read; empty if it is."""
+    if stat.S_ISLNK(status.st_mode):  # it may point to a file that the report must not show
+        return "is a symbolic link, which is not followed; replace it by a file"
+    if not (stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)):
+        return "is neither a file nor a folder; remove it"
+    if name.lower() == ".git":
+        return "belongs to another Git repository, whose files are not read; remove it"
+    if stat.S_ISDIR(status.st_mode):
+        deep = f"is more than {trees.MAX_DEPTH} folders deep; move it up"
+        return deep if depth > trees.MAX_DEPTH else ""
+    large = f"has more than {_MOST_BYTES >> 20} MiB; make it smaller"
+    return large if status.st_size > _MOST_BYTES else ""
 
 
 def base_of(folder: Path, revision: str | None) -> Base | None:
@@ -182,5 +217,5 @@ def author_of(folder: Path) -> str:
     try:
         repo = Repository(str(folder))
         return str(repo.head.peel(Commit).author.name)
-    except (pygit2.GitError, KeyError, ValueError):
+    except (pygit2.GitError, LookupError, ValueError):  # also an encoding that nobody knows
         return ""

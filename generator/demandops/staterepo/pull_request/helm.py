@@ -1,6 +1,8 @@
 """Runs ``helm`` on charts, and parses its output: kinds of rendered objects, or faults.
 
-Helm gets a home folder of its own, and has no access to a cluster or to chart repositories.
+The charts are those of a pull request, so their author may be hostile. Helm gets an empty home
+folder, no secrets of the environment, no access to a cluster or to chart repositories, limits of
+time, memory and output, and no network where the kernel allows that.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ import os
 import re
 import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,14 +19,22 @@ from pathlib import Path
 from demandops.errors import Fault, fault
 from demandops.quoting import quoted
 from demandops.staterepo.git import child_processes
+from demandops.staterepo.pull_request import confined
 
 HELM_BIN = "HELM_BIN"
 """The environment variable that names the program, instead of ``helm`` on ``PATH``."""
 
-_SECONDS = 120
+# helm renders a chart in a tenth of a second. The limit of processor time ends a chart that loops,
+# also on a busy machine; the other one ends a helm that waits.
+_CPU_SECONDS = 30
+_SECONDS = 300
+_MOST_OUTPUT = 16 << 20
+# Patterns search the text of a message, whose length is the author's choice.
+_MOST_MESSAGE = 4_000
+_MOST_LINT = 100_000
 _MOST = 400
-_API = re.compile(r"(?m)^apiVersion: *[\"']?([^\s\"']+)")
-_KIND = re.compile(r"(?m)^kind: *[\"']?([^\s\"']+)")
+_API = re.compile(r"(?m)^[\"']?apiVersion[\"']?\s*: *[\"']?([^\s\"']+)")
+_KIND = re.compile(r"(?m)^[\"']?kind[\"']?\s*: *[\"']?([^\s\"']+)")
 _LINT = re.compile(r"\[(?P<level>ERROR|WARNING)\] (?P<text>.*)")
 _PLACE = re.compile(
     r"(?P<path>[A-Za-z0-9][\w.-]*/(?:charts/[\w.-]+/)*templates/[\w./-]+?)(?::(?P<line>\d{1,9}))?(?=[:)\s])"
@@ -32,72 +43,96 @@ _PLACE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Helm's output for a chart: API group and kind of each rendered object; faults; warnings."""
+    """Helm's output for a chart: API group and kind of each rendered object; faults; warnings.
+
+    ``ended`` is False if helm was stopped because of its limits.
+    """
 
     kinds: tuple[tuple[str, str], ...] = ()
     faults: tuple[Fault, ...] = ()
     warnings: tuple[Fault, ...] = ()
+    ended: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class Helm:
-    """The installed program ``helm``, and a folder for its files."""
+    """The installed program ``helm``. Its ``home`` is a folder that holds nothing else."""
 
     program: str
-    home: Path
 
     @staticmethod
-    def find(home: Path) -> Helm | None:
+    def find() -> Helm | None:
         """Return the program that ``HELM_BIN`` names, or None if there is none.
 
-        If ``HELM_BIN`` is not set, return ``helm`` on ``PATH``. ``home`` is helm's home folder.
+        If ``HELM_BIN`` is not set, return ``helm`` on ``PATH``.
         """
         program = shutil.which(os.environ.get(HELM_BIN) or "helm")
-        return Helm(program, home) if program else None
+        return Helm(str(Path(program).absolute())) if program else None
 
-    def lint(self, chart: Path, values: Path) -> Report:
+    def lint(self, chart: Path, values: Path, home: Path) -> Report:
         """Return the faults and warnings of ``helm lint``."""
-        code, out, err = self._run("lint", str(chart), f"--values={values}")
-        found = parsed_lint(out, chart.name)
+        code, out, err = self._run(home, "lint", str(chart), f"--values={values}")
+        found = parsed_lint(out[:_MOST_LINT], chart.name)
         if code != 0 and not found.faults:
-            return Report(faults=(parsed_error(err or out, chart.name),))
+            return Report(faults=(parsed_error(err or out, chart.name),), ended=code > 0)
         return found
 
-    def template(self, chart: Path, values: Path, release: str, namespace: str) -> Report:
+    def template(
+        self, chart: Path, values: Path, home: Path, release: str, namespace: str
+    ) -> Report:
         """Render the chart for a release, and return the kinds of the objects, or a fault."""
         code, out, err = self._run(
+            home,
             *("template", release, str(chart), "--include-crds", "--skip-tests"),
             *(f"--namespace={namespace}", f"--values={values}"),
         )
         if code != 0:
-            return Report(faults=(parsed_error(err, chart.name),))
-        return Report(tuple(parsed_kinds(out)))
+            return Report(faults=(parsed_error(err, chart.name),), ended=code > 0)
+        return Report(tuple(dict.fromkeys(parsed_kinds(out))))
 
-    def _run(self, *arguments: str) -> tuple[int, str, str]:
+    def _run(self, home: Path, *arguments: str) -> tuple[int, str, str]:
+        """Return helm's exit code, output and errors; a negative code if it was stopped."""
+        home.mkdir(exist_ok=True)
         environment = {
             "PATH": os.environ.get("PATH", os.defpath),
-            "HOME": str(self.home),
+            "HOME": str(home),
+            "TMPDIR": str(home),
             "KUBECONFIG": os.devnull,
-            "HELM_PLUGINS": str(self.home / "plugins"),
+            "HELM_PLUGINS": str(home / "plugins"),
             **child_processes.mark(),
         }
-        try:
-            done = subprocess.run(
-                [self.program, *arguments],
-                env=environment,
-                capture_output=True,
-                check=False,
-                timeout=_SECONDS,
-            )
-        except subprocess.TimeoutExpired:
-            return 1, "", f"Error: helm did not end within {_SECONDS} s"
-        out, err = (text.decode("utf-8", "replace") for text in (done.stdout, done.stderr))
-        return done.returncode, out, err
+        command = [sys.executable, "-IS", confined.__file__, str(_CPU_SECONDS), self.program]
+        files = home / "out", home / "err"
+        with files[0].open("wb") as out, files[1].open("wb") as err:
+            try:
+                code = subprocess.run(
+                    [*command, *arguments],
+                    cwd=home,
+                    env=environment,
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=err,
+                    check=False,
+                    timeout=_SECONDS,
+                ).returncode
+            except subprocess.TimeoutExpired:
+                code = -1
+        if code not in (0, 1):  # a signal, or 2 from Go, for example if it gets no memory
+            limits = f"{_CPU_SECONDS} s or {confined.MEMORY >> 30} GiB"
+            return -1, "", f"Error: helm crashed, or took more than {limits}"
+        if files[0].stat().st_size > _MOST_OUTPUT:
+            return -1, "", f"Error: helm printed more than {_MOST_OUTPUT >> 20} MiB"
+        texts = []
+        for file in files:
+            with file.open("rb") as opened:
+                text = opened.read(_MOST_OUTPUT).decode("utf-8", "replace")
+            texts.append(text.replace(f"{home.parent}/chart/", ""))
+        return code, texts[0], texts[1]
 
 
 def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:
     """Yield API group and kind of each object that ``helm template`` printed."""
-    for document in re.split(r"(?m)^---$", out):
+    for document in re.split(r"(?m)^---(?=\s|$)", out):
         api, kind = _API.search(document), _KIND.search(document)
         if kind:
             yield api[1].rpartition("/")[0] if api else "", kind[1]
@@ -126,6 +161,7 @@ def parsed_error(err: str, chart: str) -> Fault:
 
 
 def _fault(text: str, chart: str) -> Fault:
+    text = text[:_MOST_MESSAGE]
     places = [*_PLACE.finditer(text)]
     place = places[-1] if places else None
     file = place["path"] if place else chart

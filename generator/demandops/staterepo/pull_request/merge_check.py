@@ -131,7 +131,6 @@ def check(
             new if start is None else start.releases(), new, edit.before_merge(wanted), wanted
         )
         charts = rendered_charts.render_charts(
-            folder,
             state,
             edit.changed if start else None,
             {each.path for each in preview.files},
@@ -159,10 +158,11 @@ def check(
         )
         faults, result = [*faults, *manual], replace(result, suggestions=suggestions)
     ordered = sorted(dict.fromkeys(faults), key=lambda fault: fault.file)
+    # an InvalidInput has only so many faults of one file
     return replace(
         result,
-        faults=tuple(with_lines(ordered, files.get)),
-        warnings=tuple(with_lines(result.warnings, files.get)),
+        faults=tuple(with_lines(InvalidInput(ordered).faults, files.get)),
+        warnings=tuple(with_lines(InvalidInput(result.warnings).faults, files.get)),
     )
 
 
@@ -318,12 +318,12 @@ class _Edit:
         edited = self.changed
         for folder, (name, source) in sorted(sources.items()):
             metadata = f"{folder}/Chart.yaml"
-            prefixes = tuple(f"{one}/" for one in chart_files.folders(folder, self.files))
-            changed = [path for path in edited if path.startswith(prefixes)]
+            folders = chart_files.folders(folder, self.files)
+            changed = sorted(path for one in folders for path in chart_files.below(one, edited))
             if not changed or metadata not in self.before:
                 continue
             if _version(self.before[metadata]) == source.version:
-                first = changed[0].removeprefix(prefixes[0])
+                first = changed[0].removeprefix(f"{folder}/")
                 yield fault(
                     "version",
                     f"is still {source.version}, but {first} changed; raise the version here and "

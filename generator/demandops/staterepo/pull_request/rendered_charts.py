@@ -4,17 +4,21 @@ The charts of each application are also rendered for an example demand. The kind
 objects are compared with those that the access domain allows. If an edit does not change a chart,
 the chart is rendered only for the examples, and for the releases whose files the edit changes.
 Charts in a registry are not rendered.
+
+Helm sees no file of the checkout. For each chart, the texts that the check has read are written
+into a temporary folder, under the names that they have in the chart. Schemas are left out, because
+helm would fetch what a schema refers to; the generator's own validator checks them.
 """
 
 from __future__ import annotations
 
 import json
-import shutil
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from demandops.charts import chart_files
 from demandops.config.config import DOMAINS_FILE, Config
@@ -22,10 +26,12 @@ from demandops.config.policy import matches
 from demandops.decision import State
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.plan.release import ServiceRelease
+from demandops.quoting import quoted
 from demandops.render.changes import merge_preview
 from demandops.render.gitops.paths import path_of
 from demandops.render.helm_values import values_of
 from demandops.render.trial_render import trial_releases
+from demandops.runtime import REAL
 from demandops.staterepo.pull_request.helm import HELM_BIN, Helm, Report
 from demandops.templating.values import SchemaTask
 
@@ -34,6 +40,8 @@ NO_HELM = (
     f"charts not rendered: {MISSING}; install it and name it in {HELM_BIN}, or put it on PATH and "
     f"leave {HELM_BIN} unset"
 )
+_SCHEMA = "values.schema.json"
+_MOST_SECONDS = 1800  # 5,000 releases take about 1,000 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,72 +63,66 @@ class RenderedCharts:
 
 
 def render_charts(
-    folder: Path, state: State, changed: Collection[str] | None, wanted: Collection[str]
+    state: State, changed: Collection[str] | None, wanted: Collection[str]
 ) -> RenderedCharts:
     """Lint and render the charts of a checkout, and return the result.
 
     Args:
-        folder: the checkout, whose configuration must be valid.
-        state: the state after the merge.
+        state: the state after the merge, with the files of the checkout.
         changed: the paths that the pull request changes, or None if they are unknown.
         wanted: the paths of the generated files that will change because of the merge.
     """
     config = state.config
-    used = {service.chart for services in config.services.values() for service in services.values()}
-    with TemporaryDirectory(prefix="demandops-helm-") as scratch:
-        helm = Helm.find(Path(scratch))
-        if helm is None:
-            return RenderedCharts(not_rendered=dict.fromkeys(sorted(used), MISSING))
-        if (folder / "appdefs").is_dir():
-            shutil.copytree(folder / "appdefs", Path(scratch, "appdefs"), ignore=_links)
-        run = _Run(helm, Path(scratch), state)
-        for release in merge_preview.planned_releases(state).values():
-            if isinstance(release, ServiceRelease) and _concerned(release, config, changed, wanted):
-                run.render(release)
-        for release in (one for found in trial_releases(config).values() for one in found):
-            run.render(release, example=True)
-        return run.result()
+    by_folder: dict[str | None, list[tuple[ServiceRelease, bool]]] = {}
+    for release in merge_preview.planned_releases(state).values():
+        if isinstance(release, ServiceRelease):
+            by_folder.setdefault(release.chart.folder, []).append((release, False))
+    for folder, pairs in by_folder.items():
+        if not _concerned(folder, config, changed):
+            by_folder[folder] = [pair for pair in pairs if path_of(pair[0]) in wanted]
+    for release in (one for found in trial_releases(config).values() for one in found):
+        by_folder.setdefault(release.chart.folder, []).append((release, True))
+    run = _Run(Helm.find(), state)
+    for folder, pairs in by_folder.items():
+        if pairs:
+            run.render(folder, pairs)
+    return run.result()
 
 
-def _links(folder: str, names: list[str]) -> list[str]:
-    """Return the names of the symbolic links in a folder.
-
-    They must not be copied, because helm would follow them out of the checkout.
-    """
-    return [name for name in names if Path(folder, name).is_symlink()]
-
-
-def _concerned(
-    release: ServiceRelease,
-    config: Config,
-    changed: Collection[str] | None,
-    wanted: Collection[str],
-) -> bool:
-    """Return whether a release must be rendered, because an edit could affect its objects.
+def _concerned(folder: str | None, config: Config, changed: Collection[str] | None) -> bool:
+    """Return whether an edit could affect the objects of all releases of a chart.
 
     This is also true if the changed paths are unknown, and for charts in a registry, which are then
     reported as not rendered.
     """
-    if changed is None or not release.chart.folder or path_of(release) in wanted:
+    if changed is None or not folder:
         return True
-    prefixes = tuple(f"{one}/" for one in chart_files.folders(release.chart.folder, config.files))
-    return any(path.startswith(prefixes) for path in changed)
+    edited = sorted(changed)
+    return any(
+        chart_files.below(each, edited) for each in chart_files.folders(folder, config.files)
+    )
 
 
 class _Run:
-    """Runs helm in a scratch folder with a copy of ``appdefs/``, and collects the results."""
+    """Runs helm on one chart after the other, and collects the results."""
 
-    def __init__(self, helm: Helm, scratch: Path, state: State) -> None:
-        self._helm, self._scratch, self._state = helm, scratch, state
+    def __init__(self, helm: Helm | None, state: State) -> None:
+        self._helm, self._state = helm, state
         self._files = state.config.files
-        self._sound: dict[str, bool] = {}
-        self._rendered: dict[str, set[str]] = {}
+        self._paths = sorted(self._files)
+        self._end = REAL.monotonic() + _MOST_SECONDS
+        self._rendered: set[str] = set()
         self._counts: Counter[bool] = Counter()
         self._not_rendered: dict[str, str] = {}
         self._faults: dict[Fault, None] = {}
         self._warnings: dict[Fault, None] = {}
 
     def result(self) -> RenderedCharts:
+        if self._helm is None:
+            services = (
+                one for found in self._state.config.services.values() for one in found.values()
+            )
+            self._not_rendered = dict.fromkeys((one.chart for one in services), MISSING)
         return RenderedCharts(
             tuple(sorted(self._rendered)),
             self._counts[False],
@@ -130,93 +132,116 @@ class _Run:
             tuple(self._warnings),
         )
 
-    def render(self, release: ServiceRelease, *, example: bool = False) -> None:
-        """Render the chart of a release or an example; lint each chart once, before it renders."""
-        name, folder = release.service.chart, release.chart.folder
+    def render(self, folder: str | None, releases: Sequence[tuple[ServiceRelease, bool]]) -> None:
+        """Lint a chart, and render it for releases; the truth value says that it is an example."""
+        names = dict.fromkeys(release.service.chart for release, _ in releases)
         if folder is None:
-            self._not_rendered[name] = "it is in a registry"
+            self._not_rendered |= dict.fromkeys(names, "it is in a registry")
             return
         try:
-            values = json.dumps(values_of(release, self._state.config, self._state.evaluate))
-        except InvalidInput:  # only if an override holds the release's file, with older values
+            files, missing = chart_files.with_libraries(folder, self._files, self._paths)
+            for place, path in files.items():
+                if place.rpartition("/")[2] == _SCHEMA:
+                    self._state.evaluate(self._files, SchemaTask(path))
+        except InvalidInput as error:
+            self._faults |= dict.fromkeys(error.faults)
             return
-        if folder not in self._sound:
-            self._sound[folder] = self._prepare(name, folder) and self._lint(folder, values)
-        if not self._sound[folder]:
+        if missing:
+            reason = f"its dependency {missing} is not in charts/"
+            self._not_rendered |= dict.fromkeys(names, reason)
+        elif self._helm:
+            with TemporaryDirectory(prefix="demandops-helm-") as scratch:
+                self._render(self._helm, Path(scratch), folder, files, releases)
+
+    def _render(
+        self,
+        helm: Helm,
+        scratch: Path,
+        folder: str,
+        files: Mapping[str, str],
+        releases: Sequence[tuple[ServiceRelease, bool]],
+    ) -> None:
+        home, file = scratch / "home", scratch / "values.json"
+        chart = scratch / "chart" / folder.rpartition("/")[2]
+        try:
+            for place, path in files.items():
+                if place.rpartition("/")[2] != _SCHEMA:
+                    (chart / place).parent.mkdir(parents=True, exist_ok=True)
+                    (chart / place).write_bytes(self._files[path].encode())
+        except OSError as error:
+            message = (
+                f"{quoted(place)} cannot be written into a temporary folder for helm: "
+                f"{error.strerror}; rename it, or make room there"
+            )
+            self._faults[fault("", message).within(folder)] = None
             return
-        seen = self._rendered.setdefault(name, set())
-        if f"{release.name} {values}" in seen:
-            return
-        seen.add(f"{release.name} {values}")
-        self._counts[example] += 1
-        report = self._helm.template(
-            self._scratch / folder, self._file(values), release.name, release.domain.namespace
-        )
-        self._add(report, folder)
-        if not example or self._may_run(release):
-            self._faults.update(dict.fromkeys(self._refused(report, release)))
+        linted, seen = False, set[str]()
+        for release, example in releases:
+            try:
+                data = values_of(release, self._state.config, self._state.evaluate)
+            except InvalidInput:  # only if an override holds the release's file, with older values
+                continue
+            text = json.dumps(data)
+            if f"{release.name} {text}" in seen:
+                continue
+            seen.add(f"{release.name} {text}")
+            if REAL.monotonic() > self._end:
+                message = f"is not rendered, because helm took more than {_MOST_SECONDS} s in all"
+                self._faults[fault("", f"{message}; make it simpler").within(folder)] = None
+                return
+            try:
+                self._check_libraries(folder, data)
+            except InvalidInput as error:
+                self._faults |= dict.fromkeys(error.faults)
+                return
+            file.write_text(text)
+            if not linted:
+                linted = True
+                report = helm.lint(chart, file, home)
+                self._add(report, folder, files)
+                if report.faults:
+                    return
+            self._rendered.add(release.service.chart)
+            self._counts[example] += 1
+            namespace = release.domain.namespace
+            report = helm.template(chart, file, home, release.name, namespace)
+            self._add(report, folder, files)
+            if not report.ended:
+                return
+            if not example or self._may_run(release):
+                self._faults |= dict.fromkeys(self._refused(report, release))
 
-    def _prepare(self, name: str, folder: str) -> bool:
-        """Check a chart's schemas, and copy its libraries into the chart's folder.
-
-        Return whether helm may render the chart.
-        """
-        for path in chart_files.folders(folder, self._files):
-            for schema in (one for one in self._files if one.startswith(f"{path}/")):
-                if schema.endswith("/values.schema.json"):
-                    try:
-                        self._state.evaluate(self._files, SchemaTask(schema))
-                    except InvalidInput as error:  # helm would fetch what a schema refers to
-                        self._faults.update(dict.fromkeys(error.faults))
-                        return False
-        if reason := self._place_libraries(folder):
-            self._not_rendered[name] = reason
-        return not reason
-
-    def _place_libraries(self, folder: str) -> str:
-        """Copy a chart's libraries into its folder ``charts/``.
-
-        Return the reason why a library cannot be copied, or an empty text.
-        """
+    def _check_libraries(self, folder: str, values: Mapping[str, Any]) -> None:
+        """Check the values of the charts in ``charts/`` against their schemas, as Helm does."""
+        above = chart_files.merged(chart_files.defaults(folder, self._files), values)
         for one in chart_files.dependencies(folder, self._files):
-            target = self._scratch / folder / "charts" / one.name
+            own = above.get(one.alias)
+            if one.optional or not isinstance(own, dict | None):
+                continue
+            library = one.folder or f"{folder}/charts/{one.name}"
+            try:
+                chart_files.defaults(library, self._files)
+            except InvalidInput:  # YAML that only Helm reads, for example with anchors
+                continue
+            inner = {"global": above.get("global", {}), **(own or {})}
+            schema = f"{library}/{_SCHEMA}"
+            if schema in self._files:
+                self._state.evaluate(
+                    self._files, SchemaTask(schema, inner, f"{folder}/values.yaml")
+                )
             if one.folder:
-                if reason := self._place_libraries(one.folder):
-                    return reason
-                shutil.rmtree(target, ignore_errors=True)
-                shutil.copytree(self._scratch / one.folder, target)
-            elif not target.exists() and not [*target.parent.glob(f"{one.name}-*.tgz")]:
-                return f"its dependency {one.name} is not in charts/"
-        return ""
+                self._check_libraries(library, inner)
 
-    def _lint(self, folder: str, values: str) -> bool:
-        report = self._helm.lint(self._scratch / folder, self._file(values))
-        self._add(report, folder)
-        return not report.faults
-
-    def _file(self, values: str) -> Path:
-        file = self._scratch / "values.json"
-        file.write_text(values)
-        return file
-
-    def _add(self, report: Report, folder: str) -> None:
+    def _add(self, report: Report, folder: str, files: Mapping[str, str]) -> None:
         """Add the faults and warnings of a report to the result.
 
-        A path in the report starts with the name of the chart's folder. In the result, the path
-        starts at the top of the checkout.
+        A path in the report starts with the name of the chart. In the result, the path is that of
+        the file in the state repo.
         """
-        above = folder.rpartition("/")[0]
-        libraries = {
-            f"{folder}/charts/{one.name}": one.folder
-            for one in chart_files.dependencies(folder, self._files)
-            if one.folder
-        }
         for found, into in ((report.faults, self._faults), (report.warnings, self._warnings)):
             for one in found:
-                path = f"{above}/{one.file}" if one.file else folder
-                for place, library in libraries.items():
-                    path = path.replace(f"{place}/", f"{library}/")
-                into[one.within(path)] = None
+                place = one.file.partition("/")[2]
+                into[one.within(files.get(place, f"{folder}/{place}".rstrip("/")))] = None
 
     def _may_run(self, release: ServiceRelease) -> bool:
         """Return whether the domain's rules allow an application that has the release's service.

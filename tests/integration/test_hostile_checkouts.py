@@ -1,0 +1,476 @@
+"""`demandops check` on checkouts whose author is hostile.
+
+It writes nothing outside its own temporary folder, fetches nothing, runs nothing of the author's,
+and ends with a verdict. The helm of these tests is a stand-in that is greedier than any helm; the
+real one is used too if the rig of the end-to-end tests has built it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shutil
+import stat
+import sys
+import tarfile
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+
+import pygit2
+import pytest
+from demandops.cli.main import run
+from demandops.staterepo.pull_request.helm import HELM_BIN
+from hypothesis import given
+from hypothesis import strategies as st
+
+from tests.e2e.rig import tools
+from tests.kit import greedy_helm
+from tests.kit.chance import examples
+from tests.kit.cli import Ran
+from tests.kit.http import Server, serving
+from tests.kit.repo import git
+
+CHARTS = "appdefs/object-detection-fusion/charts"
+CHART = f"{CHARTS}/object-fusion"
+LIBRARY = "appdefs/charts/ros-service"
+FILES = [
+    f"{CHART}/Chart.yaml",
+    f"{CHART}/values.yaml",
+    f"{CHART}/templates/service.yaml",
+    f"{LIBRARY}/Chart.yaml",
+    f"{LIBRARY}/values.schema.json",
+    "appdefs/object-detection-fusion/appdef.yaml",
+    "registry/charts.yaml",
+    "inventory/nodes.yaml",
+    "demandops.yaml",
+]
+FOLDERS = [
+    "appdefs",
+    LIBRARY,
+    CHART,
+    f"{CHART}/charts",
+    f"{CHART}/templates",
+    "ledger",
+    "overrides",
+]
+Picture = dict[str, tuple[object, ...]]
+
+
+class Lab:
+    """A folder with a checkout, a temporary folder, a home folder, and files to protect."""
+
+    def __init__(self, top: Path, url: str, capture: pytest.CaptureFixture[str]) -> None:
+        self.top, self.url, self.capture = top, url, capture
+        self.checkout, self.scratch = top / "checkout", top / "scratch"
+
+    def check(self) -> Ran:
+        """Check the checkout, and assert that everything else is as it was."""
+        before = self._picture()
+        ran = self._run()
+        assert ran.code in (0, 1), ran
+        assert "demandops itself" not in ran.err
+        assert "Traceback" not in ran.out + ran.err
+        assert "GREEDY" not in ran.out + ran.err
+        assert "hunter2" not in ran.out + ran.err
+        assert self._picture() == before
+        assert [*self.scratch.iterdir()] == []
+        return ran
+
+    def _picture(self) -> Picture:
+        found: Picture = {}
+        for folder, folders, names in os.walk(self.top):
+            for path in (Path(folder, name) for name in (*folders, *names)):
+                status = path.lstat()
+                readable = stat.S_ISREG(status.st_mode) and status.st_size < 1 << 20
+                content = path.read_bytes() if readable else b""
+                changed = 0 if path == self.scratch else status.st_mtime_ns
+                found[str(path)] = (status.st_mode, status.st_nlink, changed, content)
+        return found
+
+    def _run(self) -> Ran:
+        self.capture.readouterr()
+        code = run(["check", str(self.checkout), "--require-helm"])
+        return Ran(code, *self.capture.readouterr())
+
+
+@pytest.fixture(scope="session")
+def server() -> Iterator[Server]:
+    with serving() as started:
+        yield started
+
+
+@pytest.fixture
+def lab(
+    request: pytest.FixtureRequest,
+    _checkout_template: Path,
+    tmp_path: Path,
+    server: Server,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Callable[[], Lab]:
+    """Return a function that sets a lab up anew."""
+    program = tmp_path / "helm"
+    if getattr(request, "param", "greedy") == "real":
+        built = [*tools.cache_root().glob("helm-*/helm")]
+        if not built:
+            pytest.skip("the rig of the end-to-end tests has not built helm")
+        program = built[0]
+    else:
+        program.write_text(f"#!{sys.executable} -IS\n" + Path(greedy_helm.__file__).read_text())
+        program.chmod(0o755)
+    monkeypatch.setenv(HELM_BIN, str(program))
+    monkeypatch.setenv("A_SECRET", "hunter2")
+
+    def made() -> Lab:
+        top = tmp_path / "top"
+        shutil.rmtree(top, ignore_errors=True)
+        lab = Lab(top, server.url, capsys)
+        shutil.copytree(_checkout_template, lab.checkout)
+        for folder in (lab.scratch, top / "home", top / "sentinel"):
+            folder.mkdir()
+        (top / "sentinel" / "secret").write_text("hunter2\n")
+        (top / "sentinel" / "Chart.yaml").write_text("name: hunter2\nversion: 1.0.0\n")
+        monkeypatch.setenv("HOME", str(top / "home"))
+        monkeypatch.setattr(tempfile, "tempdir", str(lab.scratch))
+        return lab
+
+    return made
+
+
+def put(lab: Lab, path: str, text: str | bytes, mode: int = 0o644) -> None:
+    """Write a file of the checkout, unless a link or file is in the way to it."""
+    file = lab.checkout / path
+    if any(each.is_symlink() for each in file.parents):
+        return
+    with suppress(OSError):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.unlink(missing_ok=True)
+        file.write_bytes(text.encode() if isinstance(text, str) else text)
+        file.chmod(mode)
+
+
+def chart(lab: Lab, folder: str, **metadata: object) -> None:
+    data = {"apiVersion": "v2", "name": folder.rpartition("/")[2], "version": "0.1.0", **metadata}
+    put(lab, f"{folder}/Chart.yaml", json.dumps(data))
+
+
+def put_other(lab: Lab, path: str, make: Callable[[Path], object]) -> None:
+    """Replace a file or folder of the checkout, unless a link is in the way to it."""
+    at = lab.checkout / path
+    if any(each.is_symlink() for each in at.parents) or not at.parent.is_dir():
+        return
+    if at.is_dir() and not at.is_symlink():
+        shutil.rmtree(at)
+    at.unlink(missing_ok=True)
+    make(at)
+
+
+# ---- what a hostile author does; each step takes a lab and a word ----
+
+
+def names_a_dependency(lab: Lab, word: str) -> None:
+    local = "file://../../../charts/ros-service"
+    chart(lab, CHART, dependencies=[{"name": word, "version": "1.0.0", "repository": local}])
+
+
+def names_an_alias(lab: Lab, word: str) -> None:
+    local = {"name": "ros-service", "repository": "file://../../../charts/ros-service"}
+    chart(lab, CHART, name=word, dependencies=[{**local, "alias": word, "import-values": [word]}])
+
+
+def names_a_repository(lab: Lab, word: str) -> None:
+    for repository in (word, f"file://{word}"):
+        chart(lab, CHART, dependencies=[{"name": "ros-service", "repository": repository}])
+
+
+def names_a_folder(lab: Lab, word: str) -> None:
+    file = lab.checkout / "registry" / "charts.yaml"
+    if file.is_file() and not file.is_symlink():
+        text = file.read_text().replace(f"folder: {CHART}", f"folder: {json.dumps(word)}")
+        put(lab, "registry/charts.yaml", text)
+
+
+def links(lab: Lab, word: str) -> None:
+    for path in FOLDERS[len(word) % len(FOLDERS) :][:2]:
+        put_other(lab, path, lambda at: at.symlink_to(word.replace("\0", "") or ".."))
+
+
+def links_files(lab: Lab, word: str) -> None:
+    target = word * 9 if word.startswith("x") else lab.top / "sentinel" / "secret"
+    put_other(lab, FILES[len(word) % len(FILES)], lambda at: at.symlink_to(target))
+    hard = lab.top / "sentinel" / "Chart.yaml"
+    put_other(lab, f"{CHART}/hard", lambda at: at.hardlink_to(hard))
+
+
+def leaves_a_pipe(lab: Lab, word: str) -> None:
+    put_other(lab, FILES[len(word) % len(FILES)], os.mkfifo)
+
+
+def packs_an_archive(lab: Lab, word: str) -> None:
+    packed = io.BytesIO()
+    with tarfile.open(fileobj=packed, mode="w:gz") as archive:
+        for name in ("part/Chart.yaml", "part/values.schema.json", word, f"../../../{word}"):
+            text = json.dumps({"name": "part", "version": "0.1.0", "$ref": f"{lab.url}/x"}).encode()
+            entry = tarfile.TarInfo(name.replace("\0", "") or "x")
+            entry.size, entry.mode = len(text), 0o755
+            archive.addfile(entry, io.BytesIO(text))
+    for folder in (f"{CHART}/charts", f"{LIBRARY}/charts", f"{CHART}/charts/part/charts"):
+        put(lab, f"{folder}/part-0.1.0.tgz", packed.getvalue())
+
+
+def refers_elsewhere(lab: Lab, word: str) -> None:
+    targets = [f"{lab.url}/schema", f"file://{lab.top}/sentinel/secret", word]
+    schema = {"$ref": targets[len(word) % 3], "$schema": targets[(len(word) + 1) % 3]}
+    text = json.dumps({"$id": f"{lab.url}/id/", **schema, "allOf": [{"$ref": "other"}]})
+    for folder in (CHART, LIBRARY, f"{CHART}/charts/part"):
+        put(lab, f"{folder}/values.schema.json", text)
+    chart(lab, f"{CHART}/charts/part")
+
+
+def makes_a_circle(lab: Lab, word: str) -> None:
+    for each, other in (("a", "b"), ("b", "c"), ("c", "a")):
+        needed = {"name": other, "repository": f"file://../{other}", "alias": word or other}
+        chart(lab, f"{CHARTS}/{each}", dependencies=[needed])
+    chart(lab, CHART, dependencies=[{"name": "a", "repository": "file://../a"}])
+    chart(
+        lab,
+        f"{CHART}/charts/self",
+        dependencies=[{"name": "self", "repository": "file://../.."}],
+    )
+
+
+def doubles(lab: Lab, word: str) -> None:
+    for number in range(30):
+        repository = f"file://../l{number + 1}"
+        twice = [{"name": name, "repository": repository} for name in ("x", "y")]
+        chart(lab, f"{CHARTS}/l{number}", dependencies=twice if number < 29 else [])
+    chart(lab, CHART, dependencies=[{"name": "l0", "repository": "file://../l0"}])
+
+
+def nests_git(lab: Lab, word: str) -> None:
+    touch = f"touch {lab.top}/ran"
+    put(lab, ".gitattributes", "* filter=x diff=x textconv=x\n")
+    put(lab, ".gitmodules", f'[submodule "x"]\n\tpath = {word}\n\turl = {lab.url}\n')
+    for folder in (CHART, "overrides", "ledger"):
+        put(lab, f"{folder}/.git/config", f"[core]\n\tfsmonitor = {touch}\n\thooksPath = ../x\n")
+        put(lab, f"{folder}/.gitattributes", "* filter=x\n")
+    put(lab, f"{CHART}/.helmignore", f"{word}\n!**\n")
+    put(lab, f"{CHART}/templates/run.sh", f"#!/bin/sh\n{touch}\n", 0o755)
+
+
+def digs(lab: Lab, word: str) -> None:
+    put(lab, f"{CHART}/{'d/' * 300}x", word)
+    put(lab, f"{CHART}/charts/{'charts/a/' * 20}Chart.yaml", "name: a")
+    for name in (b"\xff" * 250, b"a\nb", b"a\\b", b"\xe2\x80\xae.yaml", b"~", b"x" * 255):
+        put(lab, f"{CHART}/templates/{os.fsdecode(name)}", word)
+    with suppress(OSError), (lab.checkout / CHART / "huge").open("wb") as file:
+        file.truncate(1 << 40)
+
+
+def writes_odd_metadata(lab: Lab, word: str) -> None:
+    texts = ["[]", "x", f"name: {'[' * 90}", "version: 1", "\0", "dependencies: {a: [1]}"]
+    texts += [f"dependencies: [{json.dumps(word)}, null, [], {{name: 7}}, {{name: {{}}}}]"]
+    put(lab, FILES[len(word) % len(FILES)], texts[len(word) % len(texts)])
+
+
+def writes_hostile_templates(lab: Lab, word: str) -> None:
+    text = (
+        f'{{{{ .Files.Get "../../../../../../sentinel/secret" }}}}{{{{ getHostByName "{word}" }}}}'
+        '{{ lookup "v1" "Secret" "" "" }}{{ (.Files.Glob "/**").AsSecrets }}'
+        '{{ fail "templates/x:9" }}'
+    )
+    put(lab, f"{CHART}/templates/{len(word)}.yaml", text)
+    put(lab, f"{CHART}/crds/{len(word)}.yaml", word)
+
+
+STEPS = [
+    names_a_dependency,
+    names_an_alias,
+    names_a_repository,
+    names_a_folder,
+    links,
+    links_files,
+    leaves_a_pipe,
+    packs_an_archive,
+    refers_elsewhere,
+    makes_a_circle,
+    doubles,
+    nests_git,
+    digs,
+    writes_odd_metadata,
+    writes_hostile_templates,
+]
+WORDS = st.sampled_from(
+    [
+        "../../..",
+        "../../../../../../sentinel",
+        "../../../../../..",
+        "/etc",
+        "/",
+        "/dev/zero",
+        "/proc/self",
+        ".",
+        "..",
+        "",
+        "a\0b",
+        "a/b",
+        "..\\..",
+        "-x",
+        "--post-renderer=/bin/sh",
+        "~",
+        "null",
+        "x" * 300,
+        "Ros-Service",
+        "oci://127.0.0.1:1/x",
+        "http://127.0.0.1:1/x",
+        "appdefs/./charts",
+        "appdefs",
+        "\u202e",
+        "{{ .Values }}",
+    ]
+)
+
+
+@pytest.mark.parametrize("lab", ["greedy", "real"], indirect=True)
+@examples(25)
+@given(st.lists(st.tuples(st.sampled_from(STEPS), WORDS), min_size=1, max_size=4))
+def test_check_leaves_everything_around_it_alone_and_ends(
+    lab: Callable[[], Lab], server: Server, steps: list[tuple[Callable[[Lab, str], None], str]]
+) -> None:
+    made = lab()
+    for step, word in steps:
+        step(made, word)
+    made.check()
+    assert server.calls == []
+
+
+# ---- what was found ----
+
+
+@pytest.fixture
+def told(lab: Callable[[], Lab]) -> Callable[..., list[str]]:
+    """Return a function that takes steps in a new lab and returns the errors of the check."""
+
+    def check(*steps: Callable[[Lab], object]) -> list[str]:
+        made = lab()
+        for step in steps:
+            step(made)
+        lines = made.check().err.splitlines()
+        return [line.removeprefix("error: ") for line in lines if "is still 0.1.0" not in line]
+
+    return check
+
+
+@pytest.mark.parametrize("word", ["../../../../../../sentinel", "..", ".", "", "/tmp", "a/b", None])
+@pytest.mark.parametrize("field", ["name", "alias"])
+def test_the_name_of_a_dependency_is_no_path(
+    told: Callable[..., list[str]], field: str, word: str | None
+) -> None:
+    entry = {"name": "ros-service", "repository": "file://../../../charts/ros-service"}
+    if field == "alias" and not word:
+        return  # without an alias, the name counts
+    lines = told(lambda lab: chart(lab, CHART, dependencies=[entry | {field: word}]))
+    assert [line for line in lines if line.startswith(f"{CHART}/Chart.yaml:1: dependencies[0].")]
+
+
+def test_names_in_libraries_are_checked_too(told: Callable[..., list[str]]) -> None:
+    entry = {"name": "../x", "repository": "file://../x"}
+    (line,) = told(lambda lab: chart(lab, LIBRARY, version="1.0.0", dependencies=[entry]))
+    assert line.startswith(f"{LIBRARY}/Chart.yaml:1: dependencies[0].name: ")
+
+
+def test_libraries_that_need_each_other_are_named(told: Callable[..., list[str]]) -> None:
+    (line,) = told(lambda lab: makes_a_circle(lab, ""))
+    assert line.startswith(f"{CHARTS}/c/Chart.yaml:1: dependencies[0]: ")
+    assert f"{CHARTS}/a → {CHARTS}/b → {CHARTS}/c → {CHARTS}/a;" in line
+
+
+def test_copies_of_libraries_are_bounded(told: Callable[..., list[str]]) -> None:
+    (line,) = told(lambda lab: doubles(lab, ""))
+    assert line.startswith(f"{CHART}/Chart.yaml:1: dependencies: ")
+
+
+def test_an_archive_is_refused(told: Callable[..., list[str]]) -> None:
+    lines = told(lambda lab: packs_an_archive(lab, "x"))
+    assert {line.partition(": ")[0] for line in lines} == {
+        f"{CHART}/charts/part-0.1.0.tgz",
+        f"{CHART}/charts/part/charts/part-0.1.0.tgz",
+        f"{LIBRARY}/charts/part-0.1.0.tgz",
+    }
+
+
+@pytest.mark.parametrize("root", ["overrides", "ledger", "registry", "appdefs/charts"])
+def test_a_linked_folder_is_not_looked_into(told: Callable[..., list[str]], root: str) -> None:
+    def link(lab: Lab) -> None:
+        shutil.rmtree(lab.checkout / root, ignore_errors=True)
+        (lab.checkout / root).symlink_to(lab.top / "sentinel")
+
+    lines = told(link)
+    assert [line for line in lines if line.startswith(f"{root}: is a symbolic link")]
+    assert not [line for line in lines if line.startswith((f"{root}/Chart", f"{root}/secret"))]
+
+
+@pytest.mark.parametrize(
+    ("path", "make"),
+    [
+        (f"{CHART}/files/pipe", os.mkfifo),
+        (f"{CHART}/files/.git", Path.mkdir),
+        (f"{CHART}/files/.GIT", Path.touch),
+        (f"{CHART}/files/huge", lambda path: path.write_bytes(b"") or os.truncate(path, 1 << 40)),
+        (f"{CHART}/{'d/' * 60}deep", Path.mkdir),
+    ],
+    ids=["pipe", "nested repository", "submodule", "huge", "deep"],
+)
+def test_what_is_no_plain_file_is_refused(
+    told: Callable[..., list[str]], path: str, make: Callable[[Path], object]
+) -> None:
+    def add(lab: Lab) -> None:
+        (lab.checkout / path).parent.mkdir(parents=True)
+        make(lab.checkout / path)
+
+    (line,) = told(add)
+    assert line.startswith(f"{path}: ")
+
+
+def test_settings_that_are_a_link_to_nowhere(told: Callable[..., list[str]]) -> None:
+    lines = told(lambda lab: put_other(lab, "demandops.yaml", lambda at: at.symlink_to("x" * 999)))
+    assert [line for line in lines if line.startswith("demandops.yaml: is a symbolic link")]
+
+
+def test_an_author_in_an_unknown_encoding(lab: Callable[[], Lab]) -> None:
+    made = lab()
+    put(made, "bootstrap/c-its.yaml", "edited: true\n")
+    git(made.checkout, "add", "--all")
+    tree, head = git(made.checkout, "write-tree"), git(made.checkout, "rev-parse", "HEAD")
+    raw = f"tree {tree}\nparent {head}\nauthor \xff <a> 1 +0000\ncommitter \xff <a> 1 +0000\n"
+    objects = pygit2.Repository(str(made.checkout))
+    text = f"{raw}encoding none-such\n\nx\n".encode("latin-1")
+    objects.set_head(objects.odb.write(pygit2.enums.ObjectType.COMMIT, text))
+    assert made.check().code == 1
+
+
+def test_helm_gets_no_schema_and_the_schema_of_a_library_counts(
+    told: Callable[..., list[str]],
+) -> None:
+    def require(lab: Lab) -> None:
+        schema = {"type": "object", "required": ["level"]}
+        put(lab, f"{CHART}/charts/part/values.schema.json", json.dumps(schema))
+        chart(lab, f"{CHART}/charts/part")
+        metadata = lab.checkout / CHART / "Chart.yaml"
+        entry = "  - {name: part, version: 0.1.0}\n"
+        put(lab, f"{CHART}/Chart.yaml", metadata.read_text() + entry)
+
+    (line,) = told(require)
+    assert "level" in line
+    assert line.startswith(f"{CHART}/values.yaml")
+
+    def set_level(lab: Lab) -> None:
+        require(lab)
+        values = lab.checkout / CHART / "values.yaml"
+        put(lab, f"{CHART}/values.yaml", values.read_text() + "\npart: {level: 1}\n")
+        (lab.checkout / CHART / "values.schema.json").unlink()  # it allows no such values
+
+    assert told(set_level) == []

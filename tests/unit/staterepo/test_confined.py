@@ -1,0 +1,110 @@
+"""A confined program reaches no network, knows no secrets, and ends."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+from demandops.staterepo.pull_request import confined
+from demandops.staterepo.pull_request import helm as helm_runs
+from demandops.staterepo.pull_request.helm import HELM_BIN, Helm, Report
+
+from tests.kit.http import serving
+
+
+def confine(code: str, *arguments: str, seconds: int = 60) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-IS", confined.__file__, str(seconds), sys.executable, "-c", code]
+    return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
+
+
+FETCH = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=5)"
+
+
+def test_it_reaches_no_network_where_the_kernel_lets_us_say_so() -> None:
+    unshare = "import ctypes; raise SystemExit(ctypes.CDLL(None).unshare(0x50000000) and 9)"
+    if subprocess.run([sys.executable, "-c", unshare], check=False).returncode == 9:
+        pytest.skip("this kernel lets nobody make a network namespace")
+    with serving() as server:
+        assert confine(FETCH, server.url).returncode == 1
+        assert server.calls == []
+        subprocess.run([sys.executable, "-c", FETCH, server.url], check=True)
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "while True: pass",
+        "x = b'x' * (8 << 30)",
+        "open('big', 'wb').truncate(1 << 40)",
+    ],
+    ids=["time", "memory", "file"],
+)
+def test_it_has_only_so_much(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert confine(code, seconds=1).returncode != 0
+
+
+def test_a_program_that_cannot_run_is_told() -> None:
+    command = [sys.executable, "-IS", confined.__file__, "1", "/nowhere/helm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stderr == "Error: /nowhere/helm cannot be run: No such file or directory\n"
+
+
+@pytest.fixture
+def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
+    """Return a function that runs a program in place of helm and returns the report."""
+
+    def run(code: str) -> Report:
+        program = tmp_path / "program"
+        program.write_text(f"#!{sys.executable} -IS\nimport os, sys\n{textwrap.dedent(code)}\n")
+        program.chmod(0o755)
+        monkeypatch.setenv(HELM_BIN, str(program))
+        helm = Helm.find()
+        assert helm
+        return helm.template(tmp_path / "chart", tmp_path / "values", tmp_path / "home", "r", "n")
+
+    return run
+
+
+def test_helm_knows_nothing_of_the_environment(
+    ran: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert callable(ran)
+    for name in ("TOKEN", "HELM_PLUGINS", "HELM_REGISTRY_CONFIG", "XDG_CONFIG_HOME", "LD_PRELOAD_"):
+        monkeypatch.setenv(name, "hunter2")
+    report = ran("for name in os.environ: print('---\\nkind:', name, os.environ[name])")
+    assert {kind for _, kind in report.kinds} - {"LC_CTYPE"} == {
+        "PATH",
+        "HOME",
+        "TMPDIR",
+        "KUBECONFIG",
+        "HELM_PLUGINS",
+    }
+    assert report.ended
+    assert [*tmp_path.joinpath("home").iterdir()]  # what it writes lands there
+
+
+def test_output_without_end_is_a_fault(ran: object) -> None:
+    assert callable(ran)
+    report = ran("while True: print('a' * 1000000)")
+    assert not report.ended
+    (fault,) = report.faults
+    assert fault.file == "chart"
+
+
+def test_a_program_that_loops_is_a_fault(ran: object, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert callable(ran)
+    monkeypatch.setattr(helm_runs, "_CPU_SECONDS", 1)
+    report = ran("while True: pass")
+    assert not report.ended
+    assert report.faults
+
+
+def test_a_message_of_any_length_is_parsed_soon(ran: object) -> None:
+    assert callable(ran)
+    report = ran("sys.exit('Error: ' + 'templates/' * 5_000_000)")
+    assert report.ended
+    assert len(report.faults[0].message) < 1_000
