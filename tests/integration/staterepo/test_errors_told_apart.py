@@ -67,9 +67,9 @@ def test_a_folder_that_cannot_be_used_is_no_fault_of_the_program(
     slot.write_text("")
     with pytest.raises(StateRepoError) as error:
         Generator(str(bare), data=slot.parent)
-    assert str(error.value) == (
+    assert str(error.value).startswith(
         f"the data folder of {bare} cannot be read: [Errno 17] File exists: '{slot}'; check its "
-        "disk and its files, then try again"
+        "disk and its files"
     )
 
 
@@ -207,9 +207,11 @@ def test_a_tip_that_cannot_be_read_is_told_once_and_tried_again_with_pauses(
         missing = pygit2.Oid(raw=b"\x11" * 20)
         _commit_by_hand(bare, _with_entry_in_overrides(bare, b"gone.yaml", missing))
         rig.wait_until(lambda: "writer" in generator.failures, "the failure is shown")
-        with pytest.raises(StateRepoError, match="internal error of the generator: KeyError"):
+        with pytest.raises(
+            StateRepoError, match=r"overrides/gone\.yaml of commit .* is missing or damaged"
+        ):
             rig.receipt(generator.submit(goal(2)))
-        assert caplog.text.count("Traceback") == 1
+        assert caplog.text.count("is missing or damaged") == 1
         pygit2.Repository(str(bare)).references["refs/heads/main"].set_target(good)
         rig.book(generator, goal(3))
         rig.wait_until(lambda: "writer" not in generator.failures, "the writer works again")

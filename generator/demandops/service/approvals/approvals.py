@@ -173,6 +173,9 @@ class Approvals:
                 self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
                 return
             branch = branch_name(request.demand or request.id, ticket.operation)
+            if branch in self._proposals:
+                self._demands.fail([ticket], _belongs_to_another(branch))
+                return
             replaces = next((each.record.as_replaced() for each in replaced), "")
             proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
         if not self._demands.propose(ticket, proposal.record):
@@ -288,12 +291,9 @@ class Approvals:
         objects, tip = self._repository.objects, str(snapshot.commit)
         on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
         head, added = heads.branches.get(proposal.branch, ""), set[ClaimKey]()
-        if head and not proposal.record.commits:  # a digest of two operation ids is the same
-            message = f"needs the branch {proposal.branch}, which belongs to another proposal; "
-            message += "send the demand again with another operation id"
-            refusal = Refused([fault("", message, code="conflict")])
-            self._demands.fail(proposal.tickets, refusal)
-            self._proposals = {k: p for k, p in self._proposals.items() if p is not proposal}
+        if head and not proposal.record.commits:
+            self._demands.fail(proposal.tickets, _belongs_to_another(proposal.branch))
+            self._proposals.pop(proposal.branch, None)
             return
         if proposal.record.pushed and head not in proposal.record.commits:
             added = ledger_files.added_by_people(objects, proposal.searched_to, snapshot.commit)
@@ -490,3 +490,12 @@ def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)
+
+
+def _belongs_to_another(branch: str) -> Refused:
+    """Return the refusal of a demand whose branch exists: two operation ids have one digest."""
+    message = (
+        f"needs the branch {branch}, which belongs to another proposal; send the demand again with "
+        "another operation id"
+    )
+    return Refused([fault("", message, code="conflict")])
