@@ -33,7 +33,7 @@ COMMANDS = {
     "init": ("repo", "Create a state repo."),
     "journal": ("repo", "List the accepted demands that are not published."),
     "log": ("views", "List the commits of the state repo, newest first."),
-    "new": ("repo", "Write a new application, node, access domain or override."),
+    "new": ("repo", "Write a new application, override or image."),
     "override": ("actions", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
         "demandops_ros.parameter_sync",
