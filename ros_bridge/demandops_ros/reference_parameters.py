@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from demandops.config.config import BROKERS_FILE, DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
-from demandops.migration.reference_map import is_host
+from demandops.config.inventory import Broker
 from demandops.quoting import quoted
 from rclpy.node import Node
 
@@ -99,10 +99,19 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
             continue
         port, node = values.get(f"{name.removesuffix('host')}port"), match["node"]
         brokers = [broker for one, broker in config.brokers.items() if node in (None, one)]
-        if not any(is_host(one, host, one.port if port is None else port) for one in brokers):
+        if not any(_is_at(one, host, one.port if port is None else port) for one in brokers):
             place = f"of node {quoted(node)} " if node else ""
             address = host if port is None else f"{host}:{port}"
             yield (
                 f"parameter {name} of the reference is not used: the broker {place}at "
                 f"{address} is not in {config.place_of(BROKERS_FILE)}; add it there"
             )
+
+
+def _is_at(broker: Broker, host: str, port: object) -> bool:
+    """Return whether a broker is at the address ``host`` and ``port``.
+
+    The host in the inventory may be longer than ``host``: it may end in the namespace, as in
+    ``broker.c-its``.
+    """
+    return port == broker.port and f"{broker.host}.".startswith(f"{host}.")

@@ -22,8 +22,6 @@ from demandops.cli.actions.override import ends_at
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import Target as ReleaseTarget
 from demandops.config import override, policy
-from demandops.config.base_model import parse_file
-from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.decision import try_configuration
 from demandops.detection.detector import Detector, Want
@@ -40,7 +38,6 @@ from demandops.ledger import (
     recent_shutdowns,
     waiting,
 )
-from demandops.migration import imported_goals, reference_files, reference_map
 from demandops.service.push_webhook import PushWebhook
 from demandops.service.ticket import ticket_from_journal
 from demandops.staterepo.git import open_repository as addresses
@@ -53,10 +50,9 @@ from hypothesis import strategies as st
 from tests.fuzz import Target
 from tests.kit import detection, golden, rich
 from tests.kit.cluster import Letters, condition, deployment
-from tests.kit.config import configuration, state_of
+from tests.kit.config import state_of
 from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW
-from tests.kit.reference import Reference
 from tests.unit.cluster import test_argocd, test_flux
 from tests.unit.demand.test_fuzz import ANYTHING, KEY, TEXT, assert_told, outcome
 
@@ -145,33 +141,6 @@ def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
         many = inner != type_name
         fields[name] = st.lists(known[inner], max_size=2) if many else known[inner]
     return st.fixed_dictionaries(fields).map(lambda values: kind(**values))
-
-
-def file_of_the_reference(data: bytes) -> None:
-    """Check that a file of the reference, if it can be read, can also be imported.
-
-    The import proposes a map for the file. With this map, the import must form goals.
-    """
-    documents = [("file.yml", one) for one in strict_yaml.load_all(_text(data), "file.yml")]
-    files = reference_files.read(documents)
-    joins, _ = imported_goals.remaining_joins(files)
-    proposed, _ = reference_map.propose(joins, files, _config())
-    text = strict_yaml.dump(proposed)
-    mapped = parse_file(reference_map.ReferenceMap, text, "map.yaml")
-    for goal in imported_goals.goals(joins, mapped, "map.yaml"):
-        goal_as_data(goal)
-
-
-@cache
-def _config() -> Config:
-    return load(configuration({}))
-
-
-def _files_of_the_reference() -> tuple[bytes, ...]:
-    reference = Reference()
-    for path in EXPERIMENT[:6]:
-        reference.send(yaml.safe_load(path.read_text()))
-    return tuple(text.encode() for text in reference.texts().values())
 
 
 def ros_message(message: Any) -> None:
@@ -616,7 +585,6 @@ TARGETS = (
     Target(chart_file, _seeds_of(_CHARTS)),
     Target(chart_values, values=_changed_charts()),
     Target(set_key, tuple(_CONFIG[path].encode() for path in _FILES)),
-    Target(file_of_the_reference, _files_of_the_reference()),
     Target(claim, _bytes(path for path in _BOOKED if "shutdowns" not in path.parts)),
     Target(marker, (_MARKER,)),
     Target(shutdown, (_SHUTDOWN,)),

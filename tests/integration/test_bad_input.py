@@ -17,7 +17,6 @@ from demandops.cli.contexts import ContextsFile
 from demandops.cli.repo.schema import SCHEMAS
 from demandops.cluster.clusters_file import AccessFile
 from demandops.detection.rules.rule_file import RuleFile
-from demandops.migration.reference_map import ReferenceMap
 
 from tests.kit.goals import perception
 from tests.kit.limits import PATIENCE_S
@@ -125,7 +124,7 @@ def test_a_mistake_anywhere_in_a_goal_changes_nothing(
 
 
 def test_the_schemas_of_files_and_goals_are_the_tried_ones() -> None:
-    of_other_tests = {AccessFile, ContextsFile, ReferenceMap, RuleFile}
+    of_other_tests = {AccessFile, ContextsFile, RuleFile}
     shown = {model for model, _ in SCHEMAS.values()} - of_other_tests
     assert shown == {*CONFIG_MODELS.values(), *GOAL_MODELS}
 

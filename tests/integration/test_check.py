@@ -261,7 +261,9 @@ def test_an_application_definition_that_is_in_use_cannot_be_deleted(
 
 
 def test_a_first_bootstrap_is_told_and_not_printed(checkout: Path, check: Check) -> None:
-    assert run(["new", "node", "v9", "--type=vehicle", "--cluster=c9", f"-C{checkout}"]) == 0
+    clusters, nodes = (checkout / "inventory" / f"{name}.yaml" for name in ("clusters", "nodes"))
+    clusters.write_text(clusters.read_text() + "  - name: c9\n")
+    nodes.write_text(nodes.read_text() + "  - {id: v9, type: vehicle, cluster: c9}\n")
     code, out, errors = check()
     assert code == 0
     assert (

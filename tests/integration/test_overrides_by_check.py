@@ -42,12 +42,13 @@ def bodies(text: str) -> list[Any]:
 
 
 @pytest.mark.parametrize(
-    ("path", "replaced"),
+    ("path", "replaced", "gitops"),
     [
-        (FUSION, [("domainId: 0", "domainId: 7"), ("replicas: 1", "replicas: 3")]),
-        (CLIENT, [("mqtt-client:2025-04", "mqtt-client:2026-01")]),
+        (FUSION, [("domainId: 0", "domainId: 7"), ("replicas: 1", "replicas: 3")], "flux"),
+        (FUSION, [("domainId: 0", "domainId: 7"), ("replicas: 1", "replicas: 3")], "argocd"),
+        (CLIENT, [("mqtt-client:2025-04", "mqtt-client:2026-01")], "flux"),
     ],
-    ids=["values-and-replicas", "image-of-a-client"],
+    ids=["values-and-replicas", "with-argocd", "image-of-a-client"],
 )
 def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
     demandops: Run,
@@ -56,7 +57,10 @@ def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
     clone: Path,
     path: str,
     replaced: list[tuple[str, str]],
+    gitops: str,
 ) -> None:
+    assert demandops("upgrade", "--state-repo", state.path, "--gitops", gitops).code == 0
+    git(clone, "pull", "--quiet")
     text = (clone / path).read_text()
     for old, new in replaced:
         assert old in text
@@ -74,18 +78,6 @@ def test_the_override_suggested_gives_the_file_that_was_edited_by_hand(
     git(clone, "push", "--quiet", "origin", "main")
     book(id="second")
     assert bodies(state.files()[path]) == bodies(text)
-
-
-def test_the_override_that_check_suggests_stops_a_release_deleted_by_hand(
-    demandops: Run, state: Any, book: Callable[..., Any], clone: Path
-) -> None:
-    (clone / CLIENT).unlink()
-    (suggested,) = demandops("check", clone, "--output", "json").json()["suggestions"]
-    git(clone, "checkout", "--quiet", ".")
-    state.commit({suggested["file"]: suggested["text"]})
-    goal = yaml.safe_dump(perception(id="second"))
-    demandops("request", "-", "--state-repo", state.path, stdin=goal)
-    assert CLIENT not in state.files()
 
 
 def test_a_markers_edit_is_refused(demandops: Run, clone: Path) -> None:

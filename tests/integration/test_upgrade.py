@@ -207,26 +207,12 @@ def test_a_dry_run_tells_all_and_writes_nothing(
         "  write  clusters/c-its/perception/edge/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
         "\n  write  demandops.yaml\n"
         "\n"
-        "before the upgrade, on the clusters:\n"
-        "- c-its: suspend Flux, so that it does not prune the workloads\n"
-        "      kubectl -n perception patch kustomization perception --type merge -p "
-        '\'{"spec":{"suspend":true}}\'\n'
-        "      kubectl -n perception get helmrelease -l "
-        "kustomize.toolkit.fluxcd.io/name=perception -o name | xargs -r kubectl -n perception "
-        'patch --type merge -p \'{"spec":{"suspend":true}}\'\n'
+        "a change of controller needs steps on the clusters, before and after: docs/argocd.md, "
+        "'From Flux to Argo CD, and back'\n"
         "\n"
         "after the upgrade, on the clusters:\n"
-        "- c-its: make the cluster follow the repo again; then wait until all Applications are "
-        "Synced\n"
+        "- c-its: apply the cluster's bootstrap file again, because the file changed\n"
         "      git show main:bootstrap/c-its.yaml | kubectl apply -f -\n"
-        "- c-its: delete Flux's objects; because Flux is suspended, no workload is removed\n"
-        "      kubectl -n perception get helmrelease -l "
-        "kustomize.toolkit.fluxcd.io/name=perception -o name | sed s,.*/,, | xargs -r -I NAME "
-        "kubectl -n perception delete secret -l owner=helm,name=NAME\n"
-        "      kubectl -n perception delete helmrelease,helmchart,helmrepository,ocirepository "
-        "-l kustomize.toolkit.fluxcd.io/name=perception\n"
-        "      kubectl -n perception delete kustomization perception\n"
-        "      kubectl -n perception delete gitrepository demandops\n"
     )
     data = upgraded("--gitops", "argocd", "--dry-run", "--output", "json").json()
     assert (data["outcome"], data["commit"], state.tip) == ("would-change", before, before)
@@ -253,27 +239,10 @@ def test_on_a_terminal_it_asks_whether_the_clusters_are_ready(
     os.close(ours)
     os.close(theirs)
     assert done.returncode == code
-    assert done.stdout.startswith("\nbefore the upgrade, on the clusters:\n- c-its: suspend Flux")
+    assert "before and after: docs/argocd.md" in done.stdout.splitlines()[0]
     assert (state.tip == before) is (code == 1)
     if code:
         assert done.stderr == "error: nothing was changed; do these steps first, or give --yes\n"
-
-
-def test_back_to_flux_argo_cds_finalizers_go_first(
-    state: GitRepo, upgraded: Callable[..., Ran]
-) -> None:
-    assert upgraded("--gitops", "argocd").code == 0
-    (step,) = upgraded("--gitops", "flux", "--dry-run", "--output", "json").json()["before"]
-    of_services = "application -l app.kubernetes.io/managed-by=demandops"
-    let_go = '--type merge -p \'{"metadata":{"finalizers":null}}\''
-    assert step["commands"] == [
-        f"kubectl -n argocd patch application demandops-perception {let_go}",
-        "kubectl -n argocd delete application demandops-perception",
-        f"kubectl -n perception get {of_services} -o name | xargs -r kubectl -n perception patch "
-        f"{let_go}",
-        f"kubectl -n perception delete {of_services}",
-        "kubectl -n argocd delete appproject demandops-perception",
-    ]
 
 
 @pytest.mark.parametrize("more", [[], ["--gitops", "flux"], ["--url", URL]], ids=" ".join)

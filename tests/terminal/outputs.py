@@ -19,7 +19,6 @@ from demandops.cli.main import cli, load, run
 from demandops.runtime import REAL
 
 from tests.kit.goals import EXPERIMENT, put
-from tests.kit.reference import Reference
 from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, git, init
 from tests.kit.terminal import terminal
 
@@ -68,7 +67,6 @@ CHANGING = (
     "completion bash",
     "config list",
     "config set cloud --state-repo https://git.example/cloud.git",
-    "import reference/mqtt_bookkeeping.yml --map map.yaml --state-repo fleet.git",
     "init new.git --bare",
     "new application tracking --input camera=sensor_msgs/msg/Image -C clone "
     "--service tracker=tracking/tracker.launch.py --image ghcr.io/me/tracking:1.0",
@@ -140,9 +138,6 @@ def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
     git(folder, "clone", "-q", "fleet.git", "clone")
     more = folder / "clone" / "overrides" / "more.yaml"
     more.write_text(more.read_text().replace("replicas: 2", "replicas: 3"))
-    reference = Reference()
-    reference.send(yaml.safe_load(EXPERIMENT[0].read_text()))
-    reference.write(folder / "reference")
 
 
 def _done(command: str) -> None:

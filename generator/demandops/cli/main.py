@@ -10,7 +10,6 @@ import shutil
 import sys
 from enum import IntEnum
 from importlib import import_module
-from keyword import iskeyword
 
 import click
 
@@ -31,11 +30,10 @@ COMMANDS = {
     "detect": ("demandops_ros.detector", "Watch topics, and send the demands that rules ask for."),
     "diff": ("views", "Show the differences between two commits."),
     "get": ("views", "List demands, nodes, services, overrides and so on."),
-    "import": ("actions", "Import bookings from the paper's application manager."),
     "init": ("repo", "Create a state repo."),
     "journal": ("repo", "List the accepted demands that are not published."),
     "log": ("views", "List the commits of the state repo, newest first."),
-    "new": ("repo", "Write a new application, node, access domain or override."),
+    "new": ("repo", "Write a new application, override or image."),
     "override": ("actions", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
         "demandops_ros.parameter_sync",
@@ -91,7 +89,7 @@ def load(name: str) -> click.Command:
     """
     room = COMMANDS[name][0]
     ros = room.split(".")[0] == "demandops_ros"
-    word = f"{name}_" if iskeyword(name) else name.replace("-", "_")
+    word = name.replace("-", "_")
     module = f"{room}.{word}_command" if ros else f"demandops.cli.{room}.{word}"
     try:
         command: click.Command = getattr(import_module(module), word)

@@ -20,9 +20,6 @@ _KINDS = {
     "HelmRelease": ("helm.toolkit.fluxcd.io", "v2", "helmreleases"),
     "Application": ("argoproj.io", "v1alpha1", "applications"),
     "Deployment": ("apps", "v1", "deployments"),
-    "MqttConnection": ("ika.rwth-aachen.de", "v1", "mqttconnections"),
-    "ObjectDetection": ("ika.rwth-aachen.de", "v1", "objectdetections"),
-    "ObjectFusion": ("ika.rwth-aachen.de", "v1", "objectfusions"),
 }
 _WATCH_S = 240
 _CONNECT_S = 5

@@ -27,7 +27,6 @@ from demandops.plan.output_topics import with_booked_topics_marked
 from demandops.plan.override_lifecycle import update_ledger
 from demandops.plan.release import ServiceRelease
 from demandops.render.changes.merge_preview import planned_releases
-from demandops.render.gitops.controller_switch import SwitchSteps, switch_steps
 from demandops.runtime import REAL
 from demandops.settings import LEDGER_API_VERSION, RENDER_VERSION
 from demandops.staterepo import reader
@@ -75,9 +74,9 @@ class Upgrade:
     files: Mapping[str, str | None]
 
     @property
-    def handover(self) -> SwitchSteps:
-        """The steps that an administrator takes on the clusters before and after the upgrade."""
-        return switch_steps(self.old, self.new, self.files)
+    def switches(self) -> bool:
+        """Whether another GitOps controller reads the state repo from now on."""
+        return self.old.repo_settings.gitops != self.new.repo_settings.gitops
 
 
 @dataclass(frozen=True, slots=True)
@@ -251,20 +250,19 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
 
 def _message(made: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
     old, new = made.old.repo_settings, made.new.repo_settings
-    switched = old.gitops != new.gitops
     title = "Render everything again"
-    if switched:
+    if made.switches:
         title += f", for {_NAMES[new.gitops]}"
     why = f"with render version {new.render_version}"
     if old.render_version != new.render_version:
         why += f" instead of {old.render_version}"
-    if switched:
+    if made.switches:
         why += f", for {_NAMES[new.gitops]} instead of {_NAMES[old.gitops]}"
     counts = Counter("/".join(path.split("/")[:_FOLDER_DEPTH]) for path in made.files)
     trailers = [
         ("Operation", "upgrade"),
         ("From-Render-Version", str(old.render_version)),
-        ("From-Gitops", old.gitops if switched else ""),
+        ("From-Gitops", old.gitops if made.switches else ""),
         ("Gitops", new.gitops),
         *commit_message.override_trailers(commit_message.keep_override_paths(keys)),
         *commit_message.demand_trailers(keys),

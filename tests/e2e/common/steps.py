@@ -216,8 +216,8 @@ def _autoscaled(world: World) -> dict[str, str | None]:
 def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World) -> None:
     """The state repo moves to the other controller while the cluster still runs the former one.
 
-    `demandops upgrade` prints how to retire the former controller first. An operator cannot do so
-    on a cluster that cannot be reached.
+    docs/argocd.md says how to retire the former controller first. An operator cannot do so on a
+    cluster that cannot be reached.
     """
     domain = world.domain
     other, foreign = {"flux": ("argocd", "Application"), "argocd": ("flux", "HelmRelease")}[

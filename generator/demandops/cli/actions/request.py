@@ -42,9 +42,9 @@ class Document:
 
     file: str
     goal: Any
-    text: str = ""
+    text: str
     """The text of the file."""
-    number: int = 0
+    number: int
     """The index of the document in the file, from 0."""
 
     @property
@@ -103,27 +103,6 @@ def request(
         documents = [replace(one, goal=_release_of(one.goal)) for one in documents]
     if not documents:
         raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
-    book_or_show(documents, state_repo, dry_run, wait, signing_key, output)
-
-
-def book_or_show(
-    documents: list[Document],
-    state_repo: str,
-    dry_run: bool,
-    wait: bool,
-    signing_key: Path | None,
-    output: str,
-) -> None:
-    """Book the requests, and print the outcome of each; with ``dry_run``, book nothing.
-
-    If a request cannot be parsed, all are refused.
-
-    Raises:
-        click.Abort: if the command was interrupted before each request had an answer.
-        click.exceptions.Exit: if a request is refused.
-        StateRepoError: if the state repo cannot be reached or read.
-        Unsound: if it is not known whether a request was booked.
-    """
     if any(form_faults(document.goal) for document in documents):
         rows = _unbooked(documents, state_repo)
     elif dry_run:

@@ -106,7 +106,7 @@ def init(
     if example == "none":
         where = ", in the clone" if bare else ""
         lines += [
-            f"to add a fleet{where}: run demandops new node, edit inventory/brokers.yaml, and run",
+            f"to add a fleet{where}: edit the files in inventory/, and run",
             "      demandops new application (--help has examples); then check, commit and push",
         ]
     if bare:

@@ -18,8 +18,9 @@ from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput, StateRepoError
 from demandops.evaluator.process import EVALUATE
 from demandops.ledger.ledger import Ledger
-from demandops.scaffold import new_application, new_entry, new_image
+from demandops.scaffold import new_application, new_image
 from demandops.scaffold.new_application import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
+from demandops.scaffold.yaml_document import document
 from demandops.settings import data_folder
 from demandops.staterepo import skeleton
 from demandops.staterepo.pull_request import edited_checkout
@@ -42,7 +43,7 @@ directory_option = click.option(
 
 @click.group()
 def new() -> None:
-    """Write a new application, node, access domain or override.
+    """Write a new application, override or image.
 
     The files in the state repo are valid as they are: `demandops check` passes. `new image` writes
     to the repository of a ROS package instead. The command changes no existing file and commits
@@ -50,7 +51,6 @@ def new() -> None:
 
     \b
     Examples:
-      demandops new node vehicle04 --type vehicle --cluster c-its
       demandops new application tracking
     """
 
@@ -135,70 +135,6 @@ def application(  # noqa: PLR0913 - as many as options
 
 
 @new.command()
-@click.argument("id")
-@click.option("--type", "type_", required=True, metavar="WORD", help="vehicle, station, edge, …")
-@click.option(
-    "--cluster", required=True, metavar="NAME", help="The node's cluster, which may be new."
-)
-@directory_option
-@output_option
-def node(id: str, type_: str, cluster: str, directory: Path, output: str) -> None:
-    """Write a new node, in a file of its own.
-
-    \b
-    Examples:
-      demandops new node vehicle04 --type vehicle --cluster c-its
-    """
-    _lay_down(directory, lambda config: new_entry.node(id, type_, cluster, config), output)
-
-
-@new.command()
-@click.argument("name")
-@click.option("--namespace", default="", metavar="NAME", help="Default: the access domain's name.")
-@click.option(
-    "--node",
-    "nodes",
-    multiple=True,
-    required=True,
-    metavar="PATTERN",
-    help="The ids of the domain's nodes. May be repeated.",
-)
-@click.option(
-    "--requester",
-    "requesters",
-    multiple=True,
-    metavar="PATTERN",
-    help="Who may demand something in the domain. Default: everybody. May be repeated.",
-)
-@directory_option
-@output_option
-def policy(
-    name: str,
-    *,
-    namespace: str,
-    nodes: tuple[str, ...],
-    requesters: tuple[str, ...],
-    directory: Path,
-    output: str,
-) -> None:
-    """Write a new access domain: who may demand what on which nodes.
-
-    No node may match the patterns of two access domains. A new state repo has one domain, whose
-    pattern "*" matches every node. So first edit the patterns in policy/access-domains.yaml: none
-    of them may match a node of the new domain.
-
-    \b
-    Examples:
-      demandops new policy operations --node cloud --requester "operator*"
-    """
-    _lay_down(
-        directory,
-        lambda config: new_entry.access_domain(name, namespace or name, nodes, requesters, config),
-        output,
-    )
-
-
-@new.command()
 @click.argument("name")
 @click.option("-m", "--reason", required=True, metavar="TEXT", help="Why the override is needed.")
 @click.option("--owner", required=True, metavar="NAME", help="Who is responsible.")
@@ -250,11 +186,18 @@ def override(  # noqa: PLR0913 - as many as options
     }
     if len(does) != 1:
         raise click.UsageError("give exactly one effect: --hold, --deny, --keep or --replicas")
-    _lay_down(
-        directory,
-        lambda config: new_entry.override(name, reason, owner, select, does, config),
-        output,
-    )
+
+    def made(config: Config) -> Files:
+        if name in config.overrides:
+            raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
+        path = f"overrides/{name}.yaml"
+        fields = {"reason": reason, "owner": owner, "select": [select], **does}
+        note = (
+            "overrides/README.md lists all effects and selectors of overrides, and when they end."
+        )
+        return {path: document(path, "override", "Override", fields, note)}
+
+    _lay_down(directory, made, output)
 
 
 @new.command()
@@ -405,7 +348,7 @@ def _example_node(config: Config) -> str:
     if not nodes:
         raise StateRepoError(
             "the inventory has no node in an access domain, so no demand can be made; add one "
-            "first: demandops new node ID --type edge --cluster NAME"
+            "first, in inventory/nodes.yaml"
         )
     return nodes[0]
 

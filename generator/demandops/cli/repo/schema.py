@@ -22,7 +22,6 @@ from demandops.config.repo_settings import RepoSettings
 from demandops.demand.demand_goal import DemandGoal
 from demandops.demand.deployment_request_goal import WireGoal
 from demandops.detection.rules.rule_file import RuleFile
-from demandops.migration.reference_map import ReferenceMap
 
 SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "access-domains": (
@@ -42,7 +41,6 @@ SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "clients": (ClientsFile, "registry/clients.yaml, registry/clients/*.yaml"),
     "nodes": (NodesFile, "inventory/nodes.yaml, inventory/nodes/*.yaml"),
     "override": (OverrideFile, "overrides/<name>.yaml"),
-    "reference-map": (ReferenceMap, "the file of `demandops import --map`"),
     "service": (ServiceDefinition, "appdefs/<name>/service.yaml"),
     "state-repo": (RepoSettings, "demandops.yaml"),
     "versions": (VersionsFile, "registry/versions.yaml, registry/versions/*.yaml"),

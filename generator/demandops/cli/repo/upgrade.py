@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,13 +13,17 @@ import click
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import Progress, busy
 from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
-from demandops.render.gitops.controller_switch import Step
+from demandops.render.gitops.paths import bootstrap_path, domains_by_cluster
 from demandops.runtime import REAL
 from demandops.staterepo import upgrade as upgrading
 from demandops.staterepo.git.signing import Signer
 from demandops.staterepo.upgrade import Upgrade, UpgradeRequest
 
 _MOST_PATHS = 50
+_SWITCH = (
+    "a change of controller needs steps on the clusters, before and after: docs/argocd.md, "
+    "'From Flux to Argo CD, and back'"
+)
 
 
 @click.command()
@@ -57,8 +61,8 @@ def upgrade(
 
     Use this command when a new version of demandops renders differently, because a generator
     refuses a state repo of another render version. Also use it to change between Flux and Argo CD.
-    Such a change needs steps on the clusters, which a person takes: the command prints them, and
-    docs/argocd.md explains them. If no file changes, the command makes no commit.
+    Such a change needs steps on the clusters, before and after: docs/argocd.md lists them. If no
+    file changes, the command makes no commit.
 
     \b
     Examples:
@@ -72,11 +76,9 @@ def upgrade(
     if dry_run or asks:
         with _shown() as report:
             made = upgrading.plan(state_repo, request, now, report)
-    if asks and not dry_run and made.handover.before:
-        show(
-            output, None, _step_lines("before the upgrade, on the clusters:", made.handover.before)
-        )
-        if not click.confirm("Is this done?"):
+    if asks and not dry_run and made.switches:
+        show(output, None, [_SWITCH])
+        if not click.confirm("Are those before it done?"):
             raise click.ClickException("nothing was changed; do these steps first, or give --yes")
     if not dry_run:
         with _shown() as report:
@@ -106,13 +108,20 @@ def _data(made: Upgrade, dry_run: bool) -> dict[str, Any]:
         "gitops": {"from": old.gitops, "to": new.gitops},
         "written": [path for path, text in made.files.items() if text is not None],
         "removed": [path for path, text in made.files.items() if text is None],
-        "before": [_step_data(step) for step in made.handover.before],
-        "after": [_step_data(step) for step in made.handover.after],
+        "after": _steps_after(made),
     }
 
 
-def _step_data(step: Step) -> dict[str, Any]:
-    return {"cluster": step.cluster, "what": step.description, "commands": list(step.commands)}
+def _steps_after(made: Upgrade) -> list[dict[str, Any]]:
+    return [
+        {
+            "cluster": cluster,
+            "what": "apply the cluster's bootstrap file again, because the file changed",
+            "commands": [f"git show main:{path} | kubectl apply -f -"],
+        }
+        for cluster in domains_by_cluster(made.new)
+        if (path := bootstrap_path(cluster)) in made.files
+    ]
 
 
 def _lines(made: Upgrade, dry_run: bool) -> Iterator[str]:
@@ -124,11 +133,13 @@ def _lines(made: Upgrade, dry_run: bool) -> Iterator[str]:
         )
         return
     yield from _summary(made, dry_run)
-    before = "before the upgrade, on the clusters:"
-    if not dry_run:
-        before = "on the clusters, this had to be done before the upgrade:"
-    yield from _step_lines(before, made.handover.before)
-    yield from _step_lines("after the upgrade, on the clusters:", made.handover.after)
+    if made.switches:
+        yield f"\n{_SWITCH}"
+    if steps := _steps_after(made):
+        yield "\nafter the upgrade, on the clusters:"
+    for step in steps:
+        yield f"- {step['cluster']}: {step['what']}"
+        yield from (f"      {command}" for command in step["commands"])
 
 
 def _summary(made: Upgrade, dry_run: bool) -> Iterator[str]:
@@ -138,7 +149,7 @@ def _summary(made: Upgrade, dry_run: bool) -> Iterator[str]:
     yield f"{done} {len(made.files) - written} files"
     if old.render_version != new.render_version:
         yield f"render version {old.render_version} → {new.render_version}"
-    if old.gitops != new.gitops:
+    if made.switches:
         yield f"gitops {old.gitops} → {new.gitops}"
         if getattr(old, new.gitops) is None:
             yield f"{new.gitops}.url {getattr(new, new.gitops).url}"
@@ -149,11 +160,3 @@ def _summary(made: Upgrade, dry_run: bool) -> Iterator[str]:
         yield f"  {'remove' if text is None else 'write '} {path}"
     if len(made.files) > _MOST_PATHS:
         yield f"  and {len(made.files) - _MOST_PATHS} more (--output json lists all)"
-
-
-def _step_lines(title: str, steps: Iterable[Step]) -> Iterator[str]:
-    for place, step in enumerate(steps):
-        if place == 0:
-            yield f"\n{title}"
-        yield f"- {step.cluster}: {step.description}"
-        yield from (f"      {command}" for command in step.commands)

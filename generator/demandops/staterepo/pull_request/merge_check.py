@@ -8,22 +8,23 @@ shows how the merge would change desired state and bookkeeping.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import chain, count
 from pathlib import Path
 
 from demandops import strict_yaml
 from demandops.charts import chart_files
 from demandops.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
 from demandops.config.load import load
-from demandops.config.override import format_time
+from demandops.config.override import OVERRIDES_ROOT, format_time
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.decision import State, faults_of_edit, rendered_files, try_configuration
 from demandops.errors import Fault, InvalidInput, fault
 from demandops.evaluator.process import EVALUATE
 from demandops.field_lines import with_lines
-from demandops.ledger import claim_file, ended_override_file, kept_replicas
+from demandops.ledger import claim_file, ended_override_file, kept_replicas, waiting
 from demandops.ledger.claim_changes import changes_on
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
@@ -38,15 +39,32 @@ from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeepi
 from demandops.plan.views.missing_inputs import missing_inputs
 from demandops.render.changes import merge_preview
 from demandops.render.changes.merge_preview import MergePreview
-from demandops.render.gitops.paths import BOOTSTRAP_ROOT
+from demandops.render.gitops.paths import BOOTSTRAP_ROOT, path_of
 from demandops.runtime import REAL
-from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
+from demandops.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.staterepo.git import tree as trees
 from demandops.staterepo.load import ledger_files
 from demandops.staterepo.pull_request import manual_edits, rendered_charts
 from demandops.staterepo.pull_request.edited_checkout import Base, author_of, base_of, files_of
-from demandops.staterepo.pull_request.manual_edits import Suggestion
 from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
+
+_MOST_LEFT = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Suggestion:
+    """A suggested override that replaces the manual edit of a generated file.
+
+    ``instead_of`` is the path of the edited file. ``file`` is the path of the override, ``text``
+    its content. ``not_covered`` lists the parts of the edit that the override leaves out.
+    ``other_releases`` lists the other releases to which the override also applies.
+    """
+
+    instead_of: str
+    file: str
+    text: str
+    not_covered: tuple[str, ...]
+    other_releases: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +122,7 @@ def check(
     edit = _Edit(files, start, now or REAL.now())
     claims = ledger_files.read(sorted(files.items()))
     faults += claims.faults
-    edited = [path for path in edit.changed if manual_edits.is_written_by_generator(path)]
+    edited = [path for path in edit.changed if _is_written_by_generator(path)]
     result = CheckResult(
         (),
         base=start.commit if start else None,
@@ -153,10 +171,14 @@ def check(
             ),
         )
     if start is not None and edited:
-        manual, suggestions = manual_edits.faults_and_suggestions(
-            files, start, edited, author_of(folder)
-        )
-        faults, result = [*faults, *manual], replace(result, suggestions=suggestions)
+        suggestions = _suggestions(files, start, edited, author_of(folder))
+        faults += [
+            fault(
+                "", _remedy(path, start.files.get(path), files.get(path), suggestions.get(path))
+            ).within(path)
+            for path in edited
+        ]
+        result = replace(result, suggestions=tuple(suggestions.values()))
     ordered = sorted(dict.fromkeys(faults), key=lambda fault: fault.file)
     # an InvalidInput has only so many faults of one file
     return replace(
@@ -185,6 +207,79 @@ def _newly_missing(start: Base | None, state: State) -> Iterator[Fault]:
 
 def _generated(path: str) -> bool:
     return path.split("/", maxsplit=1)[0] in GENERATED_ROOTS
+
+
+def _is_written_by_generator(path: str) -> bool:
+    root = path.split("/", maxsplit=1)[0]
+    if trees.is_readme(path):
+        return False
+    if root == claim_file.LEDGER_ROOT:  # people may edit claims and waiting demands
+        is_waiting = path.startswith(f"{waiting.WAITING_ROOT}/")
+        return claim_file.kind_of(path) is None and not is_waiting
+    return root in (*GENERATED_ROOTS, NOTES_ROOT)
+
+
+def _suggestions(
+    files: Mapping[str, str], start: Base, edited: Iterable[str], owner: str
+) -> dict[str, Suggestion]:
+    """Return the overrides that replace manual edits, each by the path of the edited file."""
+    releases = {path_of(release): release for release in start.releases().values()}
+    found, taken = dict[str, Suggestion](), set(files)
+    for path in edited:
+        release, before, after = releases.get(path), start.files.get(path), files.get(path)
+        if start.state is None or release is None or before is None or after is None:
+            continue
+        effects, left = manual_edits.effects_of(before, after, release, start.state.config)
+        if not effects:
+            continue
+        names = chain([release.name], (f"{release.name}-{number}" for number in count(2)))
+        file = next(f for name in names if (f := f"{OVERRIDES_ROOT}/{name}.yaml") not in taken)
+        taken.add(file)
+        others = [one.name for one in releases.values() if manual_edits.also_applies(release, one)]
+        text = manual_edits.override_text(effects, release, owner)
+        found[path] = Suggestion(path, file, text, tuple(left), tuple(sorted(others)))
+    return found
+
+
+def _remedy(path: str, before: str | None, after: str | None, suggestion: Suggestion | None) -> str:
+    """Return what is wrong with a manual edit of a generated file, and what to do instead."""
+    lost = "is generated, so a manual edit is lost; revert it"
+    root = path.split("/", maxsplit=1)[0]
+    if suggestion is not None:
+        left = suggestion.not_covered
+        listed = ", ".join(left[:_MOST_LEFT]) + (", …" if len(left) > _MOST_LEFT else "")
+        unchanged = f" (this override does not change {listed})" if left else ""
+        return f"{lost}, and merge {suggestion.file} as shown{unchanged}"
+    if root == NOTES_ROOT:
+        return "is written by the generator, which would undo the edit; revert the edit"
+    if root == claim_file.LEDGER_ROOT:
+        if before is not None:
+            return "is written only by the generator; revert the edit"
+        return (
+            "is not the path of a claim, and people may add only claims and waiting demands to "
+            "ledger/; remove the file"
+        )
+    if before is None:
+        if root == BOOTSTRAP_ROOT:
+            return (
+                "is in a generated folder, from which the generator removes other files; delete it"
+            )
+        return (
+            "is in a generated folder, from which the generator removes what no demand needs; "
+            "delete it, and demand what you need with `demandops request`"
+        )
+    if root == BOOTSTRAP_ROOT:
+        return f"{lost}, and change demandops.yaml, inventory/ or policy/ instead"
+    if "/_charts/" in path:
+        return f"{lost}, and change registry/ instead"
+    if path.endswith("/_domain.yaml"):
+        return f"{lost}, and change policy/ instead"
+    if after is None:
+        return (
+            f"{lost}; to stop the release, delete its claims in ledger/, or deny it by an override "
+            "(docs/overrides.md)"
+        )
+    return f"{lost}, and change the configuration or write an override instead (docs/overrides.md)"
 
 
 @dataclass(frozen=True, slots=True)
