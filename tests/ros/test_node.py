@@ -164,8 +164,8 @@ def test_a_goal_that_the_journal_cannot_keep_is_rejected_and_the_log_says_why(
     served = serve()
     client.ready()
     assert client.call(connection(1)).status == "succeeded"
-    resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))
-    assert client.call({**connection(2), "id": "x" * (2 << 20)}).accepted is False
+    resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
+    assert client.call({**connection(2), "id": "x" * 900_000}).accepted is False
     assert re.search(
         r"goal 'x+.* rejected: the journal \S+/outbox\.jsonl cannot be written: File too large; "
         "check its disk, then send the demand again",
