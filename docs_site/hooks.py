@@ -108,7 +108,7 @@ def _moved(markdown: str, source: str, path: str) -> str:
         if target in OF_THE_ROOT:
             there = OF_THE_ROOT[target]
         elif target == "docs/decisions/":
-            there = "decisions/0001-differences-from-the-first-design.md"
+            there = "decisions/0002-names.md"
         elif target.startswith("docs/"):
             there = target.removeprefix("docs/")
         else:

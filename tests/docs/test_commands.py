@@ -23,7 +23,9 @@ LISTED = subprocess.run(
 PAGES = [
     page
     for page in LISTED
-    if not page.startswith(("docs/decisions/", "tests/", "state-repo-skeleton/", "CHANGELOG"))
+    if not page.startswith(
+        ("docs/decisions/", "tests/", "state-repo-skeleton/", "CHANGELOG", "changelog.d/")
+    )
 ]
 BLOCKS = {page: list(pages.blocks(ROOT.joinpath(page).read_text())) for page in PAGES}
 RUN = [page for page, found in BLOCKS.items() if any(block.tag == "run" for block in found)]

@@ -21,6 +21,6 @@ from tests.faults.trace import parse
         ('readlink("a", "/r/b", 4096) = 4', ["/r/here/a"]),
     ],
 )
-def test_the_files_of_a_call(line: str, paths: list[str]) -> None:
+def test_what_a_call_writes_is_not_taken_for_its_files(line: str, paths: list[str]) -> None:
     (call,) = parse(f"1 {line}\n", {}, Path("/r"), "/r/here")
     assert list(call.paths) == paths

@@ -540,7 +540,7 @@ class TestVerifyByDifferences:
         self.surrounded(played, request_json, lambda: played.commit(changed))
         assert all(row["holds"] for row in self.verdicts(demandops, played).values())
 
-    def test_a_persons_file_that_stood_in_place_of_a_folder(
+    def test_a_persons_file_that_stood_in_place_of_a_folder_holds(
         self, demandops: Run, played: Any, request_json: Run
     ) -> None:
         def replace() -> str:

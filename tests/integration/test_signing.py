@@ -326,7 +326,7 @@ class TestVerify:
         assert row["touched"] == [SIGNERS]
         assert row["signature"] == "is not signed, but policy/allowed-signers requires a signature"
 
-    def test_a_signature_of_another_commit(
+    def test_a_signature_of_another_commit_does_not_hold(
         self, demandops: Run, book: Run, state: Any, key: Path
     ) -> None:
         import pygit2
@@ -374,7 +374,7 @@ class TestVerify:
         )
 
     @pytest.mark.parametrize("separator", ["\u2028", "\u0085", "\x0b", "\x1c"])
-    def test_a_signer_whose_name_has_an_odd_character(
+    def test_a_signer_whose_name_has_an_odd_character_stops_no_verification(
         self, demandops: Run, book: Run, state: Any, key: Path, separator: str
     ) -> None:
         state.commit({SIGNERS: listed(key).replace("@", f"{separator}@")})

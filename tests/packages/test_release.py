@@ -1,9 +1,10 @@
-"""`make release` builds a wheel that works, and all files name the same version."""
+"""`make release` builds a wheel that works, of one version and with a changelog that tells all."""
 
 from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tarfile
@@ -35,6 +36,40 @@ def test_everything_has_the_same_version() -> None:
 def _version(manifest: str) -> str | None:
     found = re.search("<version>(.*)</version>", ROOT.joinpath(manifest).read_text())
     return found and found[1]
+
+
+def test_each_change_that_no_release_has_told_has_a_group() -> None:
+    groups = "demand|applications|placement|policy|overrides|audit|page|operations|gone"
+    readme = ROOT.joinpath("changelog.d/README.md").read_text()
+    assert all(f"`{group}`" in readme for group in groups.split("|"))
+    for path in ROOT.joinpath("changelog.d").iterdir():
+        if path.name != "README.md":
+            assert re.fullmatch(rf"[a-z0-9-]+\.({groups})\.md", path.name), path.name
+            assert len(path.read_text().splitlines()) == 1, path.name
+
+
+@pytest.mark.parametrize(
+    ("section", "told"),
+    [
+        ("## 0.0.1 (2026-11-21)", f"no section '## {demandops.__version__}'"),
+        (f"## {demandops.__version__} (2026-12-01)", "odd-names.audit.md"),
+    ],
+)
+def test_no_release_leaves_a_change_untold(tmp_path: Path, section: str, told: str) -> None:
+    for folder in ("deploy", "changelog.d"):
+        (tmp_path / folder).mkdir()
+    script = shutil.copy(ROOT / "deploy" / "release", tmp_path / "deploy")
+    (tmp_path / "CHANGELOG.md").write_text(f"# Changelog\n\n{section}\n")
+    (tmp_path / "changelog.d" / "odd-names.audit.md").write_text("Odd names are refused.\n")
+    done = subprocess.run(
+        [script],
+        env=os.environ | {"PYTHON": sys.executable},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout) == (1, ""), done
+    assert told in done.stderr
 
 
 @pytest.mark.slow

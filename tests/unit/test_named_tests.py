@@ -1,9 +1,11 @@
-"""Each test that the documentation names exists."""
+"""Each test and each function of the flow that the documentation names exists."""
 
 from __future__ import annotations
 
 import ast
 import re
+from importlib import import_module
+from operator import attrgetter
 from pathlib import Path
 
 import pytest
@@ -33,3 +35,11 @@ def test_a_test_that_a_page_names_exists(page: str) -> None:
     missing = [name for file, name, _ in named if name not in names_in(ROOT / file)]
     assert missing == []
     assert {scenario for _, _, scenario in named} - {""} <= set(running.scenarios())
+
+
+def test_each_function_on_the_path_of_a_demand_exists() -> None:
+    page = (ROOT / "docs" / "architecture.md").read_text()
+    path = re.findall(r"^\|[^|]*\| `([\w.]+)` \| `([\w.]+)` \|", page, re.MULTILINE)
+    assert len(path) > 30
+    for function, module in path:
+        assert callable(attrgetter(function)(import_module(module)))
