@@ -280,7 +280,15 @@ def _decided(
     if taken := list(name_clash.faults_in_files(request, changes, read)):
         raise Refused(taken)
     rendered = changeset.build_changeset(
-        state, after, changes, keys, state.evaluate, read, state.plans, checkpoint=checkpoint
+        state,
+        after,
+        changes,
+        keys,
+        state.evaluate,
+        read,
+        state.plans,
+        keeps_late=request.operation not in _OUTCOMES,  # a release waits for no template
+        checkpoint=checkpoint,
     )
     differing = list(
         version_difference.differences(request, state, after, changes.claims, rendered.plans)
