@@ -268,7 +268,7 @@ def _decided(
     if not request.adds_claims:  # what was booked must be released, however long that takes
         checkpoint = _unlimited
     if isinstance(request, Drain):
-        request = relocation.with_moves(request, state, state.usage(), MOST_TRIALS)
+        request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
     if isinstance(request, Restoration):
         request = relocation.with_restored_moves(request, state)
         faults = list(restoration.faults(request, state))

@@ -63,7 +63,9 @@ class Evaluator:
             state.usage()
             state.names()
             # what was booked must be released or restored, however long all of it takes
-            adds = isinstance(goal, dict) and not is_release(goal) and not Decommission.is_goal(goal)
+            adds = (
+                isinstance(goal, dict) and not is_release(goal) and not Decommission.is_goal(goal)
+            )
             with processor_time(each=DEMAND_S, together=DEMAND_S if adds else inf):
                 decision = decide(
                     state,
