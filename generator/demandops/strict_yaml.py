@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from types import MappingProxyType
-from typing import Any
+from typing import Any, TypeVar
 
 import yaml
 
@@ -52,9 +52,22 @@ _RESOLVER, _CONSTRUCTOR = yaml.resolver.Resolver(), yaml.constructor.SafeConstru
 _REPRESENTER = yaml.representer.SafeRepresenter()
 
 
-@lru_cache(16_384)
+_Result = TypeVar("_Result")
+_LONGEST_WORD = 1_000
+
+
+def _cached(function: Callable[[str], _Result]) -> Callable[[str], _Result]:
+    """Cache the results for short texts, because words repeat often.
+
+    Long ones, which requesters may send again and again, would fill the memory.
+    """
+    of_words = lru_cache(16_384)(function)
+    return lambda text: (of_words if len(text) <= _LONGEST_WORD else function)(text)
+
+
+@_cached
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes. Results are cached, because words repeat often."""
+    """Return the tag of a scalar without quotes."""
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
@@ -189,7 +202,7 @@ def _number(value: object) -> str:
     return str(_REPRESENTER.represent_data(value).value)
 
 
-@lru_cache(16_384)
+@_cached
 def _text(text: str) -> yaml.ScalarEvent:
     """Return PyYAML's event that writes a text, in quotes if a parser could misread the text."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
@@ -367,7 +380,7 @@ def _field(key: str, value: Any, indent: str) -> str:  # noqa: ANN401
     return f"\n{indent}{_scalar(key)}:{_block(value, inner)}"
 
 
-@lru_cache(16_384)
+@_cached
 def _scalar(text: str) -> str:
     style = _text(text).style
     if not style:

@@ -109,14 +109,15 @@ def faults_of(
     model: type[BaseModel],
     file: str = "",
     place: tuple[int | str, ...] = (),
+    most: int | None = None,
 ) -> list[Fault]:
-    """Return every fault of a failed validation.
+    """Return every fault of a failed validation, or the first ``most``.
 
     ``place`` is the path to the validated value in the file, ``()`` for the whole file.
     """
     return [
         fault(field_path((*place, *item["loc"])), _message(dict(item), model)).within(file)
-        for item in error.errors(include_url=False)
+        for item in error.errors(include_url=False)[:most]
         if not _is_wrongly_short(dict(item))
     ]
 

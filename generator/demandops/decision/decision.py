@@ -268,7 +268,7 @@ def _decided(
     if not request.adds_claims:  # what was booked must be released, however long that takes
         checkpoint = _unlimited
     if isinstance(request, Drain):
-        request = relocation.with_moves(request, state, state.usage(), MOST_TRIALS)
+        request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
     if isinstance(request, Restoration):
         request = relocation.with_restored_moves(request, state)
         faults = list(restoration.faults(request, state))
@@ -280,7 +280,15 @@ def _decided(
     if taken := list(name_clash.faults_in_files(request, changes, read)):
         raise Refused(taken)
     rendered = changeset.build_changeset(
-        state, after, changes, keys, state.evaluate, read, state.plans, checkpoint=checkpoint
+        state,
+        after,
+        changes,
+        keys,
+        state.evaluate,
+        read,
+        state.plans,
+        keeps_late=request.operation not in _OUTCOMES,  # a release waits for no template
+        checkpoint=checkpoint,
     )
     differing = list(
         version_difference.differences(request, state, after, changes.claims, rendered.plans)

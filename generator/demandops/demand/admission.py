@@ -67,6 +67,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 
 _NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
 """Fields of goals whose lists have no items of their own (:func:`items_of`)."""
+_FIELDS_OF_ITEM = 10
 _ITEMS = (
     "items (applications, connections, topics, requesters and so on, also of the connections that "
     "it needs)"
@@ -78,9 +79,15 @@ def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
 
     The check ends where the goal is too large, whatever it contains.
     """
-    length = items = 0
+    length = items = fields = 0
+    most_fields = max(1_000, _FIELDS_OF_ITEM * limits.demand_items)
     left: list[tuple[object, bool]] = [(goal, True)]
-    while left and length <= limits.demand_characters and items <= limits.demand_items:
+    while (
+        left
+        and length <= limits.demand_characters
+        and items <= limits.demand_items
+        and fields <= most_fields
+    ):
         value, counts = left.pop()
         if isinstance(value, str):
             length += len(value)
@@ -89,6 +96,7 @@ def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
             items += len(value) if counts else 0
             left += [(part, counts) for part in value]
         elif isinstance(value, dict):
+            fields += len(value)
             length += sum(1 + len(key) if isinstance(key, str) else 1 for key in value)
             left += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
         elif isinstance(value, int):
@@ -96,6 +104,9 @@ def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
     if length > limits.demand_characters:
         size = f"has more than {limits.demand_characters} characters"
         message = _too_large(size, "demandCharacters", limits.demand_characters)
+        yield fault("", message, code="too-large")
+    if fields > most_fields:
+        message = _too_large(f"has more than {most_fields} fields", "demandItems", most_fields)
         yield fault("", message, code="too-large")
     if items > limits.demand_items:
         size = f"lists more than {limits.demand_items} {_ITEMS}"

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 
 from demandops import strict_yaml
 from demandops.config.base_model import faults_of
-from demandops.errors import Fault, fault, field_path
+from demandops.errors import MOST_FAULTS, Fault, Refused, fault, field_path
 
 _DEEPEST = 100
 """How deeply a goal may be nested: as deeply as a YAML file of the state repo."""
@@ -30,12 +30,17 @@ def parse_valid_part(
         data: the goal.
         model: a model with a default for every field.
         lists_of_text: the fields of the model that are lists of text.
+
+    Raises:
+        Refused: with the first faults, if there are too many to look for others.
     """
     faults: list[Fault] = []
     pruned = _with_keys_of_text(data, (), faults)
     try:
         return model.model_validate(pruned), faults
     except ValidationError as error:
+        if error.error_count() > MOST_FAULTS:  # so many only show a mistake in each item again
+            raise Refused([*faults, *faults_of(error, model, most=MOST_FAULTS)]) from None
         faults += faults_of(error, model)
         for item in error.errors():
             pruned = _blank(pruned, item["loc"], lists_of_text)

@@ -68,6 +68,8 @@ def _processor_time() -> float:
 def _limit_memory(mib: int) -> None:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + mib * 1024 * 1024
+    # if the machine lacks memory, the kernel ends this process rather than the generator
+    Path("/proc/self/oom_score_adj").write_text("1000")
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

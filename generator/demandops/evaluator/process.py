@@ -116,8 +116,8 @@ class Evaluator:
             try:
                 return child, child.answer(files, task, seconds)
             except _Died as death:
-                # the kernel may have ended an idle child, to gain memory
-                if is_fresh or not death.is_killed:
+                # somebody may have ended an idle child, or it kept much of earlier evaluations
+                if is_fresh or death.is_late:
                     raise
             except BaseException:
                 child.kill()  # its answer was not read, so the next one would be taken for it
@@ -138,12 +138,12 @@ def _over(task: ValuesTask | SchemaTask, reason: str) -> OverLimit:
 class _Died(Exception):
     """Raised if a child ended, or was ended, before it answered. The text is the reason.
 
-    ``is_late``: it had no more time. ``is_killed``: somebody else ended it.
+    ``is_late``: it had no more time.
     """
 
-    def __init__(self, reason: str, *, is_late: bool = False, is_killed: bool = False) -> None:
+    def __init__(self, reason: str, *, is_late: bool = False) -> None:
         super().__init__(reason)
-        self.is_late, self.is_killed = is_late, is_killed
+        self.is_late = is_late
 
 
 class _Child:
@@ -161,6 +161,8 @@ class _Child:
             env={"LC_ALL": "C.UTF-8", "PYTHONHASHSEED": "0"},
             start_new_session=True,  # ctrl-c ends this process, which then ends the child
         )
+        assert self._process.stdin is not None  # noqa: S101
+        os.set_blocking(self._process.stdin.fileno(), False)  # a stopped child reads nothing
         self._files: Mapping[str, str] = MappingProxyType({})
 
     def answer(
@@ -178,21 +180,26 @@ class _Child:
         parts = {field.name: getattr(task, field.name) for field in fields(task)}
         question = _encoded({"files": changed, "seconds": seconds}) + _encoded(parts)
         assert self._process.stdin is not None  # noqa: S101 - both are pipes
+        descriptor, left = self._process.stdin.fileno(), memoryview(question)
         with suppress(BrokenPipeError):  # the child ended, as reading will show
-            self._process.stdin.write(question)
-            self._process.stdin.flush()
+            while left:
+                self._wait(descriptor, select.POLLOUT, seconds)
+                left = left[os.write(descriptor, left) :]
         return self._read(seconds)
+
+    def _wait(self, descriptor: int, event: int, seconds: float) -> None:
+        waiting = select.poll()
+        waiting.register(descriptor, event)
+        if not waiting.poll((_LONGEST_WAIT_S + 20 * seconds) * 1000):
+            self.kill()
+            raise _Died("gave no answer for a long time", is_late=True)
 
     def _read(self, seconds: float) -> dict[str, Any]:
         assert self._process.stdout is not None  # noqa: S101
         descriptor = self._process.stdout.fileno()
-        waiting = select.poll()
-        waiting.register(descriptor, select.POLLIN)
         pieces, length = list[bytes](), 0
         while not pieces or not pieces[-1].endswith(b"\n"):
-            if not waiting.poll((_LONGEST_WAIT_S + 20 * seconds) * 1000):
-                self.kill()
-                raise _Died("gave no answer for a long time", is_late=True)
+            self._wait(descriptor, select.POLLIN, seconds)
             piece = os.read(descriptor, 1_000_000)
             length += len(piece)
             if not piece or length > _LONGEST_ANSWER:
@@ -209,10 +216,7 @@ class _Child:
         self._close()
         if status == -signal.SIGPROF:
             return _Died(f"takes more than {seconds:.3g} s of processor time", is_late=True)
-        return _Died(
-            f"takes more than {MEMORY_MIB} MiB of memory, or is nested too deeply",
-            is_killed=status == -signal.SIGKILL,
-        )
+        return _Died(f"takes more than {MEMORY_MIB} MiB of memory, or is nested too deeply")
 
     def kill(self) -> None:
         self._process.kill()

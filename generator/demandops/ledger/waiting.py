@@ -114,11 +114,11 @@ def read(text: str, path: str) -> WaitingDemand | None:
     """
     try:
         file = parse_file(_WaitingFile, text, path)
+        if not demand_goal.is_demand_goal(file.goal):
+            return None
+        put, _ = demand_goal.parse(file.goal)  # the booking reports the goal's faults
     except InvalidInput:
         return None
-    if not demand_goal.is_demand_goal(file.goal):
-        return None
-    put, _ = demand_goal.parse(file.goal)  # the booking reports the goal's faults
     if not isinstance(put, Put) or put.demand != file.demand:
         return None
     since = parse_timestamp(file.since)

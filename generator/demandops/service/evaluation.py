@@ -6,6 +6,7 @@ A demand that fails gets the error as its answer. The other demands of the batch
 from __future__ import annotations
 
 import logging
+from math import inf
 
 from demandops.decision import Decision, Outcome, decide
 from demandops.demand.demand_request import Decommission
@@ -61,7 +62,11 @@ class Evaluator:
             # of all services, once for each configuration; that is not this demand's work
             state.usage()
             state.names()
-            with processor_time(each=DEMAND_S, together=DEMAND_S):
+            # what was booked must be released or restored, however long all of it takes
+            adds = (
+                isinstance(goal, dict) and not is_release(goal) and not Decommission.is_goal(goal)
+            )
+            with processor_time(each=DEMAND_S, together=DEMAND_S if adds else inf):
                 decision = decide(
                     state,
                     goal,

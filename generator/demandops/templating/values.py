@@ -9,6 +9,7 @@ time, and so does not know where the values are computed.
 from __future__ import annotations
 
 import json
+import re
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
@@ -29,6 +30,7 @@ from demandops.templating.template_sandbox import Sandbox
 
 _MAX_LENGTH = 100_000  # characters of a values template
 _MAX_RENDERED = 1_000_000  # characters that it writes; Kubernetes takes objects of 1.5 MB
+_ADDRESS = re.compile(" at 0x[0-9a-f]+")
 _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 
 
@@ -134,7 +136,9 @@ def _rendered(files: Mapping[str, str], task: ValuesTask) -> str:
         raise
     except Exception as error:  # whatever an expression raises, only the template's author mends it
         problem, line = f"{type(error).__name__}: {error}", _line(error, task.template)
-    raise InvalidInput([fault("", f"{problem}; fix the template", line=line).within(task.template)])
+    # each process has other addresses, and all generators must write the same problem report
+    message = f"{_ADDRESS.sub('', problem)}; fix the template"
+    raise InvalidInput([fault("", message, line=line).within(task.template)])
 
 
 def _line(error: Exception, template: str) -> int | None:

@@ -6,15 +6,17 @@ from pathlib import Path
 
 import pytest
 from demandops.errors import OverLimit
-from demandops.service import Generator
+from demandops.service import Generator, evaluation, rollback_goal
 
 from tests.kit import rig
 from tests.kit.config import skeleton
 from tests.kit.generator import receipt
-from tests.kit.goals import Goal
+from tests.kit.goals import CLOUD, Goal, application, put
+from tests.kit.goals import goal as request
 from tests.kit.repo import GitRepo
 from tests.kit.rig import Person, goal, leave
 
+SHARED = "appdefs/object-detection-fusion/values/object-detection.yaml.j2"
 TEMPLATE = "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
 ENDLESS = "{% for a in range(99999) %}{% for b in range(99999) %}{% endfor %}{% endfor %}"
 
@@ -54,3 +56,39 @@ def test_what_runs_keeps_its_files_and_may_leave(bare: Path, person: Person) -> 
         assert fusions(bare) == before
         rig.book(generator, leave(1))
     assert not fusions(bare)
+
+
+def test_what_shares_a_service_may_leave_and_is_renewed(bare: Path, person: Person) -> None:
+    def sharing(number: int) -> Goal:
+        app = application(f"edge/fusion-{number}", who=[f"user{number}"])
+        return request([app], id=f"demand-{number}")
+
+    leased = put("leased", topic=CLOUD, lease=600)
+    short = {key: leased[key] for key in ("kind", "demand", "requesters")}
+    with rig.running(bare) as generator:
+        rig.book(generator, sharing(1), sharing(2), leased)
+        person.change({path: ENDLESS + skeleton()[path] for path in (SHARED, TEMPLATE)})
+        assert refused(generator, sharing(3))
+        rig.book(generator, leased, short | {"operation": "renew"})
+        rig.book(generator, sharing(1) | {"shutdown": True})
+        assert {claim.subject.id for claim in generator.snapshot.state.ledger} >= {"edge/fusion-2"}
+        rig.book(generator, sharing(2) | {"shutdown": True}, short | {"operation": "release"})
+    assert not rig.claims(bare)
+
+
+def test_a_rollback_may_take_longer_than_a_demand(
+    bare: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(evaluation, "DEMAND_S", 0.05)  # hundreds of services take half a second
+    with rig.running(bare) as generator:
+        demands = []
+        for number in range(60):
+            app = application(f"edge/f-{number}", clouds=[(f"/p{number}", "vehicle00")])
+            demands.append(request([app], id=f"demand-{number}"))
+        rig.book(generator, *demands)
+        then = rig.tip(bare)
+        rig.book(generator, *(demand | {"shutdown": True} for demand in demands))
+        who = ("A person", "person@example.org")
+        back = rollback_goal.goal(then, drop_newer=False, reason="a test", who=who)
+        assert receipt(generator.submit(back)).outcome == "restored"
+    assert len(rig.claims(bare)) == 60

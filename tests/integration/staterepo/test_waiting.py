@@ -5,13 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from demandops.evaluator.process import processor_time
 from demandops.ledger import waiting
 from demandops.service import Generator
+from demandops.service.timing.waiting_turns import WaitingTurns
+from demandops.staterepo.write.commit_batch import CommitBatch
 from demandops.staterepo.write.journal import JournalEntry
 from demandops.staterepo.write.slot import Slot
 
+from tests.integration.staterepo.test_hanging_template import ENDLESS, TEMPLATE
 from tests.kit import rig
 from tests.kit.clock import Clock
+from tests.kit.goals import link
 from tests.kit.repo import read as file_of
 from tests.kit.rig import Person
 from tests.kit.turns import Turns
@@ -134,3 +139,22 @@ def test_waiting_demands_are_tried_in_rounds_until_all_were_tried(
         person.change({NODES: nodes}, "Room for all")
         generator.fetch_now()
         rig.wait_until(lambda: len(_runs(bare)) == 6, "all waiting demands to be booked")
+
+
+def test_a_round_ends_with_a_demand_whose_template_takes_too_long(
+    bare: Path, person: Person
+) -> None:
+    person.change(_with_room_for_one(bare), "One at a time")
+    with rig.running(bare) as generator:
+        rig.book(generator, *(_put(name) for name in "abc"))
+        nodes = file_of(bare, NODES).replace("{cpu: 1}", "{cpu: 9}")
+        template = file_of(bare, TEMPLATE)
+        person.change({NODES: nodes, TEMPLATE: ENDLESS + template}, "Room, and no end")
+        rig.book(generator, link(1))
+        turns = WaitingTurns(generator._repository.runtime)
+        with processor_time(0.1):
+            turns.book_due(CommitBatch(generator._repository, generator.snapshot))
+        assert turns.has_more
+        person.change({TEMPLATE: template}, "An end")
+        rig.book(generator, link(2))
+        rig.wait_until(lambda: _runs(bare)[-3:] == ["of-a", "of-b", "of-c"], "all to be booked")

@@ -6,13 +6,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import yaml
 from demandops import naming
 from demandops.demand import demand_goal
-from demandops.errors import Refused, suggestion
+from demandops.errors import MOST_FAULTS, Refused, suggestion
 
 from tests.kit.config import brokers, skeleton
 from tests.kit.goals import (
@@ -241,6 +243,22 @@ def test_a_demand_that_lists_too_much_is_refused_at_once() -> None:
         "also of the connections that it needs), but at most 10000 are allowed; a platform "
         "engineer may raise limits.demandItems in demandops.yaml"
     ]
+
+
+@pytest.mark.parametrize("key", ["k{}".format, int])
+def test_a_demand_with_too_many_fields_is_refused_at_once(key: Callable[[int], Any]) -> None:
+    fields = {key(number): 0 for number in range(2_000)}
+    refused = MemoryRepo().take(put("d") | {"applications": [fields] * 60})
+    assert isinstance(refused, Refused)
+    assert [found.code for found in refused.faults] == ["too-large"]
+
+
+def test_of_many_faults_of_form_the_first_are_told() -> None:
+    fields = {f"k{number}": 0 for number in range(2_000)}
+    refused = MemoryRepo().take(put("d") | {"applications": [fields] * 2})
+    assert isinstance(refused, Refused)
+    assert len(refused.faults) == MOST_FAULTS
+    assert "applications[0].k0" in {found.field for found in refused.faults}
 
 
 def test_every_item_of_a_demand_counts_towards_the_limit() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import resource
 import signal
 import threading
 from collections.abc import Mapping
@@ -14,6 +15,7 @@ import pytest
 from demandops.config.load import load
 from demandops.decision import State, try_configuration
 from demandops.errors import InvalidInput, OverLimit
+from demandops.evaluator import process as process_module
 from demandops.evaluator.process import Evaluator, processor_time
 from demandops.ledger.ledger import Ledger
 from demandops.templating.values import SchemaTask, ValuesTask, evaluate
@@ -153,6 +155,48 @@ def test_a_child_that_somebody_ended_is_replaced(shared: Evaluator) -> None:
         os.kill(child._process.pid, signal.SIGKILL)
         child._process.wait()
     assert values("x: 1", on=shared) == {"x": 1}
+
+
+def test_a_child_that_kept_too_much_of_earlier_evaluations_is_replaced(shared: Evaluator) -> None:
+    assert values("x: 1", on=shared) == {"x": 1}
+    for child in shared._idle:
+        resource.prlimit(child._process.pid, resource.RLIMIT_AS, (2**20, 2**20))
+    assert values("x: {{ ('a' * 9999999) | length }}", on=shared) == {"x": 9999999}
+
+
+def test_a_child_that_somebody_stopped_is_given_up(
+    shared: Evaluator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert values("x: 1", on=shared) == {"x": 1}
+    stopped = [child._process for child in shared._idle]
+    for process in stopped:
+        process.send_signal(signal.SIGSTOP)
+    monkeypatch.setattr(process_module, "_LONGEST_WAIT_S", 0)
+    more_than_a_pipe_holds = {"a.j2": "x: 1", "b.j2": "x" * 999_999}
+    for _ in stopped:
+        with processor_time(SECONDS), pytest.raises(OverLimit):
+            shared(more_than_a_pipe_holds, task())
+    assert [process.poll() for process in stopped] == [-signal.SIGKILL] * len(stopped)
+
+
+def test_if_memory_is_short_the_kernel_ends_the_child_first(shared: Evaluator) -> None:
+    assert values("x: 1", on=shared) == {"x": 1}
+    adjustments = [f"/proc/{child._process.pid}/oom_score_adj" for child in shared._idle]
+    assert {Path(path).read_text().strip() for path in adjustments} == {"1000"}
+
+
+@pytest.mark.parametrize(
+    "expression",
+    ["{}[joiner()]", "[1].index(joiner())", "'a'[range]", "{}['a'.upper]", "[[]][{}.get]"],
+)
+def test_every_process_gives_the_same_faults(expression: str) -> None:
+    faults = set()
+    for _ in range(2):
+        with pytest.raises(InvalidInput) as error:
+            values(f"x: {{{{ {expression} }}}}")
+        faults.add(error.value.faults)
+    assert len(faults) == 1
+    assert "0x" not in str(faults)
 
 
 def test_threads_do_not_wait_for_each_other(shared: Evaluator) -> None:

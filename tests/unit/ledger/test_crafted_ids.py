@@ -17,15 +17,18 @@ from demandops import naming
 from demandops.config.load import load
 from demandops.config.registry import Chart
 from demandops.connections import ros
-from demandops.decision import Decision, rendered_files
+from demandops.decision import Decision, decide, rendered_files
+from demandops.demand.application import Requirement
 from demandops.demand.claim import ClaimKey, demand_id
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file, kept_replicas, waiting
 from demandops.ledger.claim_changes import Changes
+from demandops.ledger.operations.drain import Drain
 from demandops.ledger.recent_shutdowns import RecentShutdown, RecentShutdowns
 from demandops.ledger.waiting import Wait, WaitingDemand
 from demandops.plan import output_topics
 from demandops.plan.checks import name_clash
+from demandops.plan.nodes.relocation import following_overrides
 from demandops.plan.release import ServiceKey
 from demandops.subject import Subject, SubjectKind
 from hypothesis import given
@@ -34,9 +37,9 @@ from pydantic import ValidationError
 
 from tests.appdefs.test_scaling import books, demand
 from tests.kit.chance import chances, examples, told
-from tests.kit.config import configuration, skeleton
+from tests.kit.config import configuration, override, skeleton, state_of
 from tests.kit.goals import CLOUD, Goal, application, connection, goal, put
-from tests.kit.memory import NOW, MemoryRepo, ledger_in
+from tests.kit.memory import NOW, MemoryRepo, ledger_in, rebuilt
 from tests.kit.plain_yaml import FAST
 
 NODES = "inventory/nodes.yaml"
@@ -245,6 +248,61 @@ def test_two_service_instances_keep_replicas_in_two_files() -> None:
 
 def key_of(id: str) -> ClaimKey:
     return ClaimKey(Subject(SubjectKind.APPLICATION, id), id)
+
+
+def reading(id: str, topic: str, **where: object) -> Goal:
+    """Return a demand whose shared service has a name made from the topic and the node."""
+    inputs = {"point_cloud": [{"topic": topic, "source": "vehicle00"}]}
+    app = {"id": id, "type": "object-detection-fusion", "connect": "none", "inputs": inputs}
+    made = {"kind": "Demand", "demand": id, "requesters": ["vehicle00"]}
+    return made | {"applications": [app | where]}
+
+
+def rivals_at(node: str) -> str:
+    """Return a topic whose service on ``node`` has the name of the one for ``/p/a``."""
+    probe = alone().copy()
+    probe.send(reading("probe", "/p/a", node=node))
+    for number in range(1, 1000):
+        other = f"/p{'_' * (number % 30)}/{'_' * (number // 30)}a"
+        taken = probe.copy().take(reading("rival", other, node=node))
+        if isinstance(taken, Refused) and "release" in str(taken):
+            return other
+    raise AssertionError("no topic has the same name")
+
+
+@pytest.mark.usefixtures("short_digests")
+def test_a_name_that_is_taken_keeps_one_application_on_a_drained_node_and_no_other() -> None:
+    repo = alone().copy()
+    repo.send(reading("a", "/p/a", node="cloud"))
+    repo.send(reading("b", "/q/b", node="cloud"))
+    placed = (
+        replace(one, held=replace(one.application, place=Requirement(role="edge")))
+        for one in repo.state.ledger
+    )
+    repo.state = state_of(repo.config, rebuilt(placed))
+    repo.send(reading("x", rivals_at("edge"), node="edge"))
+    cloud = repo.config.nodes["cloud"].model_copy(update={"drained": True})
+    config = replace(repo.config, nodes={**repo.config.nodes, "cloud": cloud})
+    drained = decide(replace(repo.state, config=config), Drain("cloud"), NOW, repo.files.get)
+    assert isinstance(drained.request, Drain)
+    assert [text.split("'")[1] for text in drained.request.moved] == ["b"]
+    assert [text.split("'")[1] for text in drained.request.stays] == ["a"]
+
+
+@pytest.mark.usefixtures("short_digests")
+@pytest.mark.parametrize("ends", [False, True])
+def test_a_name_that_is_taken_stops_neither_begin_nor_end_of_an_override(ends: bool) -> None:
+    moving = {"overrides/move.yaml": override({"applications": ["a", "b"]}, node="cloud")}
+    repo, later = (MemoryRepo(moving), None) if ends else (alone().copy(), moving)
+    repo.send(reading("a", "/p/a", node="edge"))
+    repo.send(reading("b", "/q/b", node="edge"))
+    here = "edge" if ends else "cloud"
+    repo.send(reading("x", rivals_at(here), node=here))
+    state = state_of(load(configuration(later)), repo.state.ledger)
+    ledger = following_overrides(state).ledger
+    assert ledger.application("a") == repo.state.ledger.application("a")
+    assert ledger.application("b") != repo.state.ledger.application("b")
+    rendered_files(replace(state, ledger=ledger))
 
 
 def test_no_two_releases_of_one_name_are_rendered(monkeypatch: pytest.MonkeyPatch) -> None:

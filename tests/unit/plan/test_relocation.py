@@ -140,11 +140,11 @@ def test_a_drain_in_parts_moves_the_same_applications_and_skips_none() -> None:
         for one in repo.state.ledger
     )
     repo.state = state = state_of(with_nodes(config, "cloud"), ledger)
-    whole = with_moves(Drain("cloud"), state, state.usage())
+    whole = with_moves(Drain("cloud"), state, state.usage(), state.names())
     assert len(whole.moved) == 3 and len(whole.stays) == 2 and not whole.last
     parts, after = [], ""
     while True:
-        part = with_moves(Drain("cloud", after=after), state, state.usage(), most=2)
+        part = with_moves(Drain("cloud", after=after), state, state.usage(), state.names(), most=2)
         parts.append(part)
         after = part.last
         if not after:

@@ -7,6 +7,7 @@ mixture of both, so a scalar without quotes must be text in both.
 from __future__ import annotations
 
 import re
+import tracemalloc
 from collections.abc import Iterable, Iterator
 from typing import Any
 
@@ -246,3 +247,15 @@ def test_a_file_that_is_too_long_is_not_parsed() -> None:
 def test_no_key_is_set_in_what_is_no_yaml(text: str) -> None:
     with pytest.raises(InvalidInput, match="not valid YAML"):
         strict_yaml.set_key(text, "key", 1)
+
+
+def test_long_texts_are_not_kept_in_memory() -> None:
+    tracemalloc.start()
+    try:
+        for number in range(100):
+            text = f"{number:03}" + "a" * 100_000
+            assert strict_yaml.load(strict_yaml.dump({"text": text})) == {"text": text}
+            assert strict_yaml.load(f"text: {text}") == {"text": text}
+        assert tracemalloc.get_traced_memory()[0] < 2_000_000
+    finally:
+        tracemalloc.stop()

@@ -18,11 +18,11 @@ from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import DemandRequest
 from demandops.errors import Fault, InvalidInput, Refused, fault
 from demandops.ledger import claim_file, kept_replicas, waiting
-from demandops.ledger.claim_changes import Changes
+from demandops.ledger.claim_changes import Changes, ClaimChange
 from demandops.ledger.world import World
 from demandops.plan.checks.topic_clash import words
 from demandops.plan.planner import service_name
-from demandops.plan.release_keys import ReleaseKey, is_needed, keys_of_claims
+from demandops.plan.release_keys import ReleaseKey, affected_keys, is_needed, keys_of_claims
 
 _Reader: TypeAlias = Callable[[str], "str | None"]
 
@@ -35,6 +35,8 @@ Names: TypeAlias = "HashTrieMap[Name, HashTrieSet[ReleaseKey]]"
 The releases of suspended claims count too, because they will run again. A key that no claim needs
 any longer may be left; :func:`demandops.plan.release_keys.is_needed` tells.
 """
+
+NONE: Names = HashTrieMap()
 
 
 def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
@@ -59,7 +61,7 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
 def all_names(world: World) -> Names:
     """Return the names of all releases. This takes time for a large ledger."""
     keys = (key for claims in world.ledger.claims.values() for key in keys_of_claims(world, claims))
-    return with_keys(HashTrieMap(), world, dict.fromkeys(keys))
+    return with_keys(NONE, world, dict.fromkeys(keys))
 
 
 def with_keys(names: Names, world: World, keys: Iterable[ReleaseKey]) -> Names:
@@ -77,6 +79,13 @@ def without_keys(names: Names, world: World, keys: Iterable[ReleaseKey]) -> Name
             left = (names.get(name) or HashTrieSet()).discard(key)
             names = names.insert(name, left) if left else names.discard(name)
     return names
+
+
+def followed(names: Names, before: World, after: World, changes: Iterable[ClaimChange]) -> Names:
+    """Return the names in ``after``, given those in ``before`` and the changes of claims."""
+    keys = affected_keys(before, after, changes)
+    needed = (key for key in keys if is_needed(after, key))
+    return with_keys(without_keys(names, before, keys), after, needed)
 
 
 def faults(

@@ -26,7 +26,8 @@ from demandops.ledger.operations.conflicts import conflicts
 from demandops.ledger.operations.drain import Drain
 from demandops.ledger.operations.restoration import Restoration, request_for
 from demandops.ledger.world import World
-from demandops.plan.checks import quota, topic_clash
+from demandops.plan.checks import name_clash, quota, topic_clash
+from demandops.plan.checks.name_clash import Names
 from demandops.plan.nodes.capacity import Room, Usage
 from demandops.plan.nodes.choice import (
     MOST_TRIED,
@@ -40,19 +41,23 @@ from demandops.plan.nodes.choice import (
 )
 from demandops.plan.nodes.moved_connections import Move, renaming, with_moved
 from demandops.plan.overrides.claim_overrides import suspended_by
+from demandops.plan.release_keys import affected_keys
 from demandops.quoting import quoted
 from demandops.subject import Subject, SubjectKind
 
 _ANY = Requirement()
 
 
-def with_moves(request: Drain, world: World, usage: Usage, most: float = inf) -> Drain:
+def with_moves(
+    request: Drain, world: World, usage: Usage, names: Names, most: float = inf
+) -> Drain:
     """Return ``request`` with the moves of all applications and services that can leave the node.
 
     Args:
         request: the drain; its ``id`` is the node.
         world: the claims and the configuration.
         usage: what services request on each node in ``world``.
+        names: the names of all releases in ``world``.
         most: after so many tried nodes, the other applications are left for another drain.
     """
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
@@ -72,12 +77,12 @@ def with_moves(request: Drain, world: World, usage: Usage, most: float = inf) ->
             found: _Moved | str = next(filter(None, fixed), "")
             tried += 1
             if not found:
-                found, count = _moved(world, claims, room, service)
+                found, count = _moved(world, claims, room, names, service)
                 tried += count
             if isinstance(found, str):
                 stays.append(f"{what[0]} stays, because {found}")
                 continue
-            world, chosen, touched = found
+            world, chosen, touched, names = found
             # ``world`` has the application on its new node, so ``room`` must count it on this node
             for each in ids:
                 room.book(world.ledger.application_claims(each))
@@ -89,7 +94,7 @@ def with_moves(request: Drain, world: World, usage: Usage, most: float = inf) ->
     return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays), last=last)
 
 
-_Moved = tuple[World, Chosen, list[ClaimKey]]
+_Moved = tuple[World, Chosen, list[ClaimKey], Names]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
@@ -145,12 +150,13 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
 
 
 def _moved(
-    world: World, claims: tuple[Claim, ...], room: Room, service: Service | None
+    world: World, claims: tuple[Claim, ...], room: Room, names: Names, service: Service | None
 ) -> tuple[_Moved | str, int]:
     """Return the world with an application, or only its ``service``, moved to the best other node.
 
-    The result also has the chosen node and the keys of the changed claims. If no move is possible,
-    the result is the reason as a text. The second value is how many nodes were tried.
+    The result also has the chosen node, the keys of the changed claims, and the names after the
+    move. If no move is possible, the result is the reason as a text. The second value is how many
+    nodes were tried.
     """
     required = reduce(Requirement.united, (one.application.place or _ANY for one in claims))
     required = requirement_of(service) if service else required
@@ -166,14 +172,16 @@ def _moved(
     renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
     for chosen in islice(choice.candidates({}), MOST_TRIED):
         if route := renamed.get(chosen.node):
-            names = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
-            reasons.append(f"on {quoted(chosen.node)} {names}")
+            topics = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
+            reasons.append(f"on {quoted(chosen.node)} {topics}")
             continue
         move = partial(on_node, node=chosen.node, service=service, world=world)
         after, changes = with_moved(world, claims, move)
-        fault = next(_faults(world, after, changes), None)
+        moved_names = name_clash.followed(names, world, after, changes)
+        fault = next(_faults(world, after, changes, moved_names), None)
         if fault is None:
-            return (after, chosen, [change.key for change in changes]), len(reasons) + 1
+            keys = [change.key for change in changes]
+            return (after, chosen, keys, moved_names), len(reasons) + 1
         reasons.append(f"on {quoted(chosen.node)} {fault.message}")
     return sentences(reasons) or choice.none_fits({}).message, len(reasons)
 
@@ -216,19 +224,25 @@ def following_overrides(
         if app is not None and change(app) != app
     ]
     together, left = wanted, list[str]()
+    names = name_clash.all_names(world) if wanted else name_clash.NONE
     while together:  # applications that share a service must move at the same time
-        after, changes = _all_moved(world, together, change)
-        wrong = [id for id, of in changes.items() if next(_faults(world, after, of), None)]
+        after, changes, moved_names = _all_moved(world, together, change, names)
+        wrong = [
+            id for id, of in changes.items() if next(_faults(world, after, of, moved_names), None)
+        ]
         if not wrong:
             break
         together, left = [id for id in together if id not in wrong], [*left, *wrong]
     keys, stays = list[ClaimKey](), list[tuple[str, str]]()
     for ids in filter(None, (together, *([one] for one in left))):
-        after, changes = _all_moved(world, ids, change)
-        faults = (found for of in changes.values() for found in _faults(world, after, of))
+        after, changes, moved_names = _all_moved(world, ids, change, names)
+        faults = (
+            found for of in changes.values() for found in _faults(world, after, of, moved_names)
+        )
         fault = None if ids is together else next(faults, None)
         if fault is None:
-            world, keys = after, [*keys, *(one.key for of in changes.values() for one in of)]
+            world, names = after, moved_names
+            keys += [one.key for of in changes.values() for one in of]
         else:
             stays += _unmoved(ids[0], world, fault)
     return LedgerAfterMoves(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
@@ -251,12 +265,13 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
 
 
 def _all_moved(
-    world: World, applications: Iterable[str], move: Move
-) -> tuple[World, dict[str, tuple[ClaimChange, ...]]]:
-    changes: dict[str, tuple[ClaimChange, ...]] = {}
+    before: World, applications: Iterable[str], move: Move, names: Names
+) -> tuple[World, dict[str, tuple[ClaimChange, ...]], Names]:
+    world, changes = before, dict[str, tuple[ClaimChange, ...]]()
     for id in applications:
         world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
-    return world, changes
+    every = [one for of in changes.values() for one in of]
+    return world, changes, name_clash.followed(names, before, world, every)
 
 
 def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
@@ -276,8 +291,13 @@ def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
             )
 
 
-def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> Iterator[Fault]:
-    """Yield the faults of moved claims; each claim is checked as if it were demanded now."""
+def _faults(
+    before: World, after: World, changes: tuple[ClaimChange, ...], names: Names
+) -> Iterator[Fault]:
+    """Yield the faults of moved claims; each claim is checked as if it were demanded now.
+
+    ``names`` are those of all releases in ``after``.
+    """
     for change in changes:
         claim = change.after
         if claim is None:
@@ -294,6 +314,8 @@ def _faults(before: World, after: World, changes: tuple[ClaimChange, ...]) -> It
         if change.after:
             yield from topic_clash.faults_of_claim(change.after, before, after)
             yield from _brought_twice(change.after, after)
+    keys = affected_keys(before, after, changes)
+    yield from name_clash.faults(Drain(""), before, after, keys, Changes(changes), names)
 
 
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:

@@ -21,6 +21,7 @@ from demandops.demand.permission import PEERS, needed_access
 from demandops.errors import MOST_FAULTS, Fault, fault
 from demandops.ledger.operations.drain import Drain
 from demandops.ledger.world import World
+from demandops.plan.checks.name_clash import all_names
 from demandops.plan.nodes.capacity import overcommitted, whole_usage
 from demandops.plan.nodes.choice import lacks, requirement_of, unmet
 from demandops.plan.nodes.relocation import following_overrides, with_moves
@@ -53,7 +54,7 @@ def _drained(world: World) -> Iterator[Fault]:
     """
     for node in world.config.drained_nodes:
         if world.ledger.applications_on.get(node):
-            drain = with_moves(Drain(node), world, whole_usage(world))
+            drain = with_moves(Drain(node), world, whole_usage(world), all_names(world))
             file = world.config.file_of(NODES_FILE, world.config.host_of(node))
             for text in (*drain.moved, *drain.stays):
                 yield fault("", f"'{node}' is drained: {text}").within(file)

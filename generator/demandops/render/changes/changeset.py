@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
+from demandops.config.config import Config
 from demandops.config.repo_settings import ROOT_FILE
 from demandops.errors import OverLimit, Refused, fault
 from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
@@ -96,7 +97,7 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
         read: returns the text of a file of the state repo before the change.
         plans: releases of ``before`` that the caller has planned already.
         keeps_late: whether a release whose values take too long to compute keeps its file, instead
-            of OverLimit.
+            of OverLimit. A release that does not change keeps it in any case.
         checkpoint: called for each file and release; it may raise an exception to end the work.
 
     Raises:
@@ -132,6 +133,7 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
         checkpoint()
         now[key] = plan(after, key)
         former[key] = plans.get(key) or _plan_leniently(before, key)
+    texts = _Texts(after.config, evaluate)
     for key, new in now.items():
         checkpoint()
         old = former[key]
@@ -139,9 +141,9 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
         new_path = path_of(new) if new else None
         current = read(new_path) if new_path else None
         try:
-            text = release_file.release_text(new, after.config, evaluate, current) if new else None
+            text = texts.of(new, current) if new else None
         except OverLimit:
-            if keeps_late:
+            if keeps_late or old == new:  # what only renews a lease needs no template
                 continue
             raise
         if old_path and old_path != new_path and read(old_path) is not None:
@@ -198,7 +200,7 @@ def render_all(
     """
     config = world.config
     files = manifests.base_files(config)
-    late = set[str]()  # the templates that took too long for a release; no other waits for them
+    texts = _Texts(config, evaluate)
     keys = tuple(keys)
     name_clash.refuse_shared_names(world, keys)
     for key in keys:
@@ -206,21 +208,38 @@ def render_all(
         if release is None:
             continue
         path = path_of(release)
-        template = (
-            config.values_template(release.service) if isinstance(release, ServiceRelease) else ""
-        )
-        if template not in late:
-            try:
-                files[path] = release_file.release_text(
-                    release, config, evaluate, current.get(path)
-                )
-            except OverLimit:
-                if not keeps_late:
-                    raise
-                late.add(template)
-        if template in late and path in current:
-            files[path] = current[path]
+        try:
+            files[path] = texts.of(release, current.get(path))
+        except OverLimit:
+            if not keeps_late:
+                raise
+            if path in current:
+                files[path] = current[path]
     return files | release_file.kept_charts(files, current, world)
+
+
+class _Texts:
+    """The texts of releases. A template that took too long for one is not tried for others."""
+
+    def __init__(self, config: Config, evaluate: Evaluate) -> None:
+        self._config, self._evaluate = config, evaluate
+        self._late: dict[str, OverLimit] = {}
+
+    def of(self, release: Release, current: str | None) -> str:
+        """Return the text of a release's file; ``current`` is its text in the state repo.
+
+        Raises OverLimit if the release, or an earlier one of its template, takes too long.
+        """
+        template = ""
+        if isinstance(release, ServiceRelease):
+            template = self._config.values_template(release.service)
+        if template in self._late:
+            raise self._late[template]
+        try:
+            return release_file.release_text(release, self._config, self._evaluate, current)
+        except OverLimit as error:
+            self._late[template] = error
+            raise
 
 
 def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:

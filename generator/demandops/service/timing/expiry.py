@@ -14,7 +14,7 @@ from datetime import datetime, timedelta, timezone
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Expire
-from demandops.errors import InvalidInput
+from demandops.errors import InvalidInput, OverLimit
 from demandops.ledger.kept_replicas import Instance
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
@@ -176,6 +176,8 @@ class ScaleDown:
                 self._retry_at[instance] = now + _RETRY
                 for problem in error.faults:
                     log.error("cannot scale down: %s; trying again later", problem)
+                if isinstance(error, OverLimit):  # the next may take as long, and demands wait
+                    break
 
     def postpone(self, now: datetime) -> None:
         """For a minute, count no scale-down as due, because a fetch or a publication failed.

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 
 from demandops.decision import State, decide
-from demandops.errors import InvalidInput
+from demandops.errors import InvalidInput, OverLimit
 from demandops.ledger.waiting import in_turn
 from demandops.ledger.world import World
 from demandops.quoting import quoted
@@ -44,25 +44,26 @@ class WaitingTurns:
             self._left = [one.demand for one in in_turn(state.ledger.waiting)]
         end = self._runtime.processor_s() + _LONGEST_ROUND_S
         while self._left:
-            self._book_if_it_fits(commits, self._left.pop(0))
-            if self._runtime.processor_s() > end:
+            if self._is_late(commits, self._left.pop(0)) or self._runtime.processor_s() > end:
                 break
         self._tried = commits.head.state
 
-    def _book_if_it_fits(self, commits: CommitBatch, demand: str) -> None:
+    def _is_late(self, commits: CommitBatch, demand: str) -> bool:
+        """Book a waiting demand if it fits; return whether a template took too long for it."""
         state, now = commits.head.state, self._runtime.now()
         waiting = state.ledger.waiting.get(demand)
         if waiting is None:  # it was released meanwhile
-            return
+            return False
         checkpoint = within(state.config.repo_settings.limits, self._runtime)
         try:
             decision = decide(state, dict(waiting.goal), now, commits.read, checkpoint=checkpoint)
         except InvalidInput as error:
             log.debug("demand %s still waits: %s", quoted(demand), error)
-            return
+            return isinstance(error, OverLimit)
         if decision.outcome == "booked" and not decision.approval:
             commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
             log.info("demand %s no longer waits", quoted(demand))
+        return False
 
     def follow(self, commits: CommitBatch, before: State) -> None:
         """Book waiting demands if the last demand freed room.
