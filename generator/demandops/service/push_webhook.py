@@ -69,6 +69,8 @@ class PushWebhook:
 
     async def _handle(self, request: Request) -> PlainTextResponse:
         """Answer a request; if it is a valid notification, report the push."""
+        if "origin" in request.headers or "sec-fetch-site" in request.headers:
+            return PlainTextResponse("a browser asked for this, not a Git server\n", 403)
         digest, length = hmac.new(self._secret, digestmod=hashlib.sha256), 0
         too_long = PlainTextResponse("the body is too long\n", 413)
         if int(request.headers.get("Content-Length", "0")) > _MAX_BODY:
