@@ -60,7 +60,7 @@ class HttpServer:
         config = uvicorn.Config(
             application,
             http=Connection,
-            # as many are accepted before any is read, so all of them must fit; more wait in the kernel
+            # so many are accepted before any is read, so all must fit; more wait in the kernel
             backlog=at_once // 2,
             ws="none",
             lifespan="off",

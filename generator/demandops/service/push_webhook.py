@@ -23,7 +23,7 @@ from demandops.service.http_server import HttpServer
 log = logging.getLogger("demandops")
 
 _PATH = "/push"
-_AT_ONCE = 16
+_AT_ONCE = 32
 _MAX_BODY = 25 << 20
 """The largest body that GitHub sends, in bytes; a body is hashed and not stored."""
 _WARN_EVERY_S = 60.0

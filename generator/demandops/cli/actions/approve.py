@@ -31,8 +31,8 @@ commit_option = click.option(
     "--commit",
     metavar="ID",
     default="",
-    help="The whole id of the commit that you looked at. If the branch is at another commit, nothing "
-    "is changed.",
+    help="The whole id of the commit that you looked at. If the branch is at another commit, "
+    "nothing is changed.",
 )
 
 
