@@ -15,8 +15,8 @@ from typing import Any
 LONGEST_LINE = 4000
 """The longest line of text from outside, in characters; the rest is cut off."""
 
-_INVISIBLE = "\u034f\u115f-\u1160\u17b4-\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0"
-_HIDDEN = re.compile(f"[{_INVISIBLE}\U000e0100-\U000e01ef]")
+_INVISIBLE = "\u034f\u115f-\u1160\u17b4-\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0"
+_HIDDEN = re.compile(f"[{_INVISIBLE}\U0001d159\U000e0100-\U000e01ef]")
 """Matches characters that are displayed as nothing, although Python calls them printable."""
 _BMP = 0xFFFF
 

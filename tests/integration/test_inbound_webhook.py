@@ -9,7 +9,7 @@ import logging
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import ExitStack, closing, suppress
 from urllib.parse import urlsplit
 
 import pytest
@@ -138,6 +138,14 @@ def test_without_a_secret_whoever_is_on_this_machine_is_heard(
     assert heard.times == 2
 
 
+@pytest.mark.parametrize("header", ["Origin", "Sec-Fetch-Site"])
+def test_what_another_site_makes_a_browser_send_is_refused(
+    unsigned: PushWebhook, heard: Heard, header: str
+) -> None:
+    assert send(unsigned, {header: "null"})[0] == 403
+    assert heard.times == 0
+
+
 def test_what_else_is_asked_is_answered_and_does_nothing(signed: PushWebhook, heard: Heard) -> None:
     github = GENUINE["github"]
     assert send(signed, method="GET", path="/", body=None) == (200, "ok")
@@ -217,9 +225,32 @@ def test_however_many_connections_wait_health_and_pushes_are_answered(
             raw.sendall(head[: number + 1] if number % 2 else head)
     assert send(signed, method="GET", path="/", body=None) == (200, "ok")
     assert send(signed, GENUINE["gitea"])[0] == 202
-    assert all(_is_cut_off(raw) for raw in held[:84])
+    assert all(_is_cut_off(raw) for raw in held[:68])
     for raw in held:
         raw.close()
+
+
+def test_of_many_that_connect_at_once_the_first_is_answered() -> None:
+    began, ended = threading.Event(), threading.Event()
+
+    def push() -> None:  # the server accepts nobody meanwhile
+        began.set()
+        ended.wait(PATIENCE_S)
+
+    hook = PushWebhook("127.0.0.1:0", b"", push)
+    with ExitStack() as stack:
+        stack.callback(hook.close)
+        pushing = stack.enter_context(closing(_connected(hook)))
+        pushing.sendall(b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 0\r\n\r\n")
+        assert began.wait(PATIENCE_S)
+        health = stack.enter_context(closing(_connected(hook)))
+        health.sendall(b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")
+        for _ in range(100):
+            silent = stack.enter_context(socket.socket())
+            silent.setblocking(False)
+            silent.connect_ex(health.getpeername())
+        ended.set()
+        assert health.recv(12) == b"HTTP/1.1 200"
 
 
 def test_who_sends_a_body_in_tiny_chunks_is_cut_off(signed: PushWebhook) -> None:

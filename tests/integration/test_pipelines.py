@@ -154,7 +154,7 @@ def installing(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, dic
         (script,) = [line for line in pipeline["demandops"]["script"] if "pip" in line]
         script = script.replace("/tmp/demandops", "$RUNNER_TEMP/demandops")
     pip, python = tmp_path / "demandops" / "bin" / "pip", tmp_path / "path" / "python"
-    for program, text in ((pip, 'echo "pip $*"'), (python, 'echo "python $1 $2"')):
+    for program, text in ((pip, 'echo "pip $*"'), (python, 'echo "python $1 $2 $3"')):
         program.parent.mkdir(parents=True)
         program.write_text(f"#!{BASH}\n{text}\n")
         program.chmod(0o755)
@@ -175,7 +175,7 @@ def test_a_pipeline_installs_what_the_variable_names(
     )
     constraints = f"{environ['RUNNER_TEMP']}/demandops/share/demandops/constraints.txt"
     assert done.stdout.splitlines() == [
-        "python -m venv",
+        "python -I -m venv",
         f"pip install --quiet --no-deps {package}",
         f"pip install --quiet --constraint {constraints} demandops",
     ]

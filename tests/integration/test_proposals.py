@@ -15,7 +15,7 @@ from tests.kit.cli import Ran, Run
 from tests.kit.dialogue import Dialogue
 from tests.kit.generator import wait_until
 from tests.kit.goals import perception, put
-from tests.kit.repo import GitRepo, Person, branches, git
+from tests.kit.repo import GENERATOR_EMAIL, GENERATOR_NAME, GitRepo, Person, branches, git
 
 
 @pytest.fixture
@@ -191,6 +191,43 @@ def test_what_a_person_added_to_a_proposal_is_approved_with_it(
     assert strict.files()["sketch"] == "text"
 
 
+def test_what_is_more_than_demands_is_listed_and_no_name_of_a_file_adds_lines(
+    send: Send, strict: GitRepo, person: Person
+) -> None:
+    send(strict, goal=put("visit"))
+    (branch,) = branches(strict.path)
+    person.fetch()
+    git(person.folder, "reset", "--quiet", "--hard", f"origin/{branch}")
+    generated = next(person.folder.glob("clusters/*/*/edge/of-edge-visit-*.yaml"))
+    generated.write_text(generated.read_text().replace("object-fusion", "evil"))
+    (person.folder / "ledger/odd.yaml").write_text("a: 1\n")
+    (person.folder / "clusters/README.md").write_text("text\n")
+    (person.folder / "notes\n  + service harmless").write_text("text\n")
+    git(person.folder, "add", "--all")
+    by = {"GIT_COMMITTER_NAME": GENERATOR_NAME, "GIT_COMMITTER_EMAIL": GENERATOR_EMAIL}
+    message = 'Put\n\nRequester: "a\\n  + nothing"\nProposal: x\nRender-Version: 2\n'
+    git(person.folder, "commit", "--quiet", "--message", message, **by)
+    git(person.folder, "push", "--quiet", "origin", f"HEAD:{branch}")
+    with Dialogue("approve", branch, "--state-repo", strict.path) as asked:
+        asked.read_until("Approve it? [y/N]:")
+    path = generated.relative_to(person.folder)
+    listed = [line.strip() for line in asked.text.splitlines()]
+    for file in (path, "ledger/odd.yaml", "clusters/README.md", r"notes\n  + service harmless"):
+        assert f"~ file {file}" in listed
+    assert not [line for line in listed if line.startswith(("+ service harmless", "+ nothing"))]
+
+
+def test_a_demand_named_like_the_branch_of_another_is_not_taken_for_it(
+    demandops: Run, send: Send, strict: GitRepo
+) -> None:
+    send(strict, goal=put("visit"))
+    [branch] = branches(strict.path)
+    head = git(strict, "rev-parse", branch)
+    send(strict, goal=put(branch, topic=("/other", "vehicle00")))
+    ran = demandops("approve", branch, "--commit", head, "--state-repo", strict.path)
+    assert ran.code == 0, ran.err
+
+
 def test_a_proposal_that_a_person_edited_can_be_rejected(
     demandops: Run, send: Send, strict: GitRepo, person: Person
 ) -> None:
@@ -230,13 +267,13 @@ def test_a_proposal_that_has_changed_since_it_was_seen_is_left_alone(
     send(strict, goal=put("visit", topic=("/other", "vehicle00")))
     now, where = _commits(strict)[0], ("--state-repo", strict.path)
     assert now != seen
-    ran = demandops(command, "visit", "--commit", seen[:12], *where)
+    ran = demandops(command, "visit", "--commit", seen, *where)
     assert (ran.code, ran.out) == (1, "")
-    assert f"is at commit {now}, not at '{seen[:12]}'; if it has changed since" in ran.err
-    for other in (now[:6], now.upper(), "HEAD", f"{now[:12]}~0", f"{now}0"):
+    assert f"is at commit {now}, not at '{seen}'; if it has changed since" in ran.err
+    for other in (now[:39], now.upper(), "HEAD", f"{now[:12]}~0", f"{now}0"):
         assert demandops(command, "visit", "--commit", other, *where).code == 1, other
     assert _commits(strict) == (now, main)
-    ran = demandops(command, "visit", "--commit", now[:7], *where)
+    ran = demandops(command, "visit", "--commit", now, *where)
     assert ran.code == 0, ran.err
     assert (git(strict, "rev-parse", "main^2") == now) if command == "approve" else True
     assert "changed: it replaces demand/visit-" in ran.err and seen in ran.err

@@ -60,7 +60,7 @@ def init(path: Path, *, bare: bool = True) -> Path:
     return path
 
 
-def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
+def git(folder: Path | str | GitRepo, *args: str, check: bool = True, **environment: str) -> str:
     """Run git in a folder and return its output without the last line break."""
     done = subprocess.run(
         ["git", "-C", os.fspath(folder).removeprefix("file://"), *args],
@@ -68,7 +68,7 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True) -> str:
         text=True,
         errors="replace",
         check=False,
-        env={**os.environ, **GIT_ENVIRONMENT},
+        env={**os.environ, **GIT_ENVIRONMENT, **environment},
     )
     assert not check or done.returncode == 0, f"git {' '.join(args)}: {done.stdout}{done.stderr}"
     return done.stdout.removesuffix("\n")

@@ -18,7 +18,7 @@ import select
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from dataclasses import dataclass, fields
@@ -51,22 +51,28 @@ _START = (
 
 @dataclass(slots=True)
 class _Limits:
-    """Seconds of processor time: for each evaluation, and left for all of them together."""
+    """Seconds of processor time: for each evaluation, and left for all of them together.
+
+    ``meanwhile`` is called before each evaluation.
+    """
 
     each: float
     left: float
+    meanwhile: Callable[[], object] = lambda: None
 
 
 _limits: ContextVar[_Limits] = ContextVar("limits")
 
 
 @contextmanager
-def processor_time(each: float, together: float = inf) -> Iterator[None]:
+def processor_time(
+    each: float, together: float = inf, meanwhile: Callable[[], object] = lambda: None
+) -> Iterator[None]:
     """Limit the processor time of the evaluations in the block, in seconds.
 
-    Without a block, an evaluation may take 2 seconds.
+    ``meanwhile`` is called before each of them. Without a block, an evaluation may take 2 seconds.
     """
-    token = _limits.set(_Limits(each, together))
+    token = _limits.set(_Limits(each, together, meanwhile))
     try:
         yield
     finally:
@@ -85,6 +91,7 @@ class Evaluator:
     def __call__(self, files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:
         """Return the values of a task (:data:`demandops.templating.values.Evaluate`)."""
         limits = _limits.get(None) or _Limits(2, inf)
+        limits.meanwhile()
         seconds = min(limits.each, limits.left)
         if seconds <= 0:
             raise _over(task, "the evaluations before it took all the time of this demand")

@@ -60,6 +60,8 @@ class HttpServer:
         config = uvicorn.Config(
             application,
             http=Connection,
+            # so many are accepted before any is read, so all must fit; more wait in the kernel
+            backlog=at_once // 2,
             ws="none",
             lifespan="off",
             log_config=None,

@@ -23,7 +23,7 @@ from demandops.service.http_server import HttpServer
 log = logging.getLogger("demandops")
 
 _PATH = "/push"
-_AT_ONCE = 16
+_AT_ONCE = 32
 _MAX_BODY = 25 << 20
 """The largest body that GitHub sends, in bytes; a body is hashed and not stored."""
 _WARN_EVERY_S = 60.0
@@ -69,6 +69,8 @@ class PushWebhook:
 
     async def _handle(self, request: Request) -> PlainTextResponse:
         """Answer a request; if it is a valid notification, report the push."""
+        if "origin" in request.headers or "sec-fetch-site" in request.headers:
+            return PlainTextResponse("a browser asked for this, not a Git server\n", 403)
         digest, length = hmac.new(self._secret, digestmod=hashlib.sha256), 0
         too_long = PlainTextResponse("the body is too long\n", 413)
         if int(request.headers.get("Content-Length", "0")) > _MAX_BODY:

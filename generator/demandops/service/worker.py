@@ -113,7 +113,7 @@ class Worker:
     def run(self) -> None:
         """Publish demands, until no further demand is accepted and no demand is queued."""
         # people may have decided about proposals before the start, so answer these demands first
-        with processor_time(each=DEMAND_S):
+        with processor_time(each=DEMAND_S, meanwhile=self._heartbeat):
             if self._demands.proposed:
                 self._work()
             while self._demands.wait(self._seconds_until_due()):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -172,15 +172,39 @@ class Reader:
         commit = trees.commit_of(self._objects, snapshot.commit)
         if commit_log.is_by_generator(self._objects, commit):
             return frozenset()
-        texts = trees.texts(commit.tree, settings.GENERATED_ROOTS)
-        current = {path: text for path, text in texts.items() if not trees.is_readme(path)}
         try:
-            wanted = rendered_files(snapshot.state, current)
+            return self._unlike_rendered(snapshot)
         except InvalidInput:
             return frozenset()
+
+    def _unlike_rendered(self, snapshot: Snapshot) -> frozenset[str]:
+        tree = trees.commit_of(self._objects, snapshot.commit).tree
+        texts = trees.texts(tree, settings.GENERATED_ROOTS)
+        current = {path: text for path, text in texts.items() if not trees.is_readme(path)}
+        wanted = rendered_files(snapshot.state, current)
         return frozenset(
             path for path in {*current, *wanted} if current.get(path) != wanted.get(path)
         )
+
+    def edited_files(self, before: str, after: Snapshot) -> list[str]:
+        """Return the files that differ between two commits and are more than demands, sorted.
+
+        Left out are claims that are new or gone, and files that are as rendered from the claims,
+        whoever committed them: anybody can commit under the generator's name.
+        """
+        old, new = self._tree(before), self._tree(str(after.commit))
+        changed = trees.differences(old, new, settings.GENERATED_ROOTS)
+        as_rendered = set[str]()
+        with suppress(InvalidInput):
+            unlike = self._unlike_rendered(after)
+            as_rendered = {path for path, _ in changed if not trees.is_readme(path)} - unlike
+        claims = {
+            path
+            for path in ledger_files.changed_files(old, new)
+            if (trees.entry(old, path) is None and ledger_files.valid_claim_at(new, path))
+            or (trees.entry(new, path) is None and ledger_files.valid_claim_at(old, path))
+        }
+        return sorted({path for path, _ in trees.differences(old, new)} - as_rendered - claims)
 
     def _tree(self, revision: str | None = None) -> Tree:
         return trees.commit_of(self._objects, self.commit(revision)).tree

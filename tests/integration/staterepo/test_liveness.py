@@ -7,6 +7,7 @@ import re
 import subprocess
 import textwrap
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -14,9 +15,9 @@ import yaml
 from demandops.errors import StateRepoError
 from demandops.service import Generator
 
-from tests.kit import rig
+from tests.kit import goals, rig
 from tests.kit.git_over_http import Server
-from tests.kit.rig import Gate, goal, wait_until
+from tests.kit.rig import Gate, Goal, Person, goal, wait_until
 
 STATEFUL_SET = Path(__file__).parents[3] / "deploy/chart/templates/statefulset.yaml"
 
@@ -92,3 +93,24 @@ def test_it_passes_during_a_start_whatever_an_earlier_process_left(
     with pytest.raises(StateRepoError):
         Generator(str(tmp_path / "nowhere"))
     assert probe.passes()
+
+
+@pytest.mark.parametrize("made", [goals.link, goal], ids=["connection", "application"])
+def test_it_passes_during_a_long_check_of_proposals(
+    bare: Path, petra: Person, probe: Probe, made: Callable[[int], Goal]
+) -> None:
+    gate, passed = Gate(), list[bool]()
+
+    def proposed(stage: str, text: str) -> None:
+        if stage == "proposed":
+            passed.append(probe.passes())
+            probe.make_old()
+
+    with rig.running(bare) as generator:
+        generator.submit(goal(9), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        for number in (1, 2, 3):
+            generator.submit(made(number), listener=proposed)
+        gate.open.set()
+        wait_until(lambda: len(passed) == 3, "the demands wait for approval")
+    assert passed == [True] * 3

@@ -114,7 +114,7 @@ def test_a_proposal_names_its_commit_and_how_to_approve_just_that(
     branch = proposed.branch
     wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
     commit = git(state.path, "rev-parse", branch)
-    approve = f"demandops approve {branch} --commit {commit[:12]}"
+    approve = f"demandops approve {branch} --commit {commit}"
     assert approve in look("/").text
     shown = look("/overrides").text
     assert commit in shown and approve in shown

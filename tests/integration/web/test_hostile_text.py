@@ -69,7 +69,7 @@ def test_a_branch_is_no_command_and_hides_nothing(
     git(state.path, "branch", branch, commit)
     wait_until(lambda: follower.newest.proposals, "the page knows the proposal")
     shown = branch.replace(HIDDEN, "\\u202e")
-    wanted = ["demandops", "approve", shown, "--commit", commit[:12]]
+    wanted = ["demandops", "approve", shown, "--commit", commit]
     page = look("/overrides")
     (approve,) = [text for text in page.texts("code") if " approve " in text]
     assert shlex.split(approve) == wanted

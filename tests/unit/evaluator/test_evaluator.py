@@ -241,3 +241,11 @@ def test_a_configuration_is_not_invalid_because_it_takes_too_long() -> None:
     with processor_time(SECONDS), pytest.raises(OverLimit) as late:
         try_configuration(State(config, Ledger(), Evaluator()))
     assert {fault.file for fault in late.value.faults} == {TEMPLATE}
+
+
+def test_each_evaluation_tells_that_its_caller_goes_on(shared: Evaluator) -> None:
+    told = list[str]()
+    with processor_time(SECONDS, meanwhile=lambda: told.append("again")):
+        for _ in range(3):
+            shared({"a.j2": "x: 1"}, ValuesTask("a.j2", {}, None))
+    assert told == ["again"] * 3

@@ -20,8 +20,7 @@ from demandops.cli.output import errors
 from demandops.cli.target import signing_option, writable_repo_option
 from demandops.cli.views.diff import differences, entry_lines, release_lines
 from demandops.errors import InvalidInput, suggestion
-from demandops.ledger.claim_file import LEDGER_ROOT
-from demandops.render.gitops.paths import CLUSTERS_ROOT
+from demandops.quoting import one_line
 from demandops.runtime import REAL
 from demandops.staterepo.reader import Reader
 from demandops.staterepo.write import person_commit
@@ -32,8 +31,8 @@ commit_option = click.option(
     "--commit",
     metavar="ID",
     default="",
-    help="The commit that you looked at, or at least 7 digits of its id. If the branch is at "
-    "another commit, nothing is changed.",
+    help="The whole id of the commit that you looked at. If the branch is at another commit, "
+    "nothing is changed.",
 )
 
 
@@ -48,8 +47,12 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
         RemoteAway: if the state repo cannot be reached.
     """
     pending = list(pending_proposals(repo.repository))
-    exact = [one for one in pending if name == one.branch or name in one.demands]
-    found = exact or [one for one in pending if name in one.branch]
+    # requesters choose ids of demands, so such an id may be the branch of another proposal
+    found = (
+        [one for one in pending if name == one.branch]
+        or [one for one in pending if name in one.demands]
+        or [one for one in pending if name in one.branch]
+    )
     if len(found) == 1:
         return found[0]
     known = [one.branch for one in pending]
@@ -70,23 +73,19 @@ def print_proposal(proposal: PendingProposal, output: str) -> None:
             *(f"  required by {reason}" for reason in proposal.required_by),
             *(f"  changed: it replaces {old}" for old in proposal.replaces),
         ):
-            errors.print(line)
+            errors.print(one_line(line))
 
 
 def _print_consequence(repo: Reader, commit: str) -> None:
     base = repo.base_of(commit)
     entries, found = differences(repo, base, commit)
-    by_hand = (
-        path
-        for path in repo.changed_files(base, commit)
-        if not path.startswith((f"{CLUSTERS_ROOT}/", f"{LEDGER_ROOT}/"))
-    )
+    by_hand = repo.edited_files(base, repo.last_valid_snapshot(commit))
     for line in (
         *entry_lines(entries),
         *release_lines(found.releases, "release "),
-        *(f"~ file {path}" for path in (*found.other_files, *by_hand)),
+        *(f"~ file {path}" for path in by_hand),
     ):
-        errors.print(f"  {line}")
+        errors.print(f"  {one_line(line)}")
 
 
 @click.command()
@@ -118,7 +117,7 @@ def approve(
     \b
     Examples:
       demandops approve visit -m "Agreed with the control room"
-      demandops approve demand/visit-3f2a9c1b04de --commit 5d41402abc
+      demandops approve demand/visit-3f2a9c1b04de --commit 5d41402abc4b2a76b9719d911017c592e81f9d3a
     """
     if not (commit or is_asked(yes, output)):
         raise click.UsageError(

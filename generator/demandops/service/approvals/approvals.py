@@ -264,6 +264,7 @@ class Approvals:
             if number and self._must_pause(began):
                 self._check_next(proposals[number:])
                 break
+            self._repository.while_waiting()
             try:
                 if not proposal.is_unchanged(str(snapshot.commit), heads.branches):
                     self._check(proposal, snapshot, heads)

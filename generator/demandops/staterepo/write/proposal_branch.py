@@ -35,7 +35,6 @@ PREFIX = "demand/"
 _HEADS = "refs/heads/"
 _NO_OPTIONS = re.compile(r"does not support push options")
 _LINK = re.compile(r"https?://\S+")
-_ABBREVIATED = re.compile(r"[0-9a-f]{7,64}")
 
 
 class BranchMoved(StateRepoError):
@@ -255,8 +254,9 @@ class PendingProposal:
     replaces: tuple[str, ...] = ()
 
     def require(self, commit: str) -> None:
-        """Raise InvalidInput unless ``commit`` is the newest commit's id, or at least 7 of it."""
-        if not (_ABBREVIATED.fullmatch(commit) and self.commit.startswith(commit)):
+        """Raise InvalidInput unless ``commit`` is the whole id of the newest commit."""
+        # whoever may push to the branch finds another commit with the same 10 digits in minutes
+        if commit != self.commit:
             raise InvalidInput.at(
                 "",
                 f"{self.branch} is at commit {self.commit}, not at {quoted(commit)}; if it has "

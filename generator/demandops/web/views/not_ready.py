@@ -242,7 +242,7 @@ def _proposed(proposal: PendingProposal) -> Cause:
         Remedy(
             "a person who may merge to main",
             "merge the branch to approve the demand, or delete the branch to refuse it",
-            shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit[:12]]),
+            shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit]),
         ),
         since=proposal.since,
         requesters=proposal.requesters,
