@@ -174,6 +174,9 @@ class Approvals:
             # the next check answers the withdrawn demands: a person may have merged them meanwhile
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
             proposal.requests = []
+        if proposal.tickets and all(ticket.state == "withdrawn" for ticket in proposal.tickets):
+            # a release may have deleted the branch, and nobody can turn down what was not on it
+            proposal.record = replace(proposal.record, pushed=False)
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
             return
