@@ -1,8 +1,4 @@
-"""Mutants of a module: small changes of its syntax tree, each at one place.
-
-Left out is what a test cannot or need not notice: annotations, decorators, docstrings,
-and the wording of messages (f-strings, and texts with a space).
-"""
+"""Mutants of a module: small changes of its syntax tree, but not of types, decorators and prose."""
 
 from __future__ import annotations
 
@@ -11,64 +7,61 @@ import re
 from collections.abc import Iterator
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
+from itertools import islice
+from operator import setitem
 from pathlib import Path
 from typing import Any
 
 _PAIRS = [
     *((ast.Lt, ast.LtE), (ast.Gt, ast.GtE), (ast.Eq, ast.NotEq), (ast.In, ast.NotIn)),
-    *((ast.Is, ast.IsNot), (ast.And, ast.Or)),
-    *((ast.Add, ast.Sub), (ast.Mult, ast.FloorDiv), (ast.BitOr, ast.BitAnd)),
+    *((ast.Is, ast.IsNot), (ast.And, ast.Or), (ast.Add, ast.Sub), (ast.BitOr, ast.BitAnd)),
 ]
-_OTHER: dict[Any, Any] = dict(_PAIRS) | {two: one for one, two in _PAIRS} | {ast.Div: ast.Mult}
+_OTHER: dict[Any, Any] = dict(_PAIRS) | {two: one for one, two in _PAIRS}
+_OTHER |= {ast.Mult: ast.FloorDiv, ast.Div: ast.Mult}
 _WORD = re.compile(r"[\w./-]{1,30}")
 _SKIPPED = {"annotation", "returns", "decorator_list", "type_params"}
 
 
 @dataclass(frozen=True)
 class Mutant:
-    """A changed node of a module; when the node runs, so does one of ``lines``."""
+    """The ``number``-th change of a module; one of ``lines`` runs when the changed code does."""
 
     path: Path
-    place: int
-    variant: int
+    number: int
     text: str
     lines: frozenset[int]
+
+    def __str__(self) -> str:
+        return f"{'/'.join(self.path.parts[-2:])}:{max(self.lines)} ({self.number}) {self.text}"
 
     def tree(self) -> ast.Module:
         """Return the mutated module."""
         module = ast.parse(self.path.read_text())
-        parent, name, index, node, _ = list(_places(module, frozenset()))[self.place]
-        new = list(_changes(node))[self.variant]
-        if index is None:
-            setattr(parent, name, new)
-        else:
-            getattr(parent, name)[index] = new
+        _, _, put = next(islice(_each(module, frozenset()), self.number, None))
+        put()
         return ast.fix_missing_locations(module)
 
 
 def mutants(path: Path) -> list[Mutant]:
     """Return all mutants of a module, in the order of its syntax tree."""
-    return [
-        Mutant(path, place, variant, f"{_short(node)} -> {_short(new)}", lines)
-        for place, (*_, node, lines) in enumerate(_places(ast.parse(path.read_text()), frozenset()))
-        for variant, new in enumerate(_changes(node))
-    ]
+    found = enumerate(_each(ast.parse(path.read_text()), frozenset()))
+    return [Mutant(path, number, text, lines) for number, (text, lines, _) in found]
 
 
-_Place = tuple[ast.AST, str, "int | None", ast.AST, frozenset[int]]
-
-
-def _places(parent: ast.AST, lines: frozenset[int]) -> Iterator[_Place]:
-    """Yield (parent, field, index, node, lines) for each node below ``parent``."""
+def _each(parent: ast.AST, lines: frozenset[int]) -> Iterator[tuple[str, frozenset[int], Any]]:
+    """Yield each change below a node: in words, with its lines, and a function that makes it."""
     for name, value in ast.iter_fields(parent):
-        for index, node in enumerate(value) if isinstance(value, list) else [(None, value)]:
+        of: Any = value if isinstance(value, list) else vars(parent)
+        for key, node in enumerate(value) if of is value else [(name, value)]:
             if name in _SKIPPED or not isinstance(node, ast.AST) or isinstance(node, ast.JoinedStr):
                 continue
             own = frozenset({node.lineno} if hasattr(node, "lineno") else ())
             # an expression runs with its statement, a statement not with the block that it is in
             here = own if isinstance(node, ast.stmt) else lines | own
-            yield parent, name, index, node, here
-            yield from _places(node, here)
+            for new in _changes(node):
+                yield f"{_short(node)} -> {_short(new)}", here, partial(setitem, of, key, new)
+            yield from _each(node, here)
 
 
 def _changes(node: ast.AST) -> Iterator[ast.AST]:
@@ -98,9 +91,8 @@ def _changes(node: ast.AST) -> Iterator[ast.AST]:
         case ast.Return(value=ast.expr() as value) if ast.unparse(value) != "None":
             yield ast.Return(ast.Constant(None))
         case ast.Call(args=[one, two, *_]) if ast.unparse(one) != ast.unparse(two):
-            if not isinstance(one, ast.Starred):
-                new.args[:2] = [two, one]
-                yield new
+            new.args[:2] = [two, one]
+            yield new
     if isinstance(node, ast.Expr | ast.AugAssign | ast.Raise | ast.Continue | ast.Break):
         yield ast.Pass()
 
