@@ -1,16 +1,18 @@
-"""Faults that are planted in the program, which the oracle must find."""
+"""Faults that tests plant in the program, one at a time; the oracle must find each.
+
+Each is what a wrong line could do, in the room that the heading names. If its code goes, plant
+another of its kind. :data:`FAULTS` lists them all.
+"""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from datetime import timedelta
 from typing import Any
 
 from demandops.config.appdef.scaling import Scaling
 from demandops.config.config import Config
-from demandops.config.inventory import Node
 from demandops.config.override import by_rank
 from demandops.connections import route
 from demandops.connections.route import Route
@@ -20,10 +22,9 @@ from demandops.demand.claim import Claim
 from demandops.demand.lease import Lease
 from demandops.errors import InvalidInput
 from demandops.ledger import claim_file, world
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.operations import conflicts, demand_release, ownership, put, shutdown
+from demandops.ledger.operations import conflicts, demand_release, ownership, put
 from demandops.ledger.recent_shutdowns import RecentShutdowns
-from demandops.ledger.waiting import Wait, WaitingDemand, in_turn
+from demandops.ledger.waiting import Wait, WaitingDemand
 from demandops.plan import override_lifecycle, planner, release_keys, scale_down
 from demandops.plan.checks import denial, quota
 from demandops.plan.nodes import placement
@@ -32,21 +33,16 @@ from demandops.plan.nodes.choice import Choice
 from demandops.plan.overrides import claim_overrides
 from demandops.render.changes import changeset
 from demandops.service import Receipt, demand_lifecycle, generator
-from demandops.service.approvals import approvals
 from demandops.service.approvals.approvals import Approvals
-from demandops.service.approvals.proposal import Proposal
 from demandops.service.demand_lifecycle import Demands
 from demandops.service.evaluation import Evaluator
 from demandops.service.ticket import Ticket
 from demandops.service.timing import expiry, waiting_turns
 from demandops.service.timing.draining import Draining
-from demandops.service.timing.expiry import LeaseExpiry, OverrideExpiry, ScaleDown
+from demandops.service.timing.expiry import LeaseExpiry, ScaleDown
 from demandops.service.timing.waiting_turns import WaitingTurns
 from demandops.service.worker import Worker
-from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.remote_repository import RemoteRepository
-from demandops.staterepo.git.repository import PushDenied
-from demandops.staterepo.history import commit_message
 from demandops.staterepo.load import snapshot
 from demandops.staterepo.write import journal
 from demandops.staterepo.write.commit_batch import CommitBatch
@@ -54,132 +50,56 @@ from demandops.staterepo.write.proposal_branch import ProposalBranches
 
 Patch = Callable[[Any, str, Any], None]
 
-# ---- the first 26 ----
+# ---- booking ----
 
 
-def acknowledge_before_publishing(patch: Patch) -> None:
-    publish = Worker._publish_commits
+def keep_former_requesters(patch: Patch) -> None:
+    book = put.book
 
-    def early(worker: Worker, commits: CommitBatch, results: list[Any], certain: int) -> bool:
-        worker._demands.answer([pair for pair in results if isinstance(pair[1], Receipt)])
-        return publish(worker, commits, results, certain)
+    def kept(ledger: Any, one: Any, request: str, key: Any, current: Any, now: Any) -> Any:
+        former = current.requesters if current else ()
+        one = replace(one, requesters=(*one.requesters, *former))
+        return book(ledger, one, request, key, current, now)
 
-    patch(Worker, "_publish_commits", early)
-
-
-def refuse_before_publishing(patch: Patch) -> None:
-    publish = Worker._publish_commits
-
-    def early(worker: Worker, commits: CommitBatch, results: list[Any], certain: int) -> bool:
-        worker._demands.answer([pair for pair in results if isinstance(pair[1], InvalidInput)])
-        return publish(worker, commits, results, certain)
-
-    patch(Worker, "_publish_commits", early)
+    patch(put, "book", kept)
 
 
-def forget_the_journal(patch: Patch) -> None:
-    patch(journal, "read", lambda path: {})
+def let_strangers_change_a_demand(patch: Patch) -> None:
+    patch(ownership, "refuse_other_owners", lambda *_: None)
+    patch(put, "refuse_other_owners", lambda *_: None)
 
 
-def leave_the_journal_in_memory(patch: Patch) -> None:
-    write = journal.Journal._write
-    patch(
-        journal.Journal,
-        "_write",
-        lambda made, records, *, durably: write(made, records, durably=False),
-    )
+def release_only_the_first_claim(patch: Patch) -> None:
+    owned = demand_release.owned_claims
+    patch(demand_release, "owned_claims", lambda *given: owned(*given)[:1])
 
 
-def skip_the_search_for_operations(patch: Patch) -> None:
-    patch(Evaluator, "published_before", lambda *_: [])
+def replace_what_was_joined(patch: Patch) -> None:
+    patch(Claim, "extending", lambda claim, current: claim)
+
+
+def commit_what_is_booked_already(patch: Patch) -> None:
+    patch(Claim, "after_booking", lambda claim, current: claim)
+
+
+def grant_one_claim_too_many(patch: Patch) -> None:
+    patch(quota, "_held", lambda *given, held=quota._held: held(*given) - 1)
 
 
 def take_a_repeat_for_another_shutdown(patch: Patch) -> None:
     patch(RecentShutdowns, "earlier", lambda *_: None)
 
 
-def end_leases_by_the_wall_clock(patch: Patch) -> None:
-    patch(LeaseExpiry, "_has_ended", lambda expiry, claim, now: claim.lease is not None)
-
-
-def follow_nothing(patch: Patch) -> None:
-    def follow(batch: CommitBatch, advance: Any, before: object, now: object) -> None:
-        batch.head = advance.snapshot
-
-    patch(CommitBatch, "follow", follow)
-
-
-def push_on_any_tip(patch: Patch) -> None:
-    publish = RemoteRepository.publish
-    patch(
-        RemoteRepository,
-        "publish",
-        lambda made, expected, commit: publish(made, made.refresh(), commit),
-    )
+def take_back_promised_leases(patch: Patch) -> None:
+    patch(Lease, "renewed", lambda lease, term, now: term.lease_from(now))
 
 
 def lose_renewals(patch: Patch) -> None:
     patch(Lease, "renewed", lambda lease, term, now: lease)
 
 
-def book_again_what_was_approved(patch: Patch) -> None:
-    receipt = Approvals._receipt
-
-    def twice(made: Approvals, ticket: Any, decision: Any, snapshot: Any, recorded: Any) -> Receipt:
-        if isinstance(decision, Decision):
-            batch = CommitBatch(made._repository, snapshot)
-            text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 2\n"
-            author = batch._objects[snapshot.commit].author
-            batch.commit_files(decision.files, decision.state, text, author, made._runtime.now())
-            batch.publish()
-        return receipt(made, ticket, decision, snapshot, recorded)
-
-    patch(Approvals, "_receipt", twice)
-
-
-def bring_back_what_was_deleted(patch: Patch) -> None:
-    follow = CommitBatch.follow
-
-    def undo(batch: CommitBatch, advance: Any, before: Any, now: Any) -> None:
-        ledger, files = advance.snapshot.state.ledger, {}
-        for claim in before.state.ledger:
-            if ledger.get(claim.key) is None:
-                ledger = ledger.replace(claim.key, claim)
-                files[claim_file.path_of(claim.key)] = claim_file.text_of(claim)
-        follow(batch, advance, before, now)
-        if files:
-            author = batch._objects[advance.snapshot.commit].author
-            state = replace(batch.head.state, ledger=ledger)
-            batch.commit_files(files, state, "Undo\n\nRender-Version: 2\n", author, now)
-
-    patch(CommitBatch, "follow", undo)
-
-
-def let_the_last_in_first(patch: Patch) -> None:
-    in_turn = waiting_turns.in_turn
-    patch(waiting_turns, "in_turn", lambda waiting: in_turn(waiting)[::-1])
-
-
-def forget_those_that_wait(patch: Patch) -> None:
-    patch(WaitingTurns, "is_due", lambda *_: False)
-
-
-def leave_drained_nodes_full(patch: Patch) -> None:
-    patch(Draining, "is_due", lambda *_: False)
-    patch(Draining, "move_due", lambda *_: None)
-
-
-def place_on_drained_nodes(patch: Patch) -> None:
-    patch(Choice, "_closed", lambda *_: "")
-
-
-def count_no_room(patch: Patch) -> None:
-    patch(Choice, "_shortage", lambda *_: [])
-    patch(Room, "is_full", lambda *_: False)
-
-
-def let_others_overtake_in_a_batch(patch: Patch) -> None:
-    patch(WaitingTurns, "follow", lambda *_: None)
+def end_leases_by_the_wall_clock(patch: Patch) -> None:
+    patch(LeaseExpiry, "_has_ended", lambda expiry, claim, now: claim.lease is not None)
 
 
 def come_down_at_once(patch: Patch) -> None:
@@ -232,60 +152,6 @@ def forget_what_is_booked_in_a_domain(patch: Patch) -> None:
     )
 
 
-# ---- booking ----
-
-
-def keep_former_requesters(patch: Patch) -> None:
-    book = put.book
-
-    def kept(ledger: Any, one: Any, request: str, key: Any, current: Any, now: Any) -> Any:
-        former = current.requesters if current else ()
-        one = replace(one, requesters=(*one.requesters, *former))
-        return book(ledger, one, request, key, current, now)
-
-    patch(put, "book", kept)
-
-
-def let_strangers_change_a_demand(patch: Patch) -> None:
-    patch(ownership, "refuse_other_owners", lambda *_: None)
-    patch(put, "refuse_other_owners", lambda *_: None)
-
-
-def release_only_the_first_claim(patch: Patch) -> None:
-    owned = demand_release.owned_claims
-    patch(demand_release, "owned_claims", lambda *given: owned(*given)[:1])
-
-
-def book_against_another_node(patch: Patch) -> None:
-    patch(conflicts, "_of_application", lambda *_: ())
-
-
-def take_back_promised_leases(patch: Patch) -> None:
-    patch(Lease, "renewed", lambda lease, term, now: term.lease_from(now))
-
-
-def let_a_shutdown_end_a_demand(patch: Patch) -> None:
-    meant = shutdown._claims_meant
-
-    def joined(ledger: Any, request: Any, one: Any, who: str) -> Any:
-        claims = ledger.claims_held_by(who, one.held.subject)
-        return meant(ledger, request, one, who) or [c for c in claims if not c.joined]
-
-    patch(shutdown, "_claims_meant", joined)
-
-
-def replace_what_was_joined(patch: Patch) -> None:
-    patch(Claim, "extending", lambda claim, current: claim)
-
-
-def commit_what_is_booked_already(patch: Patch) -> None:
-    patch(Claim, "after_booking", lambda claim, current: claim)
-
-
-def grant_one_claim_too_many(patch: Patch) -> None:
-    patch(quota, "_held", lambda *given, held=quota._held: held(*given) - 1)
-
-
 # ---- routes ----
 
 
@@ -324,14 +190,63 @@ def leave_the_far_end(patch: Patch) -> None:
     patch(release_keys, "_client_keys", lambda world, claim: [*keys(world, claim)][:1])
 
 
-def connect_any_ends(patch: Patch) -> None:
-    of_connection = conflicts._of_connection
+# ---- placement ----
 
-    def any_ends(one: Any, demanded: Any, ledger: Any, above: bool) -> Iterator[Any]:
-        found = of_connection(one, demanded, ledger, above)
-        return (fault for fault in found if not fault.field.endswith(("source", "target")))
 
-    patch(conflicts, "_of_connection", any_ends)
+def let_the_last_in_first(patch: Patch) -> None:
+    in_turn = waiting_turns.in_turn
+    patch(waiting_turns, "in_turn", lambda waiting: in_turn(waiting)[::-1])
+
+
+def ignore_priorities(patch: Patch) -> None:
+    patch(WaitingDemand, "turn", property(lambda one: (one.since, one.demand)))
+
+
+def begin_the_wait_anew(patch: Patch) -> None:
+    admitted = decision.admitted
+
+    def anew(state: Any, *more: Any) -> Any:
+        request = admitted(state, *more)
+        if isinstance(request, Wait) and request.waiting is not None:
+            return replace(request, waiting=replace(request.waiting, since=more[1]))
+        return request
+
+    patch(decision, "admitted", anew)
+
+
+def forget_those_that_wait(patch: Patch) -> None:
+    patch(WaitingTurns, "is_due", lambda *_: False)
+
+
+def let_others_overtake_in_a_batch(patch: Patch) -> None:
+    patch(WaitingTurns, "follow", lambda *_: None)
+
+
+def leave_drained_nodes_full(patch: Patch) -> None:
+    patch(Draining, "is_due", lambda *_: False)
+    patch(Draining, "move_due", lambda *_: None)
+
+
+def place_on_drained_nodes(patch: Patch) -> None:
+    patch(Choice, "_closed", lambda *_: "")
+
+
+def choose_anew_for_a_placed_demand(patch: Patch) -> None:
+    patch(placement, "_booked", lambda *_: None)
+
+
+def count_no_room(patch: Patch) -> None:
+    patch(Choice, "_shortage", lambda *_: [])
+    patch(Room, "is_full", lambda *_: False)
+
+
+def count_released_room_as_taken(patch: Patch) -> None:
+    plus = Usage.plus
+    patch(
+        Usage,
+        "plus",
+        lambda usage, more: plus(usage, {need: n for need, n in more.items() if n > 0}),
+    )
 
 
 # ---- overrides ----
@@ -345,6 +260,15 @@ def apply_no_override_to_what_a_demand_changes(patch: Patch) -> None:
         return build(before, after, *more)
 
     patch(changeset, "build_changeset", without)
+
+
+def apply_overrides_only_to_new_demands(patch: Patch) -> None:
+    followed = CommitBatch._followed
+
+    def subjects_only(batch: CommitBatch, advance: Any, before: Any, now: Any) -> Any:
+        return followed(batch, replace(advance, config_changed=False), before, now)
+
+    patch(CommitBatch, "_followed", subjects_only)
 
 
 def let_the_lowest_priority_win(patch: Patch) -> None:
@@ -369,25 +293,6 @@ def book_what_is_denied(patch: Patch) -> None:
     patch(denial, "faults", lambda *_: ())
 
 
-def deny_renewals(patch: Patch) -> None:
-    faults = denial.faults
-
-    def all_changes(request: Any, after: Any, changes: Any) -> Any:
-        same = [replace(one, before=None) for one in changes.claims]
-        return faults(request, after, replace(changes, claims=tuple(same)))
-
-    patch(denial, "faults", all_changes)
-
-
-def apply_overrides_only_to_new_demands(patch: Patch) -> None:
-    followed = CommitBatch._followed
-
-    def subjects_only(batch: CommitBatch, advance: Any, before: Any, now: Any) -> Any:
-        return followed(batch, replace(advance, config_changed=False), before, now)
-
-    patch(CommitBatch, "_followed", subjects_only)
-
-
 def end_overrides_early(patch: Patch) -> None:
     for module in (expiry, override_lifecycle):
         expired = module.expired_overrides
@@ -398,69 +303,43 @@ def end_overrides_early(patch: Patch) -> None:
         )
 
 
-def never_end_overrides(patch: Patch) -> None:
-    patch(OverrideExpiry, "is_due", lambda *_: False)
-    patch(OverrideExpiry, "end_due", lambda *_: None)
-
-
-def end_overrides_without_a_marker(patch: Patch) -> None:
-    patch(override_lifecycle, "_marker", lambda override: {})
-
-
-def apply_what_had_expired_when_merged(patch: Patch) -> None:
-    patch(override_lifecycle, "expired_overrides", lambda *_: [])
-
-
-# ---- placement ----
-
-
-def ignore_priorities(patch: Patch) -> None:
-    patch(WaitingDemand, "turn", property(lambda one: (one.since, one.demand)))
-
-
-def begin_the_wait_anew(patch: Patch) -> None:
-    admitted = decision.admitted
-
-    def anew(state: Any, *more: Any) -> Any:
-        request = admitted(state, *more)
-        if isinstance(request, Wait) and request.waiting is not None:
-            return replace(request, waiting=replace(request.waiting, since=more[1]))
-        return request
-
-    patch(decision, "admitted", anew)
-
-
-def count_released_room_as_taken(patch: Patch) -> None:
-    plus = Usage.plus
-    patch(
-        Usage,
-        "plus",
-        lambda usage, more: plus(usage, {need: n for need, n in more.items() if n > 0}),
-    )
-
-
-def count_room_twice(patch: Patch) -> None:
-    most = Node.most
-    patch(Node, "most", lambda node, resource: 2 * (most(node, resource) or 0))
-
-
-def let_strangers_end_a_wait(patch: Patch) -> None:
-    patch(demand_release, "is_waiting", lambda ledger, one: one.demand in ledger.waiting)
-
-
-def wait_on_after_the_booking(patch: Patch) -> None:
-    patch(Ledger, "without_waiting", lambda ledger, demands: ledger)
-
-
-def choose_anew_for_a_placed_demand(patch: Patch) -> None:
-    patch(placement, "_booked", lambda *_: None)
-
-
-def lose_who_waits(patch: Patch) -> None:
-    patch(waiting_turns, "in_turn", lambda waiting: in_turn(waiting)[:1])
-
-
 # ---- publishing ----
+
+
+def acknowledge_before_publishing(patch: Patch) -> None:
+    publish = Worker._publish_commits
+
+    def early(worker: Worker, commits: CommitBatch, results: list[Any], certain: int) -> bool:
+        worker._demands.answer([pair for pair in results if isinstance(pair[1], Receipt)])
+        return publish(worker, commits, results, certain)
+
+    patch(Worker, "_publish_commits", early)
+
+
+def refuse_before_publishing(patch: Patch) -> None:
+    publish = Worker._publish_commits
+
+    def early(worker: Worker, commits: CommitBatch, results: list[Any], certain: int) -> bool:
+        worker._demands.answer([pair for pair in results if isinstance(pair[1], InvalidInput)])
+        return publish(worker, commits, results, certain)
+
+    patch(Worker, "_publish_commits", early)
+
+
+def follow_nothing(patch: Patch) -> None:
+    def follow(batch: CommitBatch, advance: Any, before: object, now: object) -> None:
+        batch.head = advance.snapshot
+
+    patch(CommitBatch, "follow", follow)
+
+
+def push_on_any_tip(patch: Patch) -> None:
+    publish = RemoteRepository.publish
+    patch(
+        RemoteRepository,
+        "publish",
+        lambda made, expected, commit: publish(made, made.refresh(), commit),
+    )
 
 
 def put_a_commit_on_the_wrong_parent(patch: Patch) -> None:
@@ -473,16 +352,6 @@ def put_a_commit_on_the_wrong_parent(patch: Patch) -> None:
     patch(CommitBatch, "_write", on_the_start)
 
 
-def write_each_commit_from_the_first_tree(patch: Patch) -> None:
-    write = CommitBatch._write
-
-    def from_the_start(batch: CommitBatch, *given: Any) -> Any:
-        batch._tree = trees.commit_of(batch._objects, batch.start.commit).tree
-        return write(batch, *given)
-
-    patch(CommitBatch, "_write", from_the_start)
-
-
 def remove_no_file(patch: Patch) -> None:
     write = CommitBatch._write
 
@@ -491,17 +360,6 @@ def remove_no_file(patch: Patch) -> None:
         return write(batch, kept, *given)
 
     patch(CommitBatch, "_write", without)
-
-
-def leave_out_the_operation(patch: Patch) -> None:
-    of_decision = commit_message.of_decision
-    patch(
-        commit_message,
-        "of_decision",
-        lambda *given: "\n".join(
-            line for line in of_decision(*given).split("\n") if "Operation-Id" not in line
-        ),
-    )
 
 
 def decide_on_a_stale_tip(patch: Patch) -> None:
@@ -514,46 +372,61 @@ def decide_on_a_stale_tip(patch: Patch) -> None:
     patch(Worker, "_attempt", fresh)
 
 
-def forget_what_a_commit_could_settle(patch: Patch) -> None:
-    patch(CommitBatch, "record_in_next_commit", lambda *_: None)
-
-
-def acknowledge_rejected_pushes(patch: Patch) -> None:
-    publish = CommitBatch.publish
-
-    def always(batch: CommitBatch) -> bool:
-        try:
-            return publish(batch)
-        except PushDenied:
-            return True
-
-    patch(CommitBatch, "publish", always)
-
-
 def drop_what_a_batch_has_left(patch: Patch) -> None:
     patch(Demands, "put_back", lambda demands, batch: batch.clear())
 
 
-def tell_the_commit_before(patch: Patch) -> None:
-    commit = CommitBatch.commit
+def bring_back_what_was_deleted(patch: Patch) -> None:
+    follow = CommitBatch.follow
 
-    def before(batch: CommitBatch, *given: Any) -> str:
-        was = str(batch.head.commit)
-        commit(batch, *given)
-        return was
+    def undo(batch: CommitBatch, advance: Any, before: Any, now: Any) -> None:
+        ledger, files = advance.snapshot.state.ledger, {}
+        for claim in before.state.ledger:
+            if ledger.get(claim.key) is None:
+                ledger = ledger.replace(claim.key, claim)
+                files[claim_file.path_of(claim.key)] = claim_file.text_of(claim)
+        follow(batch, advance, before, now)
+        if files:
+            author = batch._objects[advance.snapshot.commit].author
+            state = replace(batch.head.state, ledger=ledger)
+            batch.commit_files(files, state, "Undo\n\nRender-Version: 2\n", author, now)
 
-    patch(CommitBatch, "commit", before)
+    patch(CommitBatch, "follow", undo)
 
 
-def believe_that_a_lost_push_failed(patch: Patch) -> None:
-    patch(Ticket, "mark_maybe_published", lambda *_: None)
+def book_again_what_was_approved(patch: Patch) -> None:
+    receipt = Approvals._receipt
+
+    def twice(made: Approvals, ticket: Any, decision: Any, snapshot: Any, recorded: Any) -> Receipt:
+        if isinstance(decision, Decision):
+            batch = CommitBatch(made._repository, snapshot)
+            text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 2\n"
+            author = batch._objects[snapshot.commit].author
+            batch.commit_files(decision.files, decision.state, text, author, made._runtime.now())
+            batch.publish()
+        return receipt(made, ticket, decision, snapshot, recorded)
+
+    patch(Approvals, "_receipt", twice)
+
+
+def turn_down_what_waits(patch: Patch) -> None:
+    patch(ProposalBranches, "put", lambda *_: "")
 
 
 # ---- restart ----
 
 
-def forget_proposals_at_the_start(patch: Patch) -> None:
-    patch(Approvals, "_resume", lambda *_: None)
+def forget_the_journal(patch: Patch) -> None:
+    patch(journal, "read", lambda path: {})
+
+
+def leave_the_journal_in_memory(patch: Patch) -> None:
+    write = journal.Journal._write
+    patch(
+        journal.Journal,
+        "_write",
+        lambda made, records, *, durably: write(made, records, durably=False),
+    )
 
 
 def rewrite_only_the_newest_entry(patch: Patch) -> None:
@@ -566,29 +439,13 @@ def rewrite_only_the_newest_entry(patch: Patch) -> None:
     patch(journal.Journal, "_rewrite", newest)
 
 
-def remove_from_the_journal_in_memory(patch: Patch) -> None:
-    done = journal.Journal.mark_done
-    patch(
-        journal.Journal,
-        "mark_done",
-        lambda made, operations, *, durably=False: done(made, operations),
-    )
-
-
 def resume_in_reverse(patch: Patch) -> None:
     read = journal.read
     patch(journal, "read", lambda path: dict([*read(path).items()][::-1]))
 
 
-def resume_with_a_new_time(patch: Patch) -> None:
-    resumed = demand_lifecycle.ticket_from_journal
-
-    def later(entry: Any) -> Any:
-        ticket = resumed(entry)
-        ticket.received += timedelta(minutes=5)
-        return ticket
-
-    patch(demand_lifecycle, "ticket_from_journal", later)
+def skip_the_search_for_operations(patch: Patch) -> None:
+    patch(Evaluator, "published_before", lambda *_: [])
 
 
 def start_without_overrides(patch: Patch) -> None:
@@ -596,7 +453,7 @@ def start_without_overrides(patch: Patch) -> None:
 
     def without(*given: Any) -> Any:
         found = first(*given)
-        config = found.state.config.model_copy(update={"overrides": {}})
+        config = replace(found.state.config, overrides={})
         return replace(found, state=replace(found.state, config=config))
 
     patch(generator.state_in_effect, "first_snapshot", without)
@@ -607,78 +464,82 @@ def start_without_the_last_claim(patch: Patch) -> None:
     patch(snapshot, "_claim_texts", lambda *given: iter([*texts(*given)][:-1]))
 
 
-def start_with_nobody_waiting(patch: Patch) -> None:
-    load = snapshot.load
-
-    def without(*given: Any) -> Any:
-        found = load(*given)
-        ledger = found.state.ledger.without_waiting([*found.state.ledger.waiting])
-        return replace(found, state=replace(found.state, ledger=ledger))
-
-    patch(snapshot, "load", without)
-
-
-def start_with_ended_overrides(patch: Patch) -> None:
-    load = snapshot.load
-
-    def without(*given: Any) -> Any:
-        found = load(*given)
-        ledger = replace(found.state.ledger, ended={})
-        return replace(found, state=replace(found.state, ledger=ledger))
-
-    patch(snapshot, "load", without)
-
-
-# ---- approval ----
-
-
-def book_without_approval(patch: Patch) -> None:
-    patch(permission, "approval_reasons", lambda *_: ())
-
-
 def skip_approval_after_a_restart(patch: Patch) -> None:
-    resumed = demand_lifecycle.ticket_from_journal
-    reasons = permission.approval_reasons
-    known: set[str] = set()
+    resumed, reasons = demand_lifecycle.ticket_from_journal, permission.approval_reasons
+    known = set[str]()
 
-    def remembered(entry: Any) -> Any:
+    def forgotten(entry: Any) -> Ticket:
         if entry.proposal:
-            known.add(json.dumps(entry.goal, sort_keys=True))
-            entry = replace(entry, proposal=None)
-        return resumed(entry)
+            known.add(entry.goal.get("demand", ""))
+        return resumed(replace(entry, proposal=None))
 
-    patch(demand_lifecycle, "ticket_from_journal", remembered)
-    patch(
-        permission,
-        "approval_reasons",
-        lambda request, changes, config: (
-            ()
-            if request.demand in {json.loads(k).get("demand") for k in known}
-            else reasons(request, changes, config)
-        ),
-    )
+    def without(request: Any, *more: Any) -> tuple[str, ...]:
+        return () if request.demand in known else reasons(request, *more)
+
+    patch(demand_lifecycle, "ticket_from_journal", forgotten)
+    patch(permission, "approval_reasons", without)
 
 
-def begin_leases_before_the_approval(patch: Patch) -> None:
-    patch(permission, "with_leases_from_approval", lambda request: request)
-
-
-def propose_only_the_first_of_a_branch(patch: Patch) -> None:
-    wait_for = Proposal.wait_for
-    patch(Proposal, "wait_for", lambda made, left: wait_for(made, left[:1]))
-
-
-def leave_replaced_proposals_open(patch: Patch) -> None:
-    patch(Approvals, "withdraw_replaced", lambda *_: None)
-
-
-def leave_released_proposals_open(patch: Patch) -> None:
-    patch(Approvals, "remove_released", lambda *_: None)
-
-
-def forget_that_a_proposal_was_merged(patch: Patch) -> None:
-    patch(approvals.commit_log, "operations_since", lambda *_: {})
-
-
-def turn_down_what_waits(patch: Patch) -> None:
-    patch(ProposalBranches, "put", lambda *_: "")
+FAULTS: dict[Callable[[Patch], None], int] = {
+    keep_former_requesters: 7,
+    let_strangers_change_a_demand: 1,
+    release_only_the_first_claim: 17,
+    replace_what_was_joined: 2,
+    commit_what_is_booked_already: 8,
+    grant_one_claim_too_many: 4,
+    take_a_repeat_for_another_shutdown: 16,
+    take_back_promised_leases: 5,
+    lose_renewals: 3,
+    end_leases_by_the_wall_clock: 3,
+    come_down_at_once: 8,
+    come_down_early: 1,
+    never_come_down: 15,
+    share_one_instance: 1,
+    move_instances_with_the_channel: 4,
+    keep_the_channel_of_the_default_version: 22,
+    take_the_first_domain: 1,
+    forget_what_is_booked_in_a_domain: 100,
+    carry_only_the_first_demands_routes: 0,
+    name_a_shared_route_twice: 0,
+    deliver_under_the_source_topic: 6,
+    send_a_source_topic_to_two_targets: 6,
+    leave_the_clients_of_a_released_connection: 0,
+    leave_the_far_end: 0,
+    let_the_last_in_first: 3,
+    ignore_priorities: 44,
+    begin_the_wait_anew: 13,
+    forget_those_that_wait: 6,
+    let_others_overtake_in_a_batch: 13,
+    leave_drained_nodes_full: 4,
+    place_on_drained_nodes: 3,
+    choose_anew_for_a_placed_demand: 0,
+    count_no_room: 3,
+    count_released_room_as_taken: 0,
+    apply_no_override_to_what_a_demand_changes: 8,
+    apply_overrides_only_to_new_demands: 1,
+    let_the_lowest_priority_win: 63,
+    override_all_nodes: 7,
+    run_what_is_denied: 26,
+    book_what_is_denied: 6,
+    end_overrides_early: 6,
+    acknowledge_before_publishing: 0,
+    refuse_before_publishing: 0,
+    follow_nothing: 0,
+    push_on_any_tip: 1,
+    put_a_commit_on_the_wrong_parent: 0,
+    remove_no_file: 0,
+    decide_on_a_stale_tip: 2,
+    drop_what_a_batch_has_left: 0,
+    bring_back_what_was_deleted: 0,
+    book_again_what_was_approved: 0,
+    turn_down_what_waits: 0,
+    forget_the_journal: 1,
+    leave_the_journal_in_memory: 1,
+    rewrite_only_the_newest_entry: 1,
+    resume_in_reverse: 1,
+    skip_the_search_for_operations: 22,
+    start_without_overrides: 6,
+    start_without_the_last_claim: 0,
+    skip_approval_after_a_restart: 1,
+}
+"""Each planted fault, with a seed that found it at once when the table was written."""

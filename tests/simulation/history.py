@@ -137,6 +137,7 @@ class History:
                 (self._visitor, self._edit_generated),
                 (self._maker.any, self._delete_claim),
                 (self._maker.any, self._override),
+                (self._message, self._delete_claim),
             ]
         )
 
@@ -355,10 +356,10 @@ class History:
         return GitRepo(Path(self.world.remote.path)).files(under)
 
     def _override(self) -> None:
-        """Add an override, which mostly ends by itself, or remove it."""
+        """Add an override, which mostly ends by itself, change its end, or remove it."""
         name = self.chance.choice(sorted(_OVERRIDES))
         path = f"overrides/{name}.yaml"
-        if path in self._files("overrides/"):
+        if path in self._files("overrides/") and self.chance.randrange(2):
             self._commit({path: None})
             return
         head = {"apiVersion": "demandops/v1", "kind": "Override"}
@@ -432,6 +433,7 @@ class History:
         if not (branches := self._branches()):
             return
         remote, branch = self.world.remote, self.chance.choice(branches)
+        self.oracle.decided.add(branch)
         self.oracle.check()
         ours, theirs = remote.references[MAIN].target, remote.branches[branch].target
         base = remote.merge_base(ours, theirs)

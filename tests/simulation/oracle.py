@@ -13,7 +13,7 @@ from typing import Any
 
 import pygit2
 from demandops.demand.claim import Claim
-from demandops.errors import InvalidInput
+from demandops.errors import InvalidInput, TurnedDown
 from demandops.ledger import claim_file
 from demandops.service import Ticket
 from demandops.staterepo.audit import verification
@@ -78,6 +78,8 @@ class Oracle:
         """The change that a person's commit makes in the model, by the commit's id."""
         self.approved: set[str] = set()
         """The branches of the proposals that a person has merged."""
+        self.decided: set[str] = set()
+        """The branches of the proposals that a person has merged or turned down."""
         self.counts = Counter[str]()
         self._seen = world.tip
         self.books = Running(SLACK_S, nodes=PLACES)
@@ -335,6 +337,8 @@ class Oracle:
         if error is not None:
             assert "internal error" not in str(error), error
             assert place is None, f"{operation} is booked, but was answered {error}"
+            is_decided = any(branch in str(error) for branch in self.decided)
+            assert is_decided or not isinstance(error, TurnedDown), f"nobody did: {error}"
             if isinstance(error, InvalidInput) and not asked.needs_approval:
                 self._assert_possible(asked, "refused")
             return
