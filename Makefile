@@ -24,7 +24,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate docs wheel release clean
+.PHONY: help setup demo test test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs wheel release clean
 .PHONY: $(SYSTEM) go
 
 help:  ## List the targets
@@ -156,9 +156,13 @@ fuzz: export FUZZ_S ?= 10
 fuzz: system-test setup  ## Try odd inputs on every parser and writer, each for FUZZ_S seconds (default 10)
 	@$(PY) -m tests.fuzz
 
-simulate: setup  ## Find planted faults, then simulate generators, people and faults for SIMULATE_S=60 seconds from SEED
+simulate: setup  ## Find 60 planted faults, then simulate generators, people and faults for SIMULATE_S=60 seconds from SEED
 	@$(PY) -m pytest -q -n auto $(SIMULATION_TESTS)
 	@$(PY) -m tests.simulation.run
+
+# What is known of the same code and tests is not tried again, so an interrupted run goes on.
+mutants: system-test setup  ## Say which of MUTANTS=600 small mistakes in the core, drawn from SEED, its tests do not find; an hour
+	@$(PY) -m tests.mutants.run
 
 # Without this variable, each build prints an announcement of the theme's authors.
 docs: export NO_MKDOCS_2_WARNING := 1

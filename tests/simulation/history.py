@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
@@ -17,6 +18,7 @@ from tests.kit.promises import Maker, name_of
 from tests.kit.repo import POLICY, GitRepo
 from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, MAY, NEXT, TALLY
 from tests.model.leases import Goal
+from tests.model.running import CITY_QUOTA
 from tests.simulation.oracle import KEPT_REPLICAS, PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
 
@@ -29,14 +31,11 @@ _RULES = [
     {"name": "visitors", "requesters": [f"{VISITOR}*"], "approval": "required"},
     {"name": "residents", "requesters": ["vehicle*", "station*"]},
 ]
-_OVERRIDE = """apiVersion: demandops/v1
-kind: Override
-reason: More for a test
-owner: perception-team
-select:
-  - nodes: [edge, cloud]
-replicas: 2
-"""
+_OVERRIDES: dict[str, dict[str, object]] = {
+    "more": {"select": [{"nodes": ["edge", "cloud"]}], "replicas": 2},
+    "many": {"select": [{"nodes": ["edge"]}], "replicas": 3, "priority": 10},
+    "closed": {"select": [{"connections": ["x"]}], "deny": True},
+}
 _LONGEST_LEASE_S = 90
 _TALLY = f"""apiVersion: demandops/v1
 kind: ApplicationDefinition
@@ -95,6 +94,7 @@ def template() -> Path:
             "ros": {"domainId": 42},
             "rules": [{"name": "control", "requesters": city}],
             "leases": {"slack": f"{SLACK_S}s"},
+            "quotas": {"claimsPerRequester": CITY_QUOTA},
         }
     )
     further = [{"name": "city"}]
@@ -136,6 +136,8 @@ class History:
                 (self._placed, self._drain),
                 (self._visitor, self._edit_generated),
                 (self._maker.any, self._delete_claim),
+                (self._maker.any, self._override),
+                (self._message, self._delete_claim),
             ]
         )
 
@@ -210,10 +212,20 @@ class History:
         if kind == 1 and self._sent:  # sent again, as by a requester who got no answer
             return self.chance.choice(self._sent[-6:])
         if kind == 2:
-            return self._maker._message(shutdown=bool(self.chance.randrange(2)))
+            return self._message()
         if kind < 5:
             return self._placed()
         return self._maker.any()
+
+    def _message(self) -> Goal:
+        """Return a goal of the reference's action, mostly for whom an earlier one joined."""
+        made = self._maker._message(shutdown=bool(self.chance.randrange(2)))
+        joins = [one for one in self._sent[-12:] if one.get("shutdown") is False]
+        if joins and self.chance.randrange(3):
+            (item,), known = made["connections"], self.chance.choice(joins)
+            who = {name: known["connections"][0][name] for name in ("id", "requester_ids")}
+            made |= {"id": known["id"], "connections": [item | who]}
+        return made
 
     def _tallied(self) -> Goal:
         """Return a put, release or renewal of an application of the type `tally`.
@@ -325,6 +337,7 @@ class History:
     def edit(self) -> None:
         edits = (
             self._override,
+            self._override,
             self._inventory,
             self._drain,
             self._stop_waiting,
@@ -343,8 +356,18 @@ class History:
         return GitRepo(Path(self.world.remote.path)).files(under)
 
     def _override(self) -> None:
-        path = "overrides/more.yaml"
-        self._commit({path: None if path in self._files("overrides/") else _OVERRIDE})
+        """Add an override, which mostly ends by itself, change its end, or remove it."""
+        name = self.chance.choice(sorted(_OVERRIDES))
+        path = f"overrides/{name}.yaml"
+        if path in self._files("overrides/") and self.chance.randrange(2):
+            self._commit({path: None})
+            return
+        head = {"apiVersion": "demandops/v1", "kind": "Override"}
+        file = head | {"reason": "For a test", "owner": "perception-team"} | _OVERRIDES[name]
+        if seconds := self.chance.choice([None, 5, 100, 400]):
+            end = self.turns.now().replace(microsecond=0) + timedelta(seconds=seconds)
+            file["expires"] = end.isoformat().replace("+00:00", "Z")
+        self._commit({path: plain_yaml.dump(file)})
 
     def _inventory(self) -> None:
         data = plain_yaml.load(self._files(NODES)[NODES])
@@ -410,10 +433,12 @@ class History:
         if not (branches := self._branches()):
             return
         remote, branch = self.world.remote, self.chance.choice(branches)
+        self.oracle.decided.add(branch)
         self.oracle.check()
         ours, theirs = remote.references[MAIN].target, remote.branches[branch].target
         base = remote.merge_base(ours, theirs)
         if self.chance.randrange(3):
+            self.oracle.approved.add(branch)
             if base == ours:
                 remote.references.create(MAIN, theirs, force=True)
             elif base != theirs:

@@ -13,7 +13,7 @@ from typing import Any
 
 import pygit2
 from demandops.demand.claim import Claim
-from demandops.errors import InvalidInput
+from demandops.errors import InvalidInput, TurnedDown
 from demandops.ledger import claim_file
 from demandops.service import Ticket
 from demandops.staterepo.audit import verification
@@ -23,8 +23,9 @@ from demandops.staterepo.history.commit_log import PROPOSAL, entry_of
 
 from tests.kit import plain_yaml
 from tests.kit.promises import claims_of, name_of
-from tests.model.instances import FURTHER, KEPT_FOR, NEXT, Instance, Instances
+from tests.model.instances import FURTHER, KEPT_FOR, NEXT, Instance
 from tests.model.leases import Goal, Subject
+from tests.model.running import Link, Override, Running, Service
 from tests.simulation.world import Machine, World
 
 SLACK_S = 30
@@ -73,16 +74,23 @@ class Oracle:
     def __init__(self, world: World) -> None:
         self.world = world
         self.asked: dict[str, Asked] = {}
-        self.edits: dict[str, Callable[[Instances], object]] = {}
+        self.edits: dict[str, Callable[[Running], object]] = {}
         """The change that a person's commit makes in the model, by the commit's id."""
+        self.approved: set[str] = set()
+        """The branches of the proposals that a person has merged."""
+        self.decided: set[str] = set()
+        """The branches of the proposals that a person has merged or turned down."""
         self.counts = Counter[str]()
         self._seen = world.tip
-        self.books = Instances(SLACK_S, nodes=PLACES)
+        self.books = Running(SLACK_S, nodes=PLACES)
+        self._ended: set[Override] = set()
+        """The overrides of the last commit that have ended."""
         self._pushed_at = world.turns.monotonic()
         """The time at which the oracle last found a new tip of main."""
         self._models = [pickle.dumps(self.books)]
         """The pickled model after each commit of main; copying the model takes ten times longer."""
         self._place: dict[str, int] = {}
+        self._commit: dict[str, str] = {}
         self._parsed: dict[pygit2.Oid, Claim] = {}
         self._last: dict[Any, int] = {}
         self._claims: dict[Any, Any] = {}
@@ -146,9 +154,10 @@ class Oracle:
         }
         if str(commit.id) in self.edits:
             self.edits[str(commit.id)](self.books)
-        for operation, is_proposed in self._operations(commit):
+        self._follow_overrides(commit)
+        for operation, branch in self._operations(commit):
             assert operation not in self._place, f"{operation} is booked twice"
-            self._place[operation] = len(self._models)
+            self._place[operation], self._commit[operation] = len(self._models), str(commit.id)
             asked = self.asked.get(operation)
             if asked is None:
                 assert by is not None
@@ -158,15 +167,25 @@ class Oracle:
                 continue
             if not asked.needs_approval:
                 self._assert_in_order(asked)
-            time = self.world.turns.monotonic() if is_proposed else asked.time
+            time = self.world.turns.monotonic() if branch else asked.time
+            held = self.books.content(asked.goal.get("demand", ""))
             outcome = self._take(self.books, asked, time)
             assert outcome != "refused", f"{operation} is booked, but the model refuses it"
+            # a shorter demand and other leases need no approval
+            now = self.books.content(asked.goal.get("demand", ""))
+            adds = any(held.get(subject) != what for subject, what in now.items())
+            is_approved = branch in self.approved or not (asked.needs_approval and adds)
+            assert is_approved, f"{operation} is booked, but nobody approved it"
+            renews = any(one.lease for one in self.claims(str(commit.id)).values())
+            assert outcome != "unchanged" or renews, f"{operation} is booked, but changes nothing"
             self.counts["waited"] += outcome == "waiting"
         expected = self.books.claims()
         assert claims == expected, f"after {commit.message}\n{claims}\nbut expected\n{expected}"
         told, waiting = self.books.waiting_files(), self._waiting_on(commit)
         assert waiting == told, f"{waiting} wait, but expected {told}"
         self._compare_instances(commit, records)
+        if entry_of(commit).by_generator:
+            self._compare_running(commit)
         self.books.chosen = {}
         self._claims, self._records = claims, records
         self._models.append(pickle.dumps(self.books))
@@ -193,6 +212,25 @@ class Oracle:
             found = sorted(_rendered_instances(commit))
             assert found == expected, f"after {commit.message}\n{found} run, not {expected}"
 
+    def _follow_overrides(self, commit: pygit2.Commit) -> None:
+        """Update the model with the overrides of a commit; fail if one ended before its time."""
+        overrides, ended = _overrides(commit)
+        latest = _made(commit) + timedelta(seconds=1)
+        for override in overrides:
+            early = f"{override.name} ended before {override.end}"
+            is_new = override.name in ended and override not in self._ended
+            assert not is_new or (override.end and override.end <= latest), early
+        self._ended = {one for one in overrides if one.name in ended}
+        self.books.overrides = frozenset(overrides) - self._ended
+
+    def _compare_running(self, commit: pygit2.Commit) -> None:
+        """Fail unless a generator's commit runs the services and connections of the model."""
+        services, links = _rendered(commit)
+        expected = self.books.services()
+        assert services == expected, f"after {commit.message}\n{services} run, not {expected}"
+        routes = self.books.links()
+        assert links == routes, f"after {commit.message}\n{links} are carried, not {routes}"
+
     def _time_of_own_work(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> datetime:
@@ -208,7 +246,7 @@ class Oracle:
                 return end - KEPT_FOR
         return made
 
-    def _take(self, books: Instances, asked: Asked, time: float) -> str:
+    def _take(self, books: Running, asked: Asked, time: float) -> str:
         received = asked.ticket.received.astimezone(timezone.utc).isoformat(timespec="microseconds")
         return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
 
@@ -239,11 +277,11 @@ class Oracle:
             self._end_leases(gone, machine, started, time)
         assert moved or gone or let_in, "a generator acted without a reason"
 
-    def _operations(self, commit: pygit2.Commit) -> list[tuple[str, bool]]:
+    def _operations(self, commit: pygit2.Commit) -> list[tuple[str, str]]:
         """Return the ids of the operations of a commit and of all commits that it merges.
 
-        Each id comes with a flag, which is true if a proposal contained the operation. The flag
-        matters because the lease of a proposed demand starts at the merge.
+        Each id comes with the branch of the proposal that contained the operation, or an empty
+        text. The lease of a proposed demand starts at the merge.
         """
         commits = [commit]
         if len(commit.parents) > 1:
@@ -253,7 +291,7 @@ class Oracle:
             # libgit2 may not hide all commits of main if a clock was set back
             commits += [one for one in walker if not remote.descendant_of(main, one.id)]
         return [
-            (operation, PROPOSAL in trailers)
+            (operation, next(iter(trailers.get(PROPOSAL, ())), ""))
             for each in reversed(commits)
             if (trailers := entry_of(each).trailers)
             for operation in trailers.get("Operation-Id", ())
@@ -300,6 +338,8 @@ class Oracle:
         if error is not None:
             assert "internal error" not in str(error), error
             assert place is None, f"{operation} is booked, but was answered {error}"
+            is_decided = any(branch in str(error) for branch in self.decided)
+            assert is_decided or not isinstance(error, TurnedDown), f"nobody did: {error}"
             if isinstance(error, InvalidInput) and not asked.needs_approval:
                 self._assert_possible(asked, "refused")
             return
@@ -316,6 +356,8 @@ class Oracle:
         else:
             assert place is not None, f"{operation} is acknowledged, but not on main"
             if not asked.needs_approval:
+                told = asked.ticket.future.result().commit
+                assert told == self._commit[operation], f"{operation} is told to be in {told}"
                 assert self._last.get(asked.machine, 0) <= place, (
                     "the acknowledgements came in another order than the commits"
                 )
@@ -332,7 +374,7 @@ class Oracle:
         return {self._take_in_copy(state, asked) for state in states}
 
     def _take_in_copy(self, model: bytes, asked: Asked) -> str:
-        books: Instances = pickle.loads(model)  # noqa: S301 - bytes of this oracle
+        books: Running = pickle.loads(model)  # noqa: S301 - bytes of this oracle
         return self._take(books, asked, asked.time)
 
     # ---- machines ----
@@ -370,7 +412,10 @@ class Oracle:
         for machine in self.world.machines:
             assert machine.generator is not None
             assert machine.generator.operations == (), "the journal has demands"
-            assert str(machine.generator.snapshot.commit) == tip, f"{machine.name} is behind"
+            snapshot = machine.generator.snapshot
+            assert str(snapshot.commit) == tip, f"{machine.name} is behind"
+            known = claims_of(snapshot.state.ledger)
+            assert known == self._claims, f"{machine.name} knows {known}, not {self._claims}"
         for operation, asked in self.asked.items():
             error = asked.is_answered and asked.ticket.future.exception()
             told = f"{operation} is booked, but was answered {error}"
@@ -382,6 +427,8 @@ class Oracle:
         on = {node for what, _ in self._claims.values() if (node := what.get("node"))}
         assert not free or not self.books.waiting, f"{self.books.waiting} wait, {free} are free"
         assert not free or not on & drained, f"{on & drained} were not emptied, {free} are free"
+        late = [one.name for one in self.books.overrides if one.end]
+        assert not late, f"did not end: {late}"
         (verdict,) = verification.verify(self.world.remote, [tip])
         assert verdict.holds, verdict
 
@@ -402,6 +449,66 @@ def _record(text: str) -> tuple[Instance, dict[int, datetime]]:
     return (record["application"], record["node"]), {
         replicas: datetime.fromisoformat(until.replace("Z", "+00:00")) for replicas, until in ends
     }
+
+
+def _overrides(commit: pygit2.Commit) -> tuple[list[Override], set[str]]:
+    """Return the overrides of a commit, and the names of those that have ended."""
+    found = [
+        Override.read(Path(path).stem, plain_yaml.load(text))
+        for path, text in trees.texts(commit.tree, ["overrides"]).items()
+        if path.endswith(".yaml")
+    ]
+    ended = map(plain_yaml.load, trees.texts(commit.tree, ["ledger/overrides"]).values())
+    ends = {(one["override"], str(one["expires"]).replace("Z", "+00:00")) for one in ended}
+    return found, {one.name for one in found if one.end and (one.name, one.end.isoformat()) in ends}
+
+
+def _rendered(
+    commit: pygit2.Commit,
+) -> tuple[dict[Service, tuple[list[str], int]], dict[Link, dict[str, str]]]:
+    """Return the rendered services and connections, as the model names them.
+
+    A connection carries what its source client sends under a name that its target client reads.
+    """
+    services: dict[Service, tuple[list[str], int]] = {}
+    ends: dict[tuple[str, str], tuple[str, dict[str, str]]] = {}
+    for path, blob in trees.blobs(commit.tree, ["clusters"]):
+        name, node = Path(path).stem, Path(path).parent.name
+        if name.startswith("of-"):
+            services[name.removeprefix("of-"), node] = _rendered_service(trees.text_of(blob))
+        elif name.startswith("mqtt-"):
+            _, id, end = name.split("-")
+            assert (id, end) not in ends, f"{id} has two clients at its {end}"
+            ends[id, end] = node, _carried(trees.text_of(blob))
+        else:
+            assert name.startswith(("_", "ta-", "README")) or "/_" in path, f"{path} is not needed"
+    links: dict[Link, dict[str, str]] = {}
+    for (id, end), (source, sent) in ends.items():
+        if end == "source":
+            target, read = ends.get((id, "target"), ("", {}))
+            told = {named: topic for topic, named in read.items()}
+            assert sorted(told) == sorted(sent.values()), f"{id} sends {sent} and reads {read}"
+            links[id, source, target] = {topic: told[named] for topic, named in sent.items()}
+    assert len(ends) == 2 * len(links), f"a client lacks its other end: {sorted(ends)}"
+    return services, links
+
+
+@lru_cache(maxsize=1024)
+def _rendered_service(text: str) -> tuple[list[str], int]:
+    values = plain_yaml.load(text)["spec"]["values"]
+    return sorted(values["inputs"]["egoData"]), values["replicas"]
+
+
+@lru_cache(maxsize=1024)
+def _carried(text: str) -> dict[str, str]:
+    """Return the name at the broker of each ROS topic of a client."""
+    settings = plain_yaml.load(text.partition("\n---\n")[0])["data"]["params.yaml"]
+    bridge = plain_yaml.load(settings)["/**/*"]["ros__parameters"]["bridge"]
+    sent, read = bridge.get("ros2mqtt", {}), bridge.get("mqtt2ros", {})
+    found = [(topic, sent[topic]["mqtt_topic"]) for topic in sent.get("ros_topics", ())]
+    found += [(read[named]["ros_topic"], named) for named in read.get("mqtt_topics", ())]
+    assert len(dict(found)) == len(found), f"a topic is carried twice: {found}"
+    return dict(found)
 
 
 def _rendered_instances(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:

@@ -469,6 +469,27 @@ def test_a_demand_that_main_would_place_elsewhere_is_another_proposal(
     rig.assert_sound(bare)
 
 
+def test_a_put_right_behind_a_release_is_proposed_anew(bare: Path, petra: Person) -> None:
+    gate, gone = rig.Gate(), {"kind": "Demand", "operation": "release", "demand": "d"}
+    with rig.running(bare) as generator:
+        first = Proposed(generator, put("d", 1), "op-1")
+        assert branches(bare) == [first.branch]
+        held = generator.submit(goal(2), "op-0", gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        released = generator.submit({**gone, "requesters": ["user"]}, "op-2")
+        second = Proposed(generator, put("d", 2), "op-3")
+        gate.open.set()
+        assert rig.receipt(released).outcome == "released"
+        with pytest.raises(Withdrawn):
+            rig.receipt(first.ticket)
+        assert branches(bare) == [second.branch]
+        petra.merge(second.branch)
+        assert second.outcome() == "booked"
+        generator.withdraw("op-0")
+        with pytest.raises(Withdrawn):
+            rig.receipt(held)
+
+
 def test_a_lease_counts_from_the_merge(bare: Path, petra: Person) -> None:
     with rig.running(bare) as generator:
         proposed = Proposed(generator, put("d", 1, lease=600), "op-1")
