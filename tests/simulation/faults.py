@@ -373,7 +373,7 @@ def decide_on_a_stale_tip(patch: Patch) -> None:
 
 
 def drop_what_a_batch_has_left(patch: Patch) -> None:
-    patch(Demands, "put_back", lambda demands, batch: batch.clear())
+    patch(Demands, "put_back", lambda demands, batch, *more: batch.clear())
 
 
 def bring_back_what_was_deleted(patch: Patch) -> None:
