@@ -505,7 +505,7 @@ FAULTS: dict[Callable[[Patch], None], int] = {
     send_a_source_topic_to_two_targets: 6,
     leave_the_clients_of_a_released_connection: 0,
     leave_the_far_end: 0,
-    let_the_last_in_first: 3,
+    let_the_last_in_first: 6,
     ignore_priorities: 44,
     begin_the_wait_anew: 13,
     forget_those_that_wait: 6,
@@ -518,7 +518,7 @@ FAULTS: dict[Callable[[Patch], None], int] = {
     apply_no_override_to_what_a_demand_changes: 8,
     apply_overrides_only_to_new_demands: 1,
     let_the_lowest_priority_win: 63,
-    override_all_nodes: 7,
+    override_all_nodes: 8,
     run_what_is_denied: 26,
     book_what_is_denied: 6,
     end_overrides_early: 6,
@@ -540,6 +540,6 @@ FAULTS: dict[Callable[[Patch], None], int] = {
     skip_the_search_for_operations: 22,
     start_without_overrides: 6,
     start_without_the_last_claim: 0,
-    skip_approval_after_a_restart: 1,
+    skip_approval_after_a_restart: 6,
 }
 """Each planted fault, with a seed that found it at once when the table was written."""
