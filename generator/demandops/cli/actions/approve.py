@@ -117,7 +117,7 @@ def approve(
     \b
     Examples:
       demandops approve visit -m "Agreed with the control room"
-      demandops approve demand/visit-3f2a9c1b04de --commit 5d41402abc4b2a76b9719d911017c592e81f9d3a
+      demandops approve visit --commit 5d41402abc4b2a76b9719d911017c592e81f9d3a
     """
     if not (commit or is_asked(yes, output)):
         raise click.UsageError(
