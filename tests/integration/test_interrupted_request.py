@@ -20,7 +20,8 @@ def test_an_interrupted_request_says_which_demands_are_answered(
 ) -> None:
     """Once a batch is published, the test puts a folder where Git needs the lock file of `main`.
 
-    So nothing more is committed, and some demands have no answer when the interrupt comes.
+    So nothing more is committed, and some demands have no answer when the interrupt comes. On a
+    busy machine it comes before the last ones are sent.
     """
     file = tmp_path / "demands.yaml"
     file.write_text(yaml.safe_dump_all(rig.goal(each) for each in range(60)))
@@ -40,9 +41,10 @@ def test_an_interrupted_request_says_which_demands_are_answered(
     told, booked = capfd.readouterr(), len(rig.operations(bare))
     assert code == 130
     assert told.out.count(" booked in ") == booked < 60
-    assert told.err.count(" has no answer yet") == 60 - booked
-    assert f"{booked} of 60 requests have an answer" in told.err
+    unsent = told.err.count("was not sent")
+    assert told.err.count(" has no answer yet") == 60 - booked - unsent > 0
+    assert f"{booked + unsent} of 60 requests have an answer" in told.err
     assert "stay in the journal" in told.err
     assert signal.getsignal(signal.SIGTERM) is handler
     assert rig.restart(bare) is True
-    assert len(rig.operations(bare)) == 60
+    assert 60 - unsent - 1 <= len(rig.operations(bare)) <= 60 - unsent

@@ -27,7 +27,7 @@ from demandops.cli.target import (
 )
 from demandops.decision import admit, decide, form_faults
 from demandops.demand.demand_goal import is_demand_goal
-from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, fault
+from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, Withdrawn, fault
 from demandops.input_file import read_input
 from demandops.quoting import one_line
 from demandops.runtime import REAL
@@ -204,7 +204,12 @@ def _book(
     except KeyboardInterrupt:
         if not answers:
             raise
-    answers += [_Answer() for _ in documents[len(answers) :]]
+    if len(answers) < len(documents):
+        answers.append(_Answer())  # it may be in the journal already
+    for _ in documents[len(answers) :]:
+        unsent = _Answer()
+        unsent.set_exception(Withdrawn("was not sent, because of the interrupt; send it again"))
+        answers.append(unsent)
     pairs = enumerate(zip(documents, answers, strict=True))
     return [_answered(index, document, answer) for index, (document, answer) in pairs]
 
