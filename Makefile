@@ -15,6 +15,10 @@ PAGE_TESTS := tests/page
 DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
 KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py tests/ros/test_crash.py
+# What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
+PROCESS_TESTS := tests/ros tests/experiment tests/unit/plan/test_budget.py \
+  tests/unit/config/test_thousands_of_entries.py $(addprefix tests/integration/,staterepo mqtt web \
+    test_get.py test_hostile_checkouts.py test_inbound_webhook.py test_person_commands.py)
 # One worker more than cores, because one is busy with the tests of ROS, which mostly wait.
 WORKERS := $(shell echo $$(($$(nproc) + 1)))
 # The ROS nodes of the tests and the demo talk on this machine only.
@@ -24,7 +28,7 @@ unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help setup demo test test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs wheel release clean
+.PHONY: help setup demo test test-processes test-nightly nightly test-packages page faults e2e e2e-path e2e-argocd experiment coverage check format fuzz golden bench bench-audit load simulate mutants docs wheel release clean
 .PHONY: $(SYSTEM) go
 
 help:  ## List the targets
@@ -58,7 +62,12 @@ demo: setup  ## Play the paper's experiment: eight demands over ROS 2 become eig
 FAST_TESTS := tests $(addprefix --ignore=,tests/e2e tests/benchmarks $(PACKAGE_TESTS) $(PAGE_TESTS) \
   $(DOCS_TESTS) $(SIMULATION_TESTS) $(KILL_TESTS))
 test: system-test setup  ## Run all tests but the slow ones, which other targets run
-	@$(PY) -m pytest -n $(WORKERS) --dist worksteal -m 'not nightly' $(FAST_TESTS)
+	@$(PY) -m pytest -n $(WORKERS) --dist worksteal -m 'not nightly' $(FAST_TESTS) \
+	  $(addprefix --ignore=,$(PROCESS_TESTS))
+
+test-processes: system-test setup  ## Run the tests that `make test` leaves out because they have remotes, crashes, ROS, brokers or servers
+	@$(PY) -m pytest -n $(WORKERS) --dist worksteal -m 'not nightly' $(PROCESS_TESTS) \
+	  $(addprefix --ignore=,$(KILL_TESTS))
 
 # The marked tests run one after the other, because some of them compare times.
 test-nightly: export DEMANDOPS_EXAMPLES ?= 3
@@ -117,13 +126,14 @@ experiment: export PATH := $(CURDIR)/$(GO_DIR)/go/bin:$(PATH)
 experiment: system-e2e$(if $(findstring argocd,$(EXPERIMENT)),-argocd) $(if $(FIGURES),system-page) setup go  ## Play the experiment in full: vehicles drive, the event detector demands, data flow; EXPERIMENT="--seed 1 --gitops argocd" (docs/experiment.md)
 	@$(PY) -m tests.experiment $(EXPERIMENT)
 
-check: system-test setup  ## Format, lint, types, imports, docs, test and test-packages
+check: system-test setup  ## Format, lint, types, imports, docs, test, test-processes and test-packages
 	@$(PY) -m ruff format --check .
 	@$(PY) -m ruff check .
 	@$(PY) -m mypy
 	@$(VENV)/bin/lint-imports --no-logo
 	@$(MAKE) --no-print-directory docs
 	@$(MAKE) --no-print-directory test
+	@$(MAKE) --no-print-directory test-processes
 	@$(MAKE) --no-print-directory test-packages
 
 format: setup  ## Format the code and mend what the linter can

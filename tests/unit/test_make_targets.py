@@ -12,7 +12,17 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 TEST_FILES = sorted((ROOT / "tests").rglob("test_*.py"))
-TARGETS = ("test", "test-packages", "page", "docs", "simulate", "faults", "e2e", "e2e-argocd")
+TARGETS = (
+    "test",
+    "test-processes",
+    "test-packages",
+    "page",
+    "docs",
+    "simulate",
+    "faults",
+    "e2e",
+    "e2e-argocd",
+)
 
 
 @lru_cache
