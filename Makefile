@@ -18,7 +18,8 @@ KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py tests/ros/tes
 # What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
 PROCESS_TESTS := tests/ros tests/experiment tests/unit/plan/test_budget.py \
   tests/unit/config/test_thousands_of_entries.py $(addprefix tests/integration/,staterepo mqtt web \
-    test_get.py test_hostile_checkouts.py test_inbound_webhook.py test_person_commands.py)
+    test_command_line.py test_get.py test_hostile_checkouts.py test_inbound_webhook.py \
+    test_person_commands.py test_proposals.py)
 # One worker more than cores, because one is busy with the tests of ROS, which mostly wait.
 WORKERS := $(shell echo $$(($$(nproc) + 1)))
 # The ROS nodes of the tests and the demo talk on this machine only.
