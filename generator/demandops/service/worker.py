@@ -32,6 +32,7 @@ from demandops.service.timing.backoff import (
     LONGEST_EVALUATION_S,
     Backoff,
 )
+from demandops.service.timing.budget import may_take_long
 from demandops.service.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
 from demandops.service.timing.heartbeat import Heartbeat
 from demandops.service.timing.own_work import OwnWork
@@ -264,7 +265,8 @@ class Worker:
         began = self._runtime.monotonic()
         for number, ticket in enumerate(part):
             self._require_not_ending()
-            if number and self._runtime.monotonic() - began > LONGEST_EVALUATION_S:
+            is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
+            if number and (is_late or may_take_long(ticket.goal)):
                 part, left = part[:number], part[number:] + left
                 break
             self._approvals.withdraw_released(results, ticket, commits.head.state)

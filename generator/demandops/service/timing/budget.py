@@ -4,8 +4,17 @@ from __future__ import annotations
 
 from demandops.config.repo_settings import ROOT_FILE, Limits
 from demandops.decision import Checkpoint
+from demandops.demand.admission import length_faults
 from demandops.errors import OverBudget
 from demandops.runtime import Runtime
+
+# The usual demand lists a dozen topics; one of this size is decided in some 10 ms.
+_USUAL = Limits.model_validate({"demandItems": 200, "demandCharacters": 20_000})
+
+
+def may_take_long(goal: object) -> bool:
+    """Return whether a demand is so large that what was decided before it is published first."""
+    return any(True for _ in length_faults(goal, _USUAL))
 
 
 def within(limits: Limits, runtime: Runtime) -> Checkpoint:
