@@ -19,6 +19,8 @@ from demandops.service import worker
 
 from tests.kit import rig
 from tests.kit.clock import Clock
+from tests.kit.goals import connection
+from tests.kit.goals import goal as made
 from tests.kit.rig import Gate
 
 LOOKS = 400
@@ -159,3 +161,21 @@ def test_after_a_kill_in_the_middle_it_is_refused_and_leaves_the_journal(
     assert "demand op-large ('d') from the journal: refused: too-large" in caplog.text
     assert rig.restart(bare)
     assert [commit.one("Operation") for commit in rig.commits(bare)] == ["join"]
+
+
+def test_what_was_decided_is_published_before_a_large_demand_is_begun(bare: Path) -> None:
+    told, gate = list[tuple[str, str]](), rig.Gate()
+    big = made([], [connection("c9", who=["r9"], topics=[f"/t{n}" for n in range(300)])], id="9")
+    with rig.running(bare) as generator:
+        first = generator.submit(rig.goal(1), listener=gate)
+        assert gate.reached.wait(rig.PATIENCE_S)
+        sent = [
+            generator.submit(
+                goal, listener=lambda stage, text, name=name: told.append((name, stage))
+            )
+            for name, goal in (("small", rig.goal(2)), ("large", big))
+        ]
+        gate.open.set()
+        for ticket in (first, *sent):
+            rig.receipt(ticket)
+    assert told.index(("small", "pushed")) < told.index(("large", "admitted"))
