@@ -204,7 +204,8 @@ def _searched(
                     trials = _Trials(state, now, checkpoint)
                     request = admit(state, goal, throttle, trials.succeeds, checkpoint)
                     return _decided(state, request, now, read, once, checkpoint)
-        except OverBudget as spent:  # the first refusal says what stands in the way
+        except OverBudget as spent:
+            # keep the faults of the first refusal: they tell the requester what to change
             raise Refused([_too_large(spent), *refused.faults]) from None
         raise
 

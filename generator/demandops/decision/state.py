@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
@@ -18,7 +18,7 @@ from demandops.plan.checks.name_clash import Names
 from demandops.plan.nodes import capacity
 from demandops.plan.nodes.capacity import Usage
 from demandops.plan.release import Release
-from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, is_needed
+from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
 from demandops.templating.values import Evaluate
@@ -67,7 +67,7 @@ class State(World):
         state = replace(self, ledger=ledger)
         object.__setattr__(state, "plans", known)
         object.__setattr__(state, "_usage", usage)
-        state._follow_names(self, rendered.plans)
+        state._follow_names(self, rendered.plans.keys())
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
@@ -77,23 +77,18 @@ class State(World):
         """
         state, changes = replace(self, ledger=ledger), tuple(changes)
         with suppress(Refused):  # if a definition is gone; then ``names`` looks at all releases
-            state._follow_names(self, dict.fromkeys(affected_keys(self, state, changes)))
+            state._follow_names(self, affected_keys(self, state, changes))
         if self._usage is not None:
             with suppress(Refused):  # if a definition is gone; then ``usage`` counts all services
                 usage = self._usage.plus(capacity.growth_by(self, state, changes))
                 object.__setattr__(state, "_usage", usage)
         return state
 
-    def _follow_names(self, before: State, plans: Mapping[ReleaseKey, Release | None]) -> None:
-        """Take over the names of ``before``, from which only the releases of ``plans`` differ.
-
-        A release that is not planned, because an override denies it, needs its name all the same.
-        """
-        if before._names is None:
-            return
-        names = name_clash.without_keys(before._names, before, plans)
-        needed = (key for key, planned in plans.items() if planned or is_needed(self, key))
-        object.__setattr__(self, "_names", name_clash.with_keys(names, self, needed))
+    def _follow_names(self, before: State, keys: Collection[ReleaseKey]) -> None:
+        """Take over the names of ``before``, from which only the releases at ``keys`` differ."""
+        if before._names is not None:
+            names = name_clash.followed(before._names, before, self, keys)
+            object.__setattr__(self, "_names", names)
 
 
 def rendered_files(

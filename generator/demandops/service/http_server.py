@@ -29,7 +29,7 @@ _REMEDIES = {
 
 _STOP_TIMEOUT_S = 1
 _STUCK_S = 10.0
-_PIECES = 2_000  # of one request, for its head and for a body in small packets
+_PIECES = 2_000  # the most packets that one request may arrive in
 _BYTES_IN_A_PIECE = 256
 
 

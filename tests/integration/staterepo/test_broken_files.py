@@ -488,7 +488,7 @@ MISTAKES: dict[str, Callable[[str], str | None]] = {
 def test_no_mistake_in_the_settings_stops_demands(
     bare: Path, person: Person, tmp_path: Path, demandops: Run, mistake: str
 ) -> None:
-    """What was in effect stays so, for a running generator and for one that starts."""
+    """A running generator and a restarted one both keep what was in effect before."""
     with rig.running(bare) as generator:
         rig.book(generator, goal(1))
         person.change({ROOT: MISTAKES[mistake](person.read(ROOT))})

@@ -7,7 +7,7 @@ client at a broker. So no other release in the state repo may have it, on whatev
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from typing import TypeAlias
 
@@ -18,11 +18,11 @@ from demandops.demand.claim import ClaimKey
 from demandops.demand.demand_request import DemandRequest
 from demandops.errors import Fault, InvalidInput, Refused, fault
 from demandops.ledger import claim_file, kept_replicas, waiting
-from demandops.ledger.claim_changes import Changes, ClaimChange
+from demandops.ledger.claim_changes import Changes
 from demandops.ledger.world import World
 from demandops.plan.checks.topic_clash import words
 from demandops.plan.planner import service_name
-from demandops.plan.release_keys import ReleaseKey, affected_keys, is_needed, keys_of_claims
+from demandops.plan.release_keys import ReleaseKey, is_needed, keys_of_claims
 
 _Reader: TypeAlias = Callable[[str], "str | None"]
 
@@ -81,9 +81,11 @@ def without_keys(names: Names, world: World, keys: Iterable[ReleaseKey]) -> Name
     return names
 
 
-def followed(names: Names, before: World, after: World, changes: Iterable[ClaimChange]) -> Names:
-    """Return the names in ``after``, given those in ``before`` and the changes of claims."""
-    keys = affected_keys(before, after, changes)
+def followed(names: Names, before: World, after: World, keys: Collection[ReleaseKey]) -> Names:
+    """Return the names in ``after``, given those in ``before``; only releases at ``keys`` differ.
+
+    A release that an override denies needs its name all the same.
+    """
     needed = (key for key in keys if is_needed(after, key))
     return with_keys(without_keys(names, before, keys), after, needed)
 

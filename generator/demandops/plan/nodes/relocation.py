@@ -177,7 +177,7 @@ def _moved(
             continue
         move = partial(on_node, node=chosen.node, service=service, world=world)
         after, changes = with_moved(world, claims, move)
-        moved_names = name_clash.followed(names, world, after, changes)
+        moved_names = name_clash.followed(names, world, after, affected_keys(world, after, changes))
         fault = next(_faults(world, after, changes, moved_names), None)
         if fault is None:
             keys = [change.key for change in changes]
@@ -271,7 +271,8 @@ def _all_moved(
     for id in applications:
         world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
     every = [one for of in changes.values() for one in of]
-    return world, changes, name_clash.followed(names, before, world, every)
+    keys = affected_keys(before, world, every)
+    return world, changes, name_clash.followed(names, before, world, keys)
 
 
 def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
