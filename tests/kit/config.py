@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import yaml
+from demandops.config.checks import override_conflicts
 from demandops.config.config import CONFIG_ROOTS, Config
+from demandops.config.override import Selector
 from demandops.decision import State
 from demandops.ledger.ledger import Ledger
 from demandops.staterepo.skeleton import files
@@ -51,3 +54,14 @@ def override(*select: Mapping[str, Any], **fields: Any) -> str:
     head = {"apiVersion": "demandops/v1", "kind": "Override"}
     why = {"reason": "a field test", "owner": "petra"}
     return yaml.safe_dump(head | why | {"select": list(select)} | fields, sort_keys=False)
+
+
+def may_select_same_release(
+    one: Iterable[Selector], other: Iterable[Selector], config: Config
+) -> bool:
+    """Return whether some release may match selectors of both overrides, by comparing all pairs."""
+    shares = override_conflicts.shares_any_clients(config)
+    return any(
+        override_conflicts.may_match_same_release(*pair, config, shares)
+        for pair in product(one, other)
+    )

@@ -16,7 +16,6 @@ import yaml
 from demandops.config.checks.override_conflicts import (
     check_override_conflicts,
     contested_effects,
-    may_select_same_release,
 )
 from demandops.config.config_reader import ConfigReader
 from demandops.config.load import load
@@ -26,7 +25,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
-from tests.kit.config import configuration, override
+from tests.kit.config import configuration, may_select_same_release, override
 from tests.unit.overrides.test_ties import _override, effects, selector
 
 Files = dict[str, str]

@@ -11,7 +11,6 @@ from typing import Any
 
 from demandops.config.checks.override_conflicts import (
     contested_effects,
-    may_select_same_release,
     patches_commute,
     patterns_overlap,
 )
@@ -27,7 +26,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
-from tests.kit.config import configuration
+from tests.kit.config import configuration, may_select_same_release
 
 TEXTS = ["".join(chars) for size in range(7) for chars in product("ab", repeat=size)]
 pattern = st.text("ab*?", min_size=1, max_size=4)

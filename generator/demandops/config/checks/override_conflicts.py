@@ -94,7 +94,7 @@ def _rivals(
     grows with the number of overrides, not with that of pairs, unless patterns hardly differ.
     """
 
-    shares = _shares_clients(config)
+    shares = shares_any_clients(config)
 
     def crowding(field: str) -> int:
         starts = Counter(
@@ -126,7 +126,7 @@ def _rivals(
                         for pair in pairs
                     )
                     for one, left in near:
-                        if one.name not in met and _may_match_same_release(
+                        if one.name not in met and may_match_same_release(
                             left, right, config, shares
                         ):
                             met[one.name] = one
@@ -180,19 +180,10 @@ def patches_commute(one: object, other: object) -> bool:
     )  # unlike ==, it distinguishes 1 from True
 
 
-def may_select_same_release(
-    one: Iterable[Selector], other: Iterable[Selector], config: Config
-) -> bool:
-    """Return whether some release, now or later, may match selectors of both overrides."""
-    others, shares = list(other), _shares_clients(config)
-    return any(
-        _may_match_same_release(left, right, config, shares) for left in one for right in others
-    )
-
-
-def _may_match_same_release(
+def may_match_same_release(
     one: Selector, other: Selector, config: Config, shares_clients: bool
 ) -> bool:
+    """Return whether some release, now or later, may match both selectors."""
     if (one.connections and _selects_services(other)) or (
         other.connections and _selects_services(one)
     ):
@@ -222,7 +213,7 @@ def _selects_services(selector: Selector) -> bool:
     return bool(selector.applications or selector.appdefs or selector.services)
 
 
-def _shares_clients(config: Config) -> bool:
+def shares_any_clients(config: Config) -> bool:
     return any(known.shares_clients(config) for known in connection_types.CONNECTION_TYPES)
 
 
