@@ -300,7 +300,9 @@ def _decided(
         refused = refused or list(capacity.faults(state.usage(), grown, config))
     if refused:
         raise Refused(refused)
+    checkpoint()
     after = state.followed_by(ledger, rendered, state.usage().plus(grown))
+    checkpoint()
     on_stage("booked")
     outcome: Outcome = "unchanged"
     if changes.claims or changes.waiting or isinstance(request, Wait):
@@ -348,7 +350,9 @@ def _booked(
     ledger, kept = scale_downs.with_kept_replicas(state, after, keys, now)
     after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
     clashes = list(topic_clash.faults(request, state, after, paced(keys, checkpoint)))
-    clashes += name_clash.faults(request, state, after, keys, changes, state.names())
+    clashes += name_clash.faults(
+        request, state, after, paced(keys, checkpoint), changes, state.names()
+    )
     for change in changes.claims if isinstance(request, Restoration) else ():
         clashes += topic_clash.faults_of_claim(change.after, state, after) if change.after else ()
     if clashes:

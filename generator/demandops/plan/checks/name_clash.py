@@ -107,11 +107,10 @@ def faults(
         changes: what the demand changes in the ledger.
         names: the names of the releases in ``before``.
     """
-    keys = tuple(keys)
-    names = with_keys(names, after, keys)
     for key in keys:
         for name in names_of(after, key):
-            others = names[name].discard(key)
+            others = (names.get(name) or HashTrieSet()).discard(key)
+            names = names.insert(name, others.insert(key))  # for the keys that follow
             # a release keeps the name that it has, even if a person gave another one this name
             if not others or not is_needed(after, key) or is_needed(before, key):
                 continue
