@@ -8,7 +8,7 @@ os.environ["GIT_NO_REPLACE_OBJECTS"] = "1"
 
 # A hook, or a command that git runs, has these variables. They would make git work on the
 # repository of the hook instead of the state repo.
-_OF_A_HOOK = (
+for _name in (
     "GIT_ALTERNATE_OBJECT_DIRECTORIES",
     "GIT_COMMON_DIR",
     "GIT_DIR",
@@ -20,6 +20,5 @@ _OF_A_HOOK = (
     "GIT_QUARANTINE_PATH",
     "GIT_SHALLOW_FILE",
     "GIT_WORK_TREE",
-)
-for _name in _OF_A_HOOK:
+):
     os.environ.pop(_name, None)

@@ -12,21 +12,18 @@ from demandops.settings import MAIN_BRANCH
 from demandops.staterepo.git.local_repository import LocalRepository
 from demandops.staterepo.git.repository import PushDenied
 
-_ROOT_FILE = "demandops.yaml"
-
 
 def is_checkout(folder: Path) -> bool:
-    """Return whether a folder is a Git checkout of a state repo."""
-    return (folder / ".git").exists() and (folder / _ROOT_FILE).is_file()
+    return (folder / ".git").exists() and (folder / "demandops.yaml").is_file()
 
 
 def checkout_around(folder: Path) -> Path | None:
-    """Return the nearest checkout of a state repo, from ``folder`` upwards, or None."""
-    return next((one for one in (folder, *folder.parents) if is_checkout(one)), None)
+    """Return the nearest checkout of a state repo, from ``folder`` upwards."""
+    return next(filter(is_checkout, (folder, *folder.parents)), None)
 
 
 def origin_of(checkout: Path) -> str | None:
-    """Return the URL of a checkout's remote ``origin``, or None if it has none."""
+    """Return the URL of a checkout's remote ``origin``."""
     try:
         remotes = {remote.name: remote.url for remote in Repository(str(checkout)).remotes}
     except pygit2.GitError:
@@ -41,7 +38,6 @@ class Checkout(LocalRepository):
     branches = "refs/remotes/origin/"
 
     def tip(self) -> Oid:
-        """Return the commit that is checked out."""
         target = self.objects.head.target
         assert isinstance(target, Oid)  # noqa: S101 - HEAD is resolved
         return target
@@ -52,7 +48,7 @@ class Checkout(LocalRepository):
         _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Raise PushDenied, because the program only reads checkouts."""
+        # a person may be editing the files, and would commit back what a demand has changed
         raise PushDenied(
             f"{self.address} is a checkout, and no command writes to a checkout; name the "
             "checkout's remote instead"

@@ -17,7 +17,8 @@ from functools import cache
 from demandops.runtime import REAL
 
 # The input ends without a line only if this process was killed. A process that is just being
-# started has no mark yet, so the shell looks again for two seconds.
+# started has no mark yet, so the shell looks again for two seconds. grep has -z, because the
+# kernel ends each variable in environ with a NUL byte.
 _WATCH = r"""
 read -r _ && exit
 for round in 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20; do
@@ -35,7 +36,7 @@ def mark() -> dict[str, str]:
     return _mark(os.getpid())
 
 
-@cache
+@cache  # by process: a fork is a process of its own, which may live longer
 def _mark(pid: int) -> dict[str, str]:
     name, value = "_DEMANDOPS_PROCESS", REAL.fresh_id()
     watch = subprocess.Popen(
@@ -56,6 +57,7 @@ def _mark(pid: int) -> dict[str, str]:
             pipe.close()
             watch.wait()
 
+    # the pipe must end with this process, also if a fork of it lives on
     os.register_at_fork(after_in_child=pipe.close)
     atexit.register(finish)
     return {name: value}

@@ -25,11 +25,9 @@ from demandops.staterepo.git.repository import (
     unopened,
 )
 
+# From this age on, a branch's lock counts as left behind by a killed process: Git locks a branch
+# only for milliseconds.
 _STALE_LOCK_S = 5.0
-"""The age in seconds from which a branch's lock counts as left behind by a killed process.
-
-Git locks a branch only for milliseconds.
-"""
 
 log = logging.getLogger("demandops")
 
@@ -45,7 +43,15 @@ class LocalRepository(StateRepository):
         try:
             self.objects = Repository(str(path))
         except pygit2.GitError as error:
-            raise unopened(path, error) or _not_a_repository(path) from None
+            if reason := unopened(path, error):
+                raise reason from None
+            remedy = f"make one with `demandops init {path} --bare`"
+            if any(path.iterdir()):  # `demandops init` would refuse this folder
+                remedy = (
+                    "name another folder, or make one in a new folder with `demandops init DIR "
+                    "--bare`"
+                )
+            raise StateRepoError(f"{path} is not a Git repository; {remedy}") from None
         self.new = NewObjects(self.objects)
         try:
             self._require_usable(path)
@@ -59,10 +65,7 @@ class LocalRepository(StateRepository):
         )
 
     def renew_if_damaged(self) -> bool:
-        """Raise StateRepoError if git finds the repository damaged, or return False.
-
-        A repository on this disk is never renewed, because it has no remote to clone from.
-        """
+        """Raise StateRepoError if git finds damage: there is no remote to clone from."""
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
             cwd=self.objects.path,
@@ -73,9 +76,10 @@ class LocalRepository(StateRepository):
             check=False,
         )
         if checked.returncode:
-            found = [*(checked.stderr + checked.stdout).strip().splitlines(), "git fsck fails"]
-            missing = (line for line in found if line.startswith("missing "))
-            raise self._unreadable(next(missing, found[0]))
+            lines = [*(checked.stderr + checked.stdout).strip().splitlines(), "git fsck fails"]
+            # other lines name only objects that point to the missing one
+            missing = (line for line in lines if line.startswith("missing "))
+            raise self._unreadable(next(missing, lines[0]))
         return False
 
     def _require_usable(self, path: Path) -> None:
@@ -87,7 +91,10 @@ class LocalRepository(StateRepository):
             )
         self.new.clean()
         self.tip()
-        if self.objects.is_shallow or _is_partial(self.objects):
+        # what `git clone --filter` writes into the configuration
+        filtered = (".promisor", ".partialclonefilter")
+        is_partial = any(entry.name.endswith(filtered) for entry in self.objects.config)
+        if self.objects.is_shallow or is_partial:
             raise StateRepoError(
                 f"{path} is a clone that lacks a part of the history or of the files; clone the "
                 "state repo again, without --depth and --filter"
@@ -102,30 +109,22 @@ class LocalRepository(StateRepository):
         _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def tip(self) -> Oid:
-        """Return the newest commit of main.
-
-        Raises StateRepoError if main does not exist, or is a symbolic reference.
-        """
-        found = self.objects.references.get(self.main_reference)
-        if found is None:
+        """Return the newest commit of main, or raise StateRepoError if main is no plain branch."""
+        main = self.objects.references.get(self.main_reference)
+        if main is None:
             raise missing_main(self.address)
-        if not isinstance(found.target, Oid):
+        if not isinstance(main.target, Oid):
             raise StateRepoError(
                 f"the branch '{MAIN_BRANCH}' of {self.address} is only another name of "
-                f"{found.target}; make it a branch: git -C {self.address} update-ref --no-deref "
-                f"{MAIN} {found.target}"
+                f"{main.target}; make it a branch: git -C {self.address} update-ref --no-deref "
+                f"{MAIN} {main.target}"
             )
-        return found.target
+        return main.target
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Return the tip, which is always current; there is nothing to fetch."""
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Move main to ``commit`` and return True.
-
-        Return False if main is no longer at ``expected``, or if another writer locks main.
-        """
         if self.tip() != expected:
             return False
         reference = self.objects.references[MAIN]
@@ -170,13 +169,13 @@ class LocalRepository(StateRepository):
         """
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         try:
-            found = lock.lstat()
+            status = lock.lstat()
         except FileNotFoundError:
             self._lock_seen = None
             return
-        seen, now = (found.st_ino, found.st_mtime_ns), self.runtime.monotonic()
-        if self._lock_seen is None or self._lock_seen[0] != seen:
-            self._lock_seen = (seen, now)
+        identity, now = (status.st_ino, status.st_mtime_ns), self.runtime.monotonic()
+        if self._lock_seen is None or self._lock_seen[0] != identity:
+            self._lock_seen = (identity, now)
         elif now - self._lock_seen[1] > _STALE_LOCK_S:
             log.warning("removing %s, which a killed process left behind", lock)
             try:
@@ -186,15 +185,3 @@ class LocalRepository(StateRepository):
                     f"{self.address} cannot be written: {lock} cannot be removed "
                     f"({error.strerror}); remove it"
                 ) from None
-
-
-def _not_a_repository(path: Path) -> StateRepoError:
-    remedy = f"make one with `demandops init {path} --bare`"
-    if any(path.iterdir()):  # `demandops init` would refuse this folder
-        remedy = "name another folder, or make one in a new folder with `demandops init DIR --bare`"
-    return StateRepoError(f"{path} is not a Git repository; {remedy}")
-
-
-def _is_partial(repo: Repository) -> bool:
-    """Return whether a repository is a clone that was made with ``--filter``."""
-    return any(entry.name.endswith((".promisor", ".partialclonefilter")) for entry in repo.config)

@@ -27,32 +27,24 @@ from pygit2.enums import ObjectType
 from demandops.staterepo.git.pack_file import write_pack
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
-_LAST = 0
-"""The priority of this source: the lowest, because most objects are read from other sources."""
-
+# The prefix of the folders in which packs are built.
 UNFINISHED = "demandops-pack-"
-"""The prefix of the folders in which packs are built."""
+# The errors raised if a file system has no hard links, or a file has too many.
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-"""The errors raised if a file system has no hard links, or a file has too many."""
+# The first bytes of the index of a pack.
 _INDEX = b"\xfftOc"
-"""The first bytes of the index of a pack."""
 
+# An entry of a tree object: the mode, the name and the raw id.
 _ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0.{20})", re.DOTALL)
-"""An entry of a tree object: the mode, the name and the raw id."""
 _ID = re.compile(rb"[0-7]+ [^\0]+\0(.{20})", re.DOTALL)
 _FOLDER = b"40000"
 
+# Name → raw entry of a folder. The name of a subfolder ends in a slash, so that sorting by name
+# gives Git's order.
 Entries = dict[bytes, bytes]
-"""Name → raw entry, for each entry of a folder.
-
-The name of a subfolder ends in a slash, so that sorting by name gives Git's order.
-"""
+# How many folders to remember. The newest are kept, because demands often change these again. A
+# remembered folder never becomes outdated, because an id always means the same content.
 _REMEMBERED = 32
-"""How many folders to remember.
-
-The newest folders are kept, because demands often change these again. A remembered folder never
-becomes outdated, because an id always means the same content.
-"""
 
 
 class NewObjects(pygit2.OdbBackend):
@@ -63,34 +55,33 @@ class NewObjects(pygit2.OdbBackend):
         # a strong reference would leak the repository and this object: Python does not know that
         # libgit2 refers to this object, so it could not free the cycle
         self._repo = weakref.ref(repo)
-        self._known: dict[Oid, tuple[ObjectType, bytes]] = {}
+        self._unpacked: dict[Oid, tuple[ObjectType, bytes]] = {}
         self._folders: dict[Oid, Entries] = {}
-        repo.odb.add_backend(self, _LAST)
+        # the lowest priority, because most objects are read from the disk
+        repo.odb.add_backend(self, 0)
 
     @property
     def repo(self) -> Repository:
-        """The repository.
-
-        The writer must keep a reference to the repository, because this object has only a weak one.
-        """
         repo = self._repo()
         assert repo is not None  # noqa: S101 - its writer has a strong reference
         return repo
 
     def add(self, kind: ObjectType, data: bytes) -> Oid:
         """Keep an object in memory until it is packed, and return its id."""
-        header = b"%s %d\0" % (_TYPES[kind], len(data))
-        oid = Oid(raw=_sha1(header + data))
-        self._known[oid] = (kind, data)
+        content = b"%s %d\0%s" % (_TYPES[kind], len(data), data)
+        oid = Oid(raw=hashlib.sha1(content).digest())  # noqa: S324 - Git's object ids
+        self._unpacked[oid] = (kind, data)
         return oid
 
     def folder(self, oid: Oid) -> Entries:
-        """Return the entries of a folder.
-
-        The caller may change the entries, and pass them to :meth:`add_folder`.
-        """
-        known = self._folders.pop(oid, None)
-        return _entries_of(self.repo[oid].peel(Tree).read_raw()) if known is None else known
+        """Return the entries of a folder, to change and pass to :meth:`add_folder`."""
+        remembered = self._folders.pop(oid, None)
+        if remembered is not None:
+            return remembered
+        return {
+            name + b"/" if mode == _FOLDER else name: entry
+            for entry, mode, name in _ENTRY.findall(self.repo[oid].peel(Tree).read_raw())
+        }
 
     def add_folder(self, entries: Entries) -> Oid:
         """Keep a folder in memory until it is packed, and return its id.
@@ -104,8 +95,7 @@ class NewObjects(pygit2.OdbBackend):
         return oid
 
     def forget(self) -> None:
-        """Drop all objects that are not packed."""
-        self._known.clear()
+        self._unpacked.clear()
 
     @contextmanager
     def packed(self, commit: Oid) -> Iterator[None]:
@@ -118,40 +108,36 @@ class NewObjects(pygit2.OdbBackend):
         if not needed:
             yield
             return
-        with self._placed(lambda folder: self._build_pack(folder, needed)):
+        objects = [(oid, *self._unpacked[oid]) for oid in needed]
+        with self._placed(lambda folder: write_pack(folder, objects)):
             for oid in needed:
-                del self._known[oid]
+                del self._unpacked[oid]
             yield
 
     @contextmanager
     def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
         """Write a new synced pack with the objects that ``commit`` has and ``since`` lacks.
 
-        If ``since`` is no commit of the repository, the pack has all objects of ``commit``.
-
-        The repository has these objects, but they may not be durable, because an earlier sync may
-        have failed. While the ``with`` block runs, git's housekeeping does not remove the pack.
+        If ``since`` is no commit of the repository, the pack has all objects of ``commit``. The
+        repository has these objects, but an earlier sync of them may have failed.
         """
         without = f"^{since}\n" if since and since in self.repo else ""
         with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n{without}")):
             yield
 
     @contextmanager
-    def _placed(self, build: Callable[[str], Path]) -> Iterator[None]:
-        """Build a pack, move the pack and then its index into place, and run the ``with`` block.
-
-        The pack comes first, because git removes an index without a pack. While the ``with`` block
-        runs, a .keep file protects the pack. The .keep file begins like an index, so that
-        :meth:`clean` recognizes the .keep file.
-        """
+    def _placed(self, build: Callable[[Path], Path]) -> Iterator[None]:
+        """Build a pack, move it into place, and protect it from git while the block runs."""
         packs = self._packs
-        with _locked(packs, fcntl.LOCK_SH), _folder_until_done(self.repo.path) as folder:
+        with _locked(packs, fcntl.LOCK_SH), _new_folder(self.repo.path) as folder:
             built = build(folder)
             placed = packs / built.name
             keep = placed.with_suffix(".keep")
             keep.unlink(missing_ok=True)
             try:
-                _mark(keep, built.with_suffix(".idx"))
+                # git removes no pack that has a .keep file
+                _link_or_write(keep, built.with_suffix(".idx"))
+                # the pack comes first, because git removes an index without a pack
                 built.replace(placed)
                 built.with_suffix(".idx").replace(placed.with_suffix(".idx"))
                 sync_folder(packs)
@@ -170,17 +156,14 @@ class NewObjects(pygit2.OdbBackend):
             for folder in Path(self.repo.path).glob(f"{UNFINISHED}*"):
                 shutil.rmtree(folder, ignore_errors=True)
             for keep in self._packs.glob("*.keep"):
-                with keep.open("rb") as file:
+                with keep.open("rb") as file:  # a person's .keep does not begin like an index
                     is_ours = file.read(len(_INDEX)) == _INDEX
                 if is_ours:
                     keep.unlink()
 
-    def _copy_to_pack(self, folder: str, revisions: str) -> Path:
-        """Let git write a synced pack into ``folder``, with the objects that ``revisions`` selects.
-
-        Return the pack's path. Git packs each object anew, so it reads and checks each object.
-        """
+    def _copy_to_pack(self, folder: Path, revisions: str) -> Path:
         done = subprocess.run(
+            # packing each object anew reads and checks it
             ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
              "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
             cwd=self.repo.path,
@@ -191,122 +174,87 @@ class NewObjects(pygit2.OdbBackend):
         )  # fmt: skip
         if done.returncode:
             raise pygit2.GitError(done.stderr.strip())
-        return _pack_in(folder)
-
-    def _build_pack(self, folder: str, needed: list[Oid]) -> Path:
-        return write_pack(Path(folder), [(oid, *self._known[oid]) for oid in needed])
+        # iterdir, because glob would hide that the folder cannot be read
+        (pack,) = [path for path in folder.iterdir() if path.suffix == ".pack"]
+        return pack
 
     def _needed_by(self, commit: Oid) -> list[Oid]:
-        known = {oid.raw: oid for oid in self._known}
+        unpacked = {oid.raw: oid for oid in self._unpacked}
         needed, queue = dict[Oid, None](), [commit]
         while queue:
             oid = queue.pop()
-            if oid in needed or oid not in self._known:
+            if oid in needed or oid not in self._unpacked:
                 continue
             needed[oid] = None
-            kind, data = self._known[oid]
+            kind, data = self._unpacked[oid]
             if kind is ObjectType.COMMIT:
-                found = self.repo[oid].peel(pygit2.Commit)
-                queue += [found.tree_id, *found.parent_ids]
+                parsed = self.repo[oid].peel(pygit2.Commit)
+                queue += [parsed.tree_id, *parsed.parent_ids]
             elif kind is ObjectType.TREE:
-                queue += [known[raw] for raw in _ID.findall(data) if raw in known]
+                queue += [unpacked[raw] for raw in _ID.findall(data) if raw in unpacked]
         return list(needed)
 
     # ---- called by libgit2 ----
 
     def __iter__(self) -> Iterator[Oid]:
-        return iter(self._known)
+        return iter(self._unpacked)
 
     def exists_cb(self, oid: Oid) -> bool:
-        """Return whether there is a new object with this id."""
-        return oid in self._known
+        return oid in self._unpacked
 
     def read_cb(self, oid: Oid) -> tuple[int, bytes]:
-        """Return the type and the content of a new object."""
-        return self._known[oid]
+        return self._unpacked[oid]
 
     def read_header_cb(self, oid: Oid) -> tuple[int, int]:
-        """Return the type and the size of a new object."""
-        kind, data = self._known[oid]
+        kind, data = self._unpacked[oid]
         return kind, len(data)
 
     def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
-        """Return the type, content and id of a new object. A shortened id finds nothing."""
-        kind, data = self._known[oid]
+        kind, data = self._unpacked[oid]  # a shortened id finds nothing
         return kind, data, oid
 
     def refresh_cb(self) -> None:
-        """Do nothing: memory is always current."""
-
-
-def _sha1(data: bytes | bytearray) -> bytes:
-    return hashlib.sha1(data).digest()  # noqa: S324 - Git's object ids
-
-
-def _entries_of(data: bytes) -> Entries:
-    return {
-        name + b"/" if mode == _FOLDER else name: entry
-        for entry, mode, name in _ENTRY.findall(data)
-    }
+        pass  # memory is always current
 
 
 @contextmanager
-def _folder_until_done(parent: str) -> Iterator[str]:
-    """Yield a new folder, and remove the folder after the block.
-
-    If the folder cannot be removed, the next start of the program removes it.
-    """
+def _new_folder(parent: str) -> Iterator[Path]:
     folder = mkdtemp(dir=parent, prefix=UNFINISHED)
     try:
-        yield folder
+        yield Path(folder)
     finally:
-        with suppress(OSError):  # for the folder itself, rmtree raises some errors nevertheless
+        # For the folder itself, rmtree raises some errors nevertheless. A folder that stays is
+        # removed at the next start.
+        with suppress(OSError):
             shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
-def _locked(folder: Path, how: int) -> Iterator[None]:
-    """Lock a folder while the block runs; ``how`` is the operation of ``flock``.
-
-    Several writers of packs may share the lock.
-    """
+def _locked(folder: Path, operation: int) -> Iterator[None]:
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        fcntl.flock(handle, how)
+        fcntl.flock(handle, operation)
         yield
     finally:
         os.close(handle)
 
 
-def _pack_in(folder: str) -> Path:
-    """Return the path of the only pack in a folder.
-
-    Raises OSError if the folder cannot be read. :meth:`Path.glob` would hide this error.
-    """
-    (pack,) = [path for path in Path(folder).iterdir() if path.suffix == ".pack"]
-    return pack
-
-
-def _mark(keep: Path, index: Path) -> None:
-    """Make the .keep file of a pack: a hard link to the pack's index, which is synced already.
-
-    On a file system without hard links, write and sync a new file, then move it to ``keep``.
-    """
+def _link_or_write(keep: Path, index: Path) -> None:
     try:
-        keep.hardlink_to(index)
+        keep.hardlink_to(index)  # which is synced already, so this costs no sync
     except OSError as error:
         if error.errno not in _NO_LINKS:
             raise
-        made = index.with_suffix(".keep")
-        with made.open("wb") as file:
+        unplaced = index.with_suffix(".keep")
+        with unplaced.open("wb") as file:
             file.write(_INDEX)
             file.flush()
             os.fsync(file.fileno())
-        made.replace(keep)
+        unplaced.replace(keep)
 
 
 def sync_folder(folder: Path) -> None:
-    """Sync a folder, so that the names of its files are on the disk."""
+    # without this, a power loss may take the names of new files, though not their content
     handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(handle)

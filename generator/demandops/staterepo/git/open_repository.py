@@ -24,14 +24,12 @@ _ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
 
 
 def is_url(address: str) -> bool:
-    """Return whether an address is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``).
-
-    The path of an existing file or folder is not a URL.
-    """
+    """Return whether an address is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``)."""
     try:
         exists = Path(address).exists()
     except OSError:  # the address is too long, or in a folder that this user cannot read
         exists = False
+    # like git, which takes an existing folder ``a:b`` for a folder
     return not exists and bool(_SCHEME.match(address) or _SCP.match(address))
 
 
@@ -51,12 +49,7 @@ def connect(
         folder: the folder in which the clone of a URL is made.
         notify: called with a text before work that takes a while.
         allow_offline: whether an existing clone may be used if its remote cannot be reached.
-        only_read: whether the caller only reads. If so, the address may also be the folder of a
-            checkout.
-
-    Raises:
-        StateRepoError: the address is not usable, or the remote cannot be reached.
-        Unsound: the disk failed.
+        only_read: whether the address may also be the folder of a checkout.
     """
     if is_url(address):
         _check_url(address)
@@ -82,8 +75,8 @@ def connect(
 
 
 def _check_url(url: str) -> None:
-    """Raise StateRepoError if a URL has an unknown scheme, a password, a token or no host."""
     scheme = _SCHEME.match(url)
+    # git would start a program for other schemes: ``ext::COMMAND``, or git-remote-SCHEME
     if scheme and (scheme[2] == "::" or scheme[1] not in _ALLOWED):
         raise StateRepoError(
             f"a state repo's address cannot start with '{scheme[0]}'; use https, ssh, git or file"

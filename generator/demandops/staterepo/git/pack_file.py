@@ -11,7 +11,7 @@ import os
 import struct
 import zlib
 from bisect import bisect_right
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -19,10 +19,10 @@ from pygit2 import Oid
 from pygit2.enums import ObjectType
 
 _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
+# The level of compression. A pack is short-lived, so speed counts more than size.
 _LEVEL = 1
-"""The level of compression. A pack is short-lived, so speed counts more than size."""
+# An index has a separate table for offsets of at least this value.
 _SHORT_OFFSETS = 1 << 31
-"""An index has a separate table for offsets of at least this value."""
 
 
 class Packed(NamedTuple):
@@ -34,11 +34,7 @@ class Packed(NamedTuple):
 
 
 def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -> Path:
-    """Write a pack and its index into a folder, sync both, and return the pack's path.
-
-    Raises:
-        OSError: if the pack or the index cannot be written or synced.
-    """
+    """Write a pack and its index into a folder, sync both, and return the pack's path."""
     parts = [b"PACK" + struct.pack(">II", 2, len(objects))]
     packed, offset = list[Packed](), len(parts[0])
     for oid, kind, data in objects:
@@ -54,42 +50,33 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
 
 
 def _header(kind: int, size: int) -> bytes:
-    """Return the header of an object in a pack: the object's type and size."""
-    first, size = kind << 4 | size & 0xF, size >> 4
+    # 4 bits of the size are beside the type, and 7 in each further byte; the top bit means more
+    byte, size = kind << 4 | size & 0xF, size >> 4
     header = bytearray()
     while size:
-        header.append(first | 0x80)
-        first, size = size & 0x7F, size >> 7
-    header.append(first)
+        header.append(byte | 0x80)
+        byte, size = size & 0x7F, size >> 7
+    header.append(byte)
     return bytes(header)
 
 
 def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
-    """Return the bytes of the index (version 2) of a pack, in parts.
-
-    Args:
-        packed: the objects in the pack.
-        checksum: the checksum of the pack.
-    """
-    found = sorted(packed)
-    firsts = [one.oid[0] for one in found]
-    far = [one.offset for one in found if one.offset >= _SHORT_OFFSETS]
+    """Return the bytes of the index (version 2) of a pack with this checksum, in parts."""
+    packed = sorted(packed)
+    firsts = [item.oid[0] for item in packed]
+    far = [item.offset for item in packed if item.offset >= _SHORT_OFFSETS]
     places = {offset: _SHORT_OFFSETS | place for place, offset in enumerate(far)}
     parts = [
         b"\xfftOc" + struct.pack(">I", 2),
+        # git looks an id up by its first byte: how many ids begin with at most this byte
         struct.pack(">256I", *(bisect_right(firsts, first) for first in range(256))),
-        b"".join(one.oid for one in found),
-        _numbers("I", (one.crc for one in found)),
-        _numbers("I", (places.get(one.offset, one.offset) for one in found)),
-        _numbers("Q", far),
+        b"".join(item.oid for item in packed),
+        struct.pack(f">{len(packed)}I", *(item.crc for item in packed)),
+        struct.pack(f">{len(packed)}I", *(places.get(i.offset, i.offset) for i in packed)),
+        struct.pack(f">{len(far)}Q", *far),
         checksum,
     ]
     return [*parts, _sha1(parts)]
-
-
-def _numbers(size: str, numbers: Iterable[int]) -> bytes:
-    each: Iterator[bytes] = (struct.pack(f">{size}", number) for number in numbers)
-    return b"".join(each)
 
 
 def _sha1(parts: Iterable[bytes]) -> bytes:
@@ -100,7 +87,7 @@ def _sha1(parts: Iterable[bytes]) -> bytes:
 
 
 def _write_synced(path: Path, parts: Iterable[bytes]) -> None:
-    """Write and sync a new file that is read-only, like git's packs."""
+    # read-only, like git's packs
     handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o444)
     with open(handle, "wb") as file:  # noqa: PTH123 - opens a file descriptor
         file.writelines(parts)

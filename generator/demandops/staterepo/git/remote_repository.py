@@ -39,20 +39,21 @@ _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
 _REMOTE_MOVED = re.compile(r"\[rejected\]")
 _REMOTE_MESSAGE = re.compile(r"remote: ?(.*)")
 _REMOTE_REJECTED = re.compile(r"\[remote rejected\] \((.*)\)")
+# A temporary rejection: the cause is the server or another writer, not a rule.
 _TEMPORARY = re.compile(
     r"lock|failed to update ref|incorrect old value|unpack|bad pack|"
     r"unable to (create|migrate|write)"
 )
-"""Matches a temporary rejection: the cause is the server or another writer, not a rule."""
+# The reason of a permanent rejection: the server will never accept the push.
 _RULE = re.compile(r"fsck|exceeds maximum|[Ii]nsufficient permission")
-"""Matches the reason of a permanent rejection: the server will never accept the push."""
+# Lines at the end of git's output that do not give the reason of a failure.
 _WITHOUT_REASON = re.compile(
     r"fatal: Could not read from remote repository|fatal: the remote end hung up|"
     r"error: failed to push some refs|Please make sure you have the correct access|"
     r"and the repository exists|send-pack: unexpected disconnect|fatal: expected flush after|"
     r"fatal: unknown error occurred while reading the configuration files"
 )
-"""Matches lines at the end of git's output that do not give the reason of a failure."""
+# Pairs: a pattern that matches git's reason, and the remedy for a person.
 _REMEDIES = (
     (
         re.compile(r"resolve host|Name or service not known", re.IGNORECASE),
@@ -84,25 +85,23 @@ _REMEDIES = (
         "check the host and the port in the address, and the network",
     ),
 )
-"""Pairs: a pattern that matches git's reason, and the remedy for a person."""
+# Git's error if the remote also has a reference like ``refs/heads/refs/heads/main``.
 _AMBIGUOUS = re.compile(r"dst refspec \S+ matches more than one")
-"""Matches git's error if the remote also has a reference like ``refs/heads/refs/heads/main``."""
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to", "fsck": "checking the clone of"}
+# Git ends an idle HTTP transfer much earlier.
 _CLONE_TIMEOUT_S = 3600
-"""How many seconds a clone may take. Git ends an idle HTTP transfer much earlier."""
+# This machine's disk, not the server's, whose errors begin with ``remote:``.
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
+# Git's errors about its own clone: unreadable, or without the remote ``origin``.
 _NO_CLONE = re.compile(
     r"^(?!remote:).*fatal: (not a git repository|'origin' does not appear to be a git|"
     r"detected dubious ownership in repository at '.*/clone\.git')",
     re.MULTILINE,
 )
-"""Matches git's errors about its own clone: unreadable, or without the remote ``origin``."""
+# Git's error if it cannot read a file, here or on the server. Its error about a URL that it cannot
+# reach does not match, because a URL has a colon.
 _NO_FILE = re.compile(r".*unable to access '[^':]*':.*")
-"""Matches git's error if git cannot read a file, here or on the server.
-
-Git's error about a URL that it cannot reach does not match.
-"""
 _NO_PERMISSION = re.compile(
     r"returned error: 40[13]|Permission denied|access denied", re.IGNORECASE
 )
@@ -110,20 +109,17 @@ _NO_PERMISSION = re.compile(
 _USER = re.compile(r"(://)[^/@\s]*@")
 
 HAS_PASSWORD = re.compile(r"(://)[^/@\s]*:(?!\d+/)\S*@")
+# A URL whose user name is a token. Other user names are allowed, because some forges need one.
 HAS_TOKEN = re.compile(
     r"^https?://(gh[a-z]_|github_pat_|gl[a-z]+-|ATBB|ATCTT|(?=[a-zA-Z]*\d)[a-zA-Z0-9]{32,}@)", re.I
 )
-"""Matches a URL whose user name is a token.
-
-Other user names are allowed, because some forges need a user name.
-"""
 Notify = Callable[[str], None]
 
 log = logging.getLogger("demandops")
 
 
 def without_secrets(text: str) -> str:
-    """Return ``text`` without the user part of its URLs, which may hold a password."""
+    # first what surely has a password, which may itself have an @; then each user name
     return _USER.sub(r"\1", HAS_PASSWORD.sub(r"\1", text))
 
 
@@ -175,7 +171,6 @@ class RemoteRepository(StateRepository):
             return False
 
     def renew_if_damaged(self) -> bool:
-        """Clone again if git's check of the clone fails or times out; return whether it did."""
         try:
             with git.Repo(self._folder) as repo:
                 self._run_git(repo, "fsck", "--no-dangling", "--no-progress")
@@ -193,12 +188,13 @@ class RemoteRepository(StateRepository):
     def _clone(self, notify: Notify) -> None:
         notify(f"cloning {self.address}")
         self._folder.parent.mkdir(parents=True, exist_ok=True)
+        # a killed process must not leave half a clone under the final name
         partial = self._folder.with_name(self._folder.name + ".partial")
         shutil.rmtree(partial, ignore_errors=True)
         with git.Repo.init(partial, bare=True, object_format="sha1") as repo:
             with repo.config_writer() as config:
                 config.set_value('remote "origin"', "url", self._url)
-                config.set_value("gc", "auto", 0)
+                config.set_value("gc", "auto", 0)  # tidy joins the packs, not a fetch
                 # Keep each fetched pack, because git syncs packs. Loose objects may be half-written
                 # after a crash, and libgit2 hangs on them.
                 config.set_value("fetch", "unpackLimit", 1)
@@ -220,21 +216,12 @@ class RemoteRepository(StateRepository):
         self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
-        """Fetch and return the remote's tip.
-
-        If ``urgent`` returns true before the fetch ends, git is ended and FetchInterrupted is
-        raised, so that a demand need not wait. Raises Unavailable if git cannot fetch now, and
-        StateRepoError if the remote has no main.
-        """
         self._fetch(self._git, urgent)
         return self.tip()
 
     def publish(self, expected: Oid, commit: Oid) -> bool:
-        """Push ``commit`` and return True; return False if the remote's tip is not ``expected``.
-
-        Return True also if the answer to the push was lost, but the remote has the commit.
-        """
-        try:  # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
+        # --force-with-lease overwrites nothing, because ``commit`` follows ``expected``
+        try:
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except (pygit2.GitError, OSError) as error:
@@ -279,8 +266,6 @@ class RemoteRepository(StateRepository):
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
         """Push one reference and return git's output, or raise GitCommandError.
 
-        After :meth:`abort`, raise RemoteAway.
-
         Args:
             spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
             lease: ``<reference>:<commit>``: the remote's reference must have this commit; if the
@@ -295,29 +280,18 @@ class RemoteRepository(StateRepository):
             commit, _, reference = spec.partition(":")
             if not commit or not _AMBIGUOUS.search(str(error.stderr)):
                 raise
-            out, err = self._push_literally(command, Oid(hex=commit), reference)
+            # Git finds a plain reference ambiguous if another one ends with it, but not the result
+            # of a pattern. The source of a pattern must be a reference, so one is made.
+            pushed = f"refs/pushed/{reference}"
+            self.objects.references.create(pushed, Oid(hex=commit), force=True)
+            try:
+                out, err = self._run_git(self._git, *command, f"{pushed}*:{reference}*")
+            finally:
+                self.objects.references.delete(pushed)
         return f"{out}\n{err}"
 
-    def _push_literally(
-        self, command: Sequence[str], commit: Oid, reference: str
-    ) -> tuple[str, str]:
-        """Push a branch although another reference of the remote ends with the branch's name.
-
-        Git finds a plain reference ambiguous if another one ends with it, but not the result of a
-        pattern. The source of a pattern must be a reference, so one is made for the commit.
-        """
-        pushed = f"refs/pushed/{reference}"
-        self.objects.references.create(pushed, commit, force=True)
-        try:
-            return self._run_git(self._git, *command, f"{pushed}*:{reference}*")
-        finally:
-            self.objects.references.delete(pushed)
-
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
-        """Return the error to raise for a failed push.
-
-        The error is PushDenied if a further attempt would fail too, and otherwise Unavailable.
-        """
+        """Return PushDenied if another attempt at a push would fail too, else Unavailable."""
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
         if _NO_ROOM.search(text):
             return self._disk_full()
@@ -342,10 +316,6 @@ class RemoteRepository(StateRepository):
         urgent: Callable[[], bool] = lambda: False,
         timeout: float = TIMEOUT_S,
     ) -> str:
-        """Return the output of a git command that reads from the remote, or raise Unavailable.
-
-        Raises StateRepoError if the remote has no main.
-        """
         command = (*command, "--quiet", "origin", *references)
         try:
             return self._run_git(repo, *command, urgent=urgent, timeout=timeout)[0]
@@ -359,8 +329,8 @@ class RemoteRepository(StateRepository):
             raise self._unreadable()
         failed = "read" if command[0] == "ls-remote" else "fetched"
         reason = _reason(text)
-        known = _NO_FILE.sub("", reason)  # credentials do not make a file readable
-        remedy = next((f"; {told}" for words, told in _REMEDIES if words.search(known)), "")
+        remediable = _NO_FILE.sub("", reason)  # credentials do not make a file readable
+        remedy = next((f"; {told}" for words, told in _REMEDIES if words.search(remediable)), "")
         raise RemoteAway(f"{self.address} cannot be {failed}: {reason}{remedy}")
 
     def _unreadable(self) -> Unavailable:
@@ -396,22 +366,32 @@ class RemoteRepository(StateRepository):
         if self._aborted:  # another thread has called abort since the first check
             self.abort()
         slow = SlowGit(f"{_DOING.get(command[0], 'asking')} {self.address}")
-        began = REAL.monotonic()
+        start = REAL.monotonic()
         try:
-            out, err = _wait_for(process, urgent, timeout, slow, self.while_waiting)
+            while True:
+                with suppress(subprocess.TimeoutExpired):
+                    out, err = process.communicate(timeout=_POLL_S)
+                    break
+                slow.lasts(REAL.monotonic() - start)
+                self.while_waiting()
+                if urgent():
+                    _terminate(process)
+                    raise FetchInterrupted("the fetch was interrupted by a demand")
+                if REAL.monotonic() - start >= timeout:
+                    out, err = _terminate(process)
+                    break
         finally:
             self._process = None
             slow.ends()
         if process.returncode < 0:
             err += f"\nfatal: git was ended by signal {-process.returncode}".encode()
-        if process.returncode and REAL.monotonic() - began >= timeout:
+        if process.returncode and REAL.monotonic() - start >= timeout:
             err += f"\nfatal: git timed out after {timeout:g} s".encode()
         if process.returncode:
             raise git.GitCommandError(list(command), process.returncode, err, out)
         return out.decode("utf-8", "replace"), err.decode("utf-8", "replace")
 
     def abort(self) -> None:
-        """End the running git command, if any; each later command raises RemoteAway."""
         self._aborted = True
         process = self._process
         if process is not None:
@@ -419,40 +399,9 @@ class RemoteRepository(StateRepository):
                 os.killpg(process.pid, signal.SIGTERM)
 
 
-def _wait_for(
-    process: subprocess.Popen[bytes],
-    urgent: Callable[[], bool],
-    timeout: float,
-    slow: SlowGit,
-    meanwhile: Callable[[], object],
-) -> tuple[bytes, bytes]:
-    """Return git's standard output and error output; end git after ``timeout`` seconds.
-
-    Until then, call ``meanwhile`` again and again. If ``urgent`` returns true before that, end git
-    and raise FetchInterrupted.
-    """
-    start = REAL.monotonic()
-    end = start + timeout
-    while True:
-        try:
-            return process.communicate(timeout=_POLL_S)
-        except subprocess.TimeoutExpired:
-            slow.lasts(REAL.monotonic() - start)
-            meanwhile()
-            hurry = urgent()
-            if not hurry and REAL.monotonic() < end:
-                continue
-            output = _terminate(process)
-            if hurry:
-                raise FetchInterrupted("the fetch was interrupted by a demand") from None
-            return output
-
-
 def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and its children, and return git's standard output and error output.
-
-    The first signal is SIGTERM, so that git can remove its locks.
-    """
+    """End git and its children, and return git's standard output and error output."""
+    # first by SIGTERM, so that git can remove its locks
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)
@@ -462,15 +411,10 @@ def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
 
 
 def _reason(text: str) -> str:
-    """Return the last line of git's error output that gives a reason."""
-    text = text.replace("stderr: '", "")  # GitPython's prefix
-    lines = [_without_last_quote(line) for line in text.splitlines() if line.strip(" '\"")]
+    # GitPython puts git's output into quotation marks
+    text = text.replace("stderr: '", "")
+    stripped = [line.strip(' "') for line in text.splitlines() if line.strip(" '\"")]
+    lines = [line.removesuffix("'") if line.count("'") % 2 else line for line in stripped]
     telling = [line for line in lines if not _WITHOUT_REASON.search(line)] or lines
     fatal = [line for line in telling if line.startswith(("fatal:", "error:", "remote:", "!"))]
     return (fatal or telling or ["git gave no reason"])[-1].rstrip(".")
-
-
-def _without_last_quote(line: str) -> str:
-    """Return a line without the quotation mark that GitPython puts at the end of git's output."""
-    line = line.strip(' "')
-    return line.removesuffix("'") if line.count("'") % 2 else line

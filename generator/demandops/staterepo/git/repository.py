@@ -28,9 +28,10 @@ from demandops.staterepo.git.signing import Signer
 
 MAIN = f"refs/heads/{MAIN_BRANCH}"
 TIMEOUT_S = 120
-_REPACK = ("repack", "--geometric=2", "-d", "-l", "--quiet")
 _ENVIRONMENT = {
+    # git fails instead of asking for a password, because nobody may be there to answer
     "GIT_TERMINAL_PROMPT": "0",
+    # git's errors are recognized by their English text
     "LC_ALL": "C",
     # git ends an HTTP transfer with less than 1 byte a second for 60 seconds
     "GIT_HTTP_LOW_SPEED_LIMIT": "1",
@@ -39,22 +40,18 @@ _ENVIRONMENT = {
 
 
 def git_environment() -> dict[str, str]:
-    """Return the environment variables that git gets in addition to those of this process."""
     return _ENVIRONMENT | child_processes.mark()
 
 
 class Unavailable(StateRepoError):
     """Raised when the state repo cannot be read or written now, but perhaps later.
 
-    A generator keeps its demands in the journal and tries again.
+    Then a generator keeps its demands in the journal and tries again.
     """
 
 
 class RemoteAway(Unavailable):
-    """Raised when git cannot fetch from the remote or push to it now, for example without network.
-
-    Missing rights to fetch, and a push that the remote rejects for a temporary reason, count too.
-    """
+    """Raised without network or rights to fetch, or if a push fails for a temporary reason."""
 
 
 class DiskFull(Unavailable):
@@ -68,30 +65,23 @@ class FetchInterrupted(StateRepoError):
 class PushDenied(StateRepoError):
     """Raised when a write fails for a reason that another attempt does not change.
 
-    Examples are a hook, a protected branch, missing rights, a read-only file system, and a checkout
-    as the state repo.
+    Examples are a hook, a protected branch, missing rights and a read-only file system.
     """
 
 
-_OBJECT = re.compile("[0-9a-f]{40}")
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _NOT_ALLOWED = (errno.EACCES, errno.EPERM, errno.EROFS)
 _BROKEN = (errno.EIO, errno.EUCLEAN, errno.ENODEV, errno.ENXIO, errno.ESTALE)
-_TOLD = {os.strerror(number): number for number in (*_NO_ROOM, *_NOT_ALLOWED, *_BROKEN)}
-_TOLD["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objects/pack
+_NUMBERS = {os.strerror(number): number for number in (*_NO_ROOM, *_NOT_ALLOWED, *_BROKEN)}
+_NUMBERS["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objects/pack
 
 
 def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
-    """Return the error to raise if a read or a write failed because of the disk, else None.
-
-    ``error`` is the error of the read or write. libgit2 gives the system's error only as text, so
-    this function recognizes the text. For an I/O error, it returns Unsound, because the content of
-    the disk is then unknown.
-    """
+    """Return the error to raise if ``error`` of a read or write came from the disk, else None."""
     number = getattr(error, "errno", None)
-    if number is None:
-        what = next((text for text in _TOLD if str(error).endswith(text)), "")
-        number = _TOLD.get(what)
+    if number is None:  # libgit2 gives the system's error only as text
+        what = next((text for text in _NUMBERS if str(error).endswith(text)), "")
+        number = _NUMBERS.get(what)
     else:
         what = os.strerror(number)
     if number in _NO_ROOM:
@@ -103,13 +93,12 @@ def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | Non
             f"{address} cannot be used: {what}; give the user of this program the right to read "
             "and write all files and folders there"
         )
-    if number in _BROKEN:
+    if number in _BROKEN:  # what is on the disk now is unknown, so the program must end
         return Unsound(f"{address} cannot be used: {what}; check its disk, then start again")
     return None
 
 
 def missing_main(address: str) -> StateRepoError:
-    """Return the error to raise if a state repo has no main branch."""
     return StateRepoError(
         f"{address} has no branch '{MAIN_BRANCH}'; if it was renamed or deleted, restore it; if "
         "there is no state repo yet, push one made by `demandops init DIR`"
@@ -129,17 +118,17 @@ def unopened(folder: Path, error: Exception) -> StateRepoError | None:
 def access_error(error: Exception, address: str, objects: Repository | None = None) -> Exception:
     """Return the error to raise if reading or writing ``address`` failed with ``error``.
 
-    Only an error of the system or of libgit2 is replaced. Any other error is returned unchanged.
-    With ``objects``, the text names the file and the commit of an object that cannot be read.
+    An error that is neither of the system nor of libgit2 is returned unchanged. With ``objects``,
+    the text names the file and the commit of an object that cannot be read.
     """
-    missing = isinstance(error, KeyError) and isinstance(error.args[0], Oid)
-    if not (missing or isinstance(error, OSError | pygit2.GitError)):
+    is_missing = isinstance(error, KeyError) and isinstance(error.args[0], Oid)
+    if not (is_missing or isinstance(error, OSError | pygit2.GitError)):
         return error
     # the text of a KeyError would have quotes
     what = str(error.args[0]) if isinstance(error, KeyError) else str(error)
-    if objects is not None and (name := _OBJECT.search(what)):
-        place = trees.place_of(Repository(objects.path), Oid(hex=name[0]))
-        what = f"{place}, Git object {name[0]}, is missing or damaged" if place else what
+    if objects is not None and (oid := re.search("[0-9a-f]{40}", what)):
+        place = trees.place_of(Repository(objects.path), Oid(hex=oid[0]))
+        what = f"{place}, Git object {oid[0]}, is missing or damaged" if place else what
     return disk_error(error, address) or StateRepoError(
         f"{address} cannot be read: {what}; check its disk and its files with `git fsck`, then "
         "fetch or clone the missing files again, or restore them from a backup"
@@ -166,21 +155,18 @@ class StateRepository(ABC):
 
     objects: Repository
     new: NewObjects
-    """The new objects that are in memory and not on the disk yet."""
     address: str
     signer: Signer | None = None
-    """Signs the commits that this process makes. If None, the commits are not signed."""
     runtime: Runtime = REAL
-    """The clock, randomness and threads of the code that writes to the state repo."""
+    # called again and again while this waits for git
     while_waiting: Callable[[], object] = staticmethod(lambda: None)
-    """Called again and again while this waits for git."""
+    # whether the tip needs no fetch, as in a repository on this disk
     always_current: bool
-    """Whether :meth:`tip` needs no fetch, as in a repository on this disk."""
     _tidying: subprocess.Popen[bytes] | None = None
+    # of the tip: main, its remote-tracking branch, or HEAD of a checkout
     main_reference = MAIN
-    """The reference of the tip: main, its remote-tracking branch, or HEAD of a checkout."""
+    # the prefix of the references of branches
     branches = "refs/heads/"
-    """The prefix of the references of branches in this repository."""
 
     def tip(self) -> Oid:
         """Return the newest published commit that is known here, without asking the remote."""
@@ -192,10 +178,9 @@ class StateRepository(ABC):
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         """Fetch and return the newest published commit.
 
-        Raises:
-            Unavailable: git cannot fetch now.
-            StateRepoError: the state repo has no main.
-            FetchInterrupted: ``urgent`` returned true before the fetch ended.
+        If ``urgent`` returns true before the fetch ends, git is ended and FetchInterrupted is
+        raised, so that a demand need not wait. Raises Unavailable if git cannot fetch now, and
+        StateRepoError if the state repo has no main.
         """
 
     @abstractmethod
@@ -206,31 +191,21 @@ class StateRepository(ABC):
         nothing and return false.
 
         Raises:
-            Unavailable: the commit could not be published now, or the remote cannot be reached and
-                nobody knows whether it got the commit. So look for the commit before you publish
-                it again.
+            Unavailable: the commit was not published, or nobody knows whether the remote got it. So
+                look for the commit before you publish it again.
             PushDenied: the commit was not published, and another attempt would fail too.
             Unsound: the disk failed, and nobody knows whether the commit was published.
         """
 
     def write_anew(self, since: str) -> None:  # noqa: B027 - a remote confirms what it stored
-        """Write the commits after ``since`` again, so that they are durable.
-
-        With a remote, this does nothing. Raises Unavailable or Unsound if the write fails.
-        """
+        """Write the commits after ``since`` again, so that they are durable."""
 
     def reopened(self) -> Repository:
-        """Return the repository opened again, for use in another thread.
-
-        The result has no objects that are only in memory.
-        """
+        # two threads must not use one Repository; this one has no objects that are only in memory
         return Repository(self.objects.path)
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or descends from ``other``.
-
-        Return false if the two differ and either is unknown here. Any thread may call this method.
-        """
+        """Return whether ``commit`` is ``other`` or descends from it, as far as known here."""
         if commit == other:
             return True
         try:
@@ -239,29 +214,23 @@ class StateRepository(ABC):
             return False
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` exists and is equal in two commits.
-
-        Return false if either commit is unknown here.
-        """
-        found = self._trees(commit, other)
-        if found is None:
+        """Return whether ``path`` exists and is equal in two commits that are known here."""
+        pair = self._trees(commit, other)
+        if pair is None:
             return False
         if path in ("", "."):
-            return found[0].id == found[1].id
-        return trees.entry(found[0], path) is not None and not trees.differ(*found, (path,))
+            return pair[0].id == pair[1].id
+        return trees.entry(pair[0], path) is not None and not trees.differ(*pair, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
-        """Return the paths of the files that differ between two commits, sorted.
+        """Return the sorted paths of the files that differ; None if a commit is unknown here."""
+        pair = self._trees(since, commit)
+        return None if pair is None else sorted(path for path, _ in trees.differences(*pair))
 
-        Return None if either commit is unknown here.
-        """
-        found = self._trees(since, commit)
-        return None if found is None else sorted(path for path, _ in trees.differences(*found))
-
-    def _trees(self, one: str, other: str) -> tuple[Tree, Tree] | None:
+    def _trees(self, commit: str, other: str) -> tuple[Tree, Tree] | None:
         objects = self.reopened()
         try:
-            return trees.commit_of(objects, one).tree, trees.commit_of(objects, other).tree
+            return trees.commit_of(objects, commit).tree, trees.commit_of(objects, other).tree
         except StateRepoError:
             return None
 
@@ -269,9 +238,8 @@ class StateRepository(ABC):
     def renew_if_damaged(self) -> bool:
         """Let git check the files, and replace a damaged clone; return whether it was replaced.
 
-        Raises:
-            Unavailable: the files are damaged and cannot be replaced now.
-            StateRepoError: the files are damaged, and there is nothing to replace them from.
+        Raises Unavailable if damaged files cannot be replaced now, and StateRepoError if there is
+        nothing to replace them from.
         """
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
@@ -282,7 +250,9 @@ class StateRepository(ABC):
         if self._tidying is not None and self._tidying.poll() is None:
             return
         self._tidying = subprocess.Popen(
-            ["git", *_REPACK],
+            # --geometric joins a pack only with those of about its size, so that a demand's small
+            # pack does not let git write the whole history again
+            ["git", "repack", "--geometric=2", "-d", "-l", "--quiet"],
             cwd=self.objects.path,
             env=os.environ | git_environment(),
             stdout=subprocess.DEVNULL,

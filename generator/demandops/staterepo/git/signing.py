@@ -20,8 +20,6 @@ from demandops.staterepo.git import child_processes
 from demandops.staterepo.git.new_objects import NewObjects
 
 _TIMEOUT_S = 20
-_FIELD = "gpgsig"
-_PROBE = b"demandops: can this key sign?\n"
 
 
 class SigningFailed(StateRepoError):
@@ -32,20 +30,16 @@ class Signer:
     """Signs with one key: a private key file, or the public file of a key that an agent holds."""
 
     def __init__(self, key: Path) -> None:
-        """Sign a test text with the key, or raise SigningFailed.
-
-        So a key that cannot sign is noticed before a demand is accepted.
-        """
         self.key = key.expanduser()
         if not self.key.is_file():
             raise SigningFailed(
                 f"signing key {key} is not a file; make one with `ssh-keygen -t ed25519 -f {key}`, "
                 "or name an existing one"
             )
-        self.sign(_PROBE)
+        # so that a key that cannot sign is noticed before a demand is accepted
+        self.sign(b"demandops: can this key sign?\n")
 
     def sign(self, data: bytes) -> str:
-        """Return the armored signature of ``data``, or raise SigningFailed."""
         command = ["ssh-keygen", "-Y", "sign", "-n", "git", "-f", str(self.key)]
         environment = os.environ | {"SSH_ASKPASS_REQUIRE": "never", "LC_ALL": "C"}
         try:
@@ -74,7 +68,6 @@ class Signer:
 
 
 def _key_fault(key: Path, output: str) -> str:
-    """Return the problem of a key and its remedy, from ssh-keygen's output."""
     output = output.replace(str(key), "the key")  # the path may have any of the words below
     if "UNPROTECTED PRIVATE KEY" in output or "bad permissions" in output:
         return f"signing key {key} can be read by others; run: chmod 600 {key}"
@@ -102,13 +95,11 @@ def create_commit(
     tree: Oid,
     parents: Sequence[Oid],
 ) -> Oid:
-    """Add a commit by ``people`` (author, committer) to ``objects``, and return its id.
-
-    ``signer`` signs the commit or raises SigningFailed. If it is None, the commit is not signed.
-    """
+    """Add a commit by ``people`` (author, committer) to ``objects``, and return its id."""
     content = str(objects.repo.create_commit_string(*people, text, tree, list(parents)))
     if signer is not None:
         head, end, message = content.partition("\n\n")
+        # in a commit's header, a line that begins with a space continues the line before
         signature = signer.sign(content.encode()).replace("\n", "\n ")
-        content = f"{head}\n{_FIELD} {signature}{end}{message}"
+        content = f"{head}\ngpgsig {signature}{end}{message}"
     return objects.add(ObjectType.COMMIT, content.encode())

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+# How many seconds git may take before the listener is called.
 AFTER_S = 1
-"""How many seconds git may take before the listener is called."""
 
 _listeners: list[Callable[[str], None]] = []
 
@@ -20,22 +20,16 @@ def listen(listener: Callable[[str], None]) -> None:
 
 
 class SlowGit:
-    """Reports to the listener how long one run of git takes."""
-
     def __init__(self, what: str) -> None:
         self._what, self._told = what, 0
 
     def lasts(self, seconds: float) -> None:
-        """Take note that git has run for ``seconds``; it may be called as often as one likes.
-
-        It calls the listener once for each full second, from :data:`AFTER_S` on.
-        """
+        """Call the listener once for each full second, however often this is called."""
         if int(seconds) > self._told and int(seconds) >= AFTER_S:
             self._told = int(seconds)
             for listener in _listeners:
                 listener(f"{self._what}, {self._told} s")
 
     def ends(self) -> None:
-        """Call the listener with an empty text, if this run of git called the listener before."""
         for listener in _listeners if self._told else ():
             listener("")

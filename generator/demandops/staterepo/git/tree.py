@@ -20,10 +20,8 @@ pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
 
-_ID = re.compile("[0-9a-f]{40}")
-_MOST_SEARCHED = 10_000
+# How many folders deep a file may be; deeper folders are not read.
 MAX_DEPTH = 64
-"""How many folders deep a file may be; deeper folders are not read."""
 
 
 def commit_of(repo: Repository, commit: str | Oid) -> Commit:
@@ -33,7 +31,7 @@ def commit_of(repo: Repository, commit: str | Oid) -> Commit:
     is read by :func:`demandops.staterepo.history.revisions.resolve`.
     """
     try:
-        if isinstance(commit, str) and not _ID.fullmatch(commit):
+        if isinstance(commit, str) and not re.fullmatch("[0-9a-f]{40}", commit):
             raise StateRepoError(f"{quoted(commit)} is no commit's id of 40 hexadecimal digits")
         return repo[commit].peel(Commit)
     except pygit2.InvalidError as error:
@@ -48,20 +46,20 @@ def commit_of(repo: Repository, commit: str | Oid) -> Commit:
 
 
 def place_of(repo: Repository, wanted: Oid) -> str | None:
-    """Return which file or folder of which commit has an object, or None if none is found.
+    """Return which file or folder of which of the newest commits has an object.
 
-    The object itself may be missing. The newest commits are searched.
+    The object itself may be missing.
     """
     seen = set[Oid]()
 
     def path_in(tree: Tree, prefix: str) -> str | None:
         seen.add(tree.id)
-        for found in tree:
-            path = prefix + _printable(found.raw_name or b"")
-            if found.id == wanted:
+        for child in tree:
+            path = prefix + _printable(child.raw_name or b"")
+            if child.id == wanted:
                 return path
-            if isinstance(found, Tree) and found.id not in seen and path.count("/") < MAX_DEPTH:
-                inner = path_in(found, f"{path}/")
+            if isinstance(child, Tree) and child.id not in seen and path.count("/") < MAX_DEPTH:
+                inner = path_in(child, f"{path}/")
                 if inner is not None:
                     return inner
         return None
@@ -70,7 +68,7 @@ def place_of(repo: Repository, wanted: Oid) -> str | None:
         walker = repo.walk(None, SortMode.TIME)
         for name in repo.references:
             walker.push(repo.references[name].peel(Commit).id)
-        for commit in islice(walker, _MOST_SEARCHED):
+        for commit in islice(walker, 10_000):  # each reads its new folders; a history has millions
             path = "the top folder" if commit.tree_id == wanted else path_in(commit.tree, "")
             if path is not None:
                 return f"{path} of commit {str(commit.id)[:10]}"
@@ -80,12 +78,10 @@ def place_of(repo: Repository, wanted: Oid) -> str | None:
 
 
 def parent_tree(commit: Commit) -> Tree | None:
-    """Return the tree of a commit's first parent, or None."""
     return commit.parents[0].tree if commit.parents else None
 
 
 def entry(tree: Tree | None, path: str) -> Object | None:
-    """Return the file or folder at a path, or None."""
     try:
         return tree[path] if tree is not None else None
     except KeyError:
@@ -93,22 +89,19 @@ def entry(tree: Tree | None, path: str) -> Object | None:
 
 
 def entry_id(tree: Tree | None, path: str) -> Oid | None:
-    """Return the id of the file or folder at a path, or None."""
-    found = entry(tree, path)
-    return found.id if found is not None else None
+    child = entry(tree, path)
+    return child.id if child is not None else None
 
 
 def read_text(tree: Tree | None, path: str) -> str | None:
     """Return the text of the file at a path, or None if there is no file."""
-    found = entry(tree, path)
-    return text_of(found) if isinstance(found, Blob) else None
+    blob = entry(tree, path)
+    return text_of(blob) if isinstance(blob, Blob) else None
 
 
 def text_of(blob: Object) -> str:
-    """Return the text of a file, or an empty text for any other object.
-
-    Invalid UTF-8 is replaced by a visible character.
-    """
+    """Return the text of a file, or an empty text for any other object."""
+    # a person's file in another encoding must give a fault of its content, not an exception
     return blob.data.decode("utf-8", "replace") if isinstance(blob, Blob) else ""
 
 
@@ -119,20 +112,20 @@ def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
     name, a byte that is not UTF-8 is shown as ``\\xff``.
     """
     for root in roots:
-        found = entry(tree, root)
-        if isinstance(found, Tree):
-            yield from _entries_below(found, f"{root}/", root.count("/") + 1)
-        elif found is not None:
-            yield root, found
+        child = entry(tree, root)
+        if isinstance(child, Tree):
+            yield from _entries_below(child, f"{root}/", root.count("/") + 1)
+        elif child is not None:
+            yield root, child
 
 
 def _entries_below(tree: Tree, prefix: str, depth: int) -> Iterator[tuple[str, Object]]:
-    for found in tree:
-        path = prefix + _printable(found.raw_name or b"")
-        if isinstance(found, Tree) and depth < MAX_DEPTH:
-            yield from _entries_below(found, f"{path}/", depth + 1)
+    for child in tree:
+        path = prefix + _printable(child.raw_name or b"")
+        if isinstance(child, Tree) and depth < MAX_DEPTH:
+            yield from _entries_below(child, f"{path}/", depth + 1)
         else:
-            yield path, found
+            yield path, child
 
 
 def _printable(name: bytes) -> str:
@@ -140,18 +133,15 @@ def _printable(name: bytes) -> str:
 
 
 def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
-    """Yield (path, file) of every file and link at or below the paths ``roots``.
-
-    The order is Git's.
-    """
-    for path, found in entries(tree, roots):
-        if isinstance(found, Blob):
-            yield path, found
+    """Yield (path, file) of every file and link at or below the paths ``roots``, in Git's order."""
+    for path, child in entries(tree, roots):
+        if isinstance(child, Blob):
+            yield path, child
 
 
-def is_file(found: Object) -> bool:
+def is_file(child: Object) -> bool:
     """Return whether an entry is a file, not a link, submodule or folder."""
-    return isinstance(found, Blob) and found.filemode != FileMode.LINK
+    return isinstance(child, Blob) and child.filemode != FileMode.LINK
 
 
 def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
@@ -185,8 +175,8 @@ def differences(
 def _differences_below(
     before: Tree | None, after: Tree | None, prefix: str
 ) -> Iterator[tuple[str, Oid | None]]:
-    old = {_printable(found.raw_name or b""): found for found in before or ()}
-    new = {_printable(found.raw_name or b""): found for found in after or ()}
+    old = {_printable(child.raw_name or b""): child for child in before or ()}
+    new = {_printable(child.raw_name or b""): child for child in after or ()}
     for name in sorted({*old, *new}):
         yield from _differences_at(old.get(name), new.get(name), f"{prefix}{name}")
 
@@ -197,7 +187,7 @@ def _differences_at(
     if old is not None and new is not None and old.id == new.id:
         return
     if path.count("/") < MAX_DEPTH and (isinstance(old, Tree) or isinstance(new, Tree)):
-        before, after = (found if isinstance(found, Tree) else None for found in (old, new))
+        before, after = (child if isinstance(child, Tree) else None for child in (old, new))
         yield from _differences_below(before, after, f"{path}/")
     if new is not None and not isinstance(new, Tree):
         yield path, new.id
@@ -206,7 +196,6 @@ def _differences_at(
 
 
 def is_readme(path: str) -> bool:
-    """Return whether a file is a README, which people may put next to generated files."""
     return path.rsplit("/", 1)[-1] == "README.md"
 
 
@@ -226,15 +215,16 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
     below: dict[bytes, dict[str, str | None]] = {}
     here: dict[bytes, str | None] = {}
     for path, text in files.items():
-        first, _, rest = path.partition("/")
-        if rest:
-            below.setdefault(_raw_name(first, entries), {})[rest] = text
+        folder_name, _, inner_path = path.partition("/")
+        raw_name = _raw_name(folder_name, entries)
+        if inner_path:
+            below.setdefault(raw_name, {})[inner_path] = text
         else:
-            here[_raw_name(first, entries)] = text
+            here[raw_name] = text
     for name, inner in below.items():
         folder = name + b"/"
         kept = folder in entries and here.get(name, "") is not None
-        old = Oid(raw=entries[folder][-20:]) if kept else None
+        old = Oid(raw=entries[folder][-20:]) if kept else None  # an entry ends with the raw id
         subtree = _write(objects, old, inner)
         if subtree is not None:
             entries.pop(name, None)
@@ -253,12 +243,9 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
 
 
 def _raw_name(name: str, entries: Entries) -> bytes:
-    """Return the raw name of the entry that the program shows as ``name``.
-
-    If there is no such entry, return ``name`` in UTF-8.
-    """
+    """Return the raw name of the entry that the program shows as ``name``; if none, in UTF-8."""
     raw = name.encode()
-    if raw in entries or b"\\" not in raw:
+    if raw in entries or b"\\" not in raw:  # only _printable writes a backslash
         return raw
-    known = (one.removesuffix(b"/") for one in entries)
-    return next((one for one in known if _printable(one) == name), raw)
+    raw_names = (key.removesuffix(b"/") for key in entries)
+    return next((known for known in raw_names if _printable(known) == name), raw)

@@ -34,11 +34,9 @@ class Check(NamedTuple):
     fault: str = ""
 
 
+# Commit → result, for each commit whose signature was found valid. A result stays true, because
+# neither a commit, its signature nor its parent's list of keys changes.
 _good: dict[str, Check] = {}
-"""Commit → result of the check, for each commit whose signature was found valid.
-
-A result stays true, because neither a commit, its signature nor its parent's list of keys changes.
-"""
 
 
 def are_listed(repo: Repository, commit: Oid) -> bool:
@@ -47,31 +45,22 @@ def are_listed(repo: Repository, commit: Oid) -> bool:
 
 
 def signature_of(commit: Commit) -> str:
-    """Return the signature of a commit, or an empty text if there is none."""
     return (commit.gpg_signature[0] or b"").decode("utf-8", "replace")
 
 
 def faults(repo: Repository, commits: Iterable[Commit]) -> dict[str, str]:
-    """Return a map from commit to fault.
-
-    The map has each commit whose signature is required but missing or not valid.
-    """
-    return {commit: one.fault for commit, one in checks(repo, commits).items() if one.fault}
+    return {commit: check.fault for commit, check in checks(repo, commits).items() if check.fault}
 
 
 def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
-    """Check the signatures of commits, and return a map from commit to result.
-
-    A commit is checked, and in the map, only if its first parent lists the allowed keys. Raises
-    StateRepoError if a signature cannot be checked, because ssh-keygen is missing.
-    """
-    signatures, found = dict[str, str](), dict[str, Check]()
+    """Check the signatures of those commits whose first parent lists the allowed keys."""
+    signatures, results = dict[str, str](), dict[str, Check]()
     lists: dict[str, list[str]] = {}
     for commit in commits:
         id = str(commit.id)
         allowed = trees.read_text(trees.parent_tree(commit), ALLOWED_SIGNERS)
         if allowed is not None and id in _good:
-            found[id] = _good[id]
+            results[id] = _good[id]
         elif allowed is not None:
             signatures[id] = signature_of(commit)
             lists.setdefault(allowed, []).append(id)
@@ -85,35 +74,25 @@ def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
     for allowed, ids in lists.items():
         states = _check_with_git(repo, allowed, ids)
         for id in ids:
-            state, signer = states.get(id, ("", ""))
-            fault = _fault(signatures[id], state)
-            found[id] = Check("" if fault else signer, fault)
-            if not fault:
-                _good[id] = found[id]
-    return found
-
-
-def _fault(signature: str, state: str) -> str:
-    """Return why a signature is not valid, or an empty text if it is valid.
-
-    ``state`` is the letter that git prints for the signature (``%G?``).
-    """
-    if not signature:
-        return f"is not signed, but {ALLOWED_SIGNERS} requires a signature"
-    if state == "B":
-        return "has a signature that does not match its content"
-    if state != "G" or not signature.lstrip().startswith(_SSH):
-        return f"is signed, but not by a key that {ALLOWED_SIGNERS} lists"
-    return ""
+            state, signer = states.get(id, ("", ""))  # %G? and %GS of git
+            signature = signatures[id]
+            if not signature:
+                fault = f"is not signed, but {ALLOWED_SIGNERS} requires a signature"
+            elif state == "B":
+                fault = "has a signature that does not match its content"
+            # git also finds a GPG signature good, by this machine's keyring
+            elif state != "G" or not signature.lstrip().startswith(_SSH):
+                fault = f"is signed, but not by a key that {ALLOWED_SIGNERS} lists"
+            else:
+                results[id] = _good[id] = Check(signer)
+                continue
+            results[id] = Check(fault=fault)
+    return results
 
 
 def _check_with_git(
     repo: Repository, allowed: str, commits: list[str]
 ) -> dict[str, tuple[str, str]]:
-    """Return a map from commit to (git's letter for the signature, name of the signer).
-
-    ``allowed`` is the text of the list of keys.
-    """
     with tempfile.TemporaryDirectory(prefix="demandops-") as folder, git.Repo(repo.path) as opened:
         file = Path(folder) / "allowed-signers"
         file.write_text(allowed)

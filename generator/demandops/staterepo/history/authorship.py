@@ -45,21 +45,16 @@ class Person(NamedTuple):
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
-    """Return people's commits since ``known`` that change files of the state repo, newest first.
-
-    Files that the generator neither reads nor writes do not count.
-    """
+    """Return people's commits since ``known`` that change files of the generator, newest first."""
     commits = commit_log.person_commits(repo, to, known)
     return [commit for commit in commits if _touches(commit, _ROOTS)]
 
 
 def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
-    """Return a function that finds out which person's commit caused a fault in a file.
+    """Return a function from a file with a fault to the id and author of the commit that caused it.
 
-    The function gets the file's path and searches people's commits after ``known`` up to ``to``. It
-    returns id and author of the last commit that changed the file. If no commit did so, it takes
-    the last commit that changed any file which the generator reads or writes. If there is no such
-    commit either, it returns None.
+    This is the last person's commit that changed the file, else the last one that changed any file
+    of the generator, else None.
     """
 
     @cache  # the commits are read only when needed: most problems are already in the report
@@ -81,51 +76,38 @@ def _touches(commit: Commit, paths: Iterable[str]) -> bool:
 
 
 def author_of(commit: Commit) -> Person:
-    """Return the author of a commit as :func:`commit_message.signature` writes an author."""
     plain = commit_message.signature(*commit_log.author_of(commit), commit_log.time_of(commit))
     return Person(plain.name, plain.email)
 
 
 def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
-    """Return trailers ``Caused-By: <commit> <name> <email>`` for the newest of ``causes``.
-
-    ``causes`` has the newest commit first; the trailers have the oldest commit first. At most
-    :data:`_MOST_NAMED` commits get a trailer.
-    """
-    return [("Caused-By", f"{one.id} {author_of(one)}") for one in reversed(causes[:_MOST_NAMED])]
+    """Return trailers for the newest of ``causes``, whose newest is first; in time's order."""
+    named = reversed(causes[:_MOST_NAMED])
+    return [("Caused-By", f"{commit.id} {author_of(commit)}") for commit in named]
 
 
 def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
-    """Return the author of a follow commit that renders the commits ``causes``.
-
-    If one person made ``causes``, the author has the person's name and address, so that
-    ``git log --author`` finds the follow commit too. If several people made ``causes``, the author
-    has their names and the generator's address. If ``causes`` is empty, the author is the
-    generator.
-    """
+    """Return the author of a follow commit that renders the commits ``causes``."""
     if not causes:
         return commit_message.generator_signature(now)
     people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))
-    names = ", ".join(dict.fromkeys(one.name for one in people))
+    names = ", ".join(dict.fromkeys(person.name for person in people))
+    # one person's own address, so that `git log --author` finds the follow commit too
     email = people[0].email if len(people) == 1 else commit_log.GENERATOR_EMAIL
     return commit_message.signature(names, email, commit_log.time_of(causes[0]))
 
 
 def operator(folder: str | None = None) -> Person:
-    """Return the person who runs this program.
-
-    Name and address come from git's environment variables, else from git's configuration, else from
-    the login. ``folder`` is a repository whose configuration counts too.
-    """
+    """Return who runs this program, as git knows this person, else by the login."""
     try:
         login = getpass.getuser()
     except (KeyError, OSError):  # a container's user has no passwd entry
         login = "unknown"
 
-    def known(variable: str, key: str) -> str:
+    def configured(variable: str, key: str) -> str:
         setting = git.Git(folder).config("--get", key, with_exceptions=False)
         return os.environ.get(variable) or str(setting)
 
-    name = known("GIT_AUTHOR_NAME", "user.name") or login
-    email = known("GIT_AUTHOR_EMAIL", "user.email") or f"{login}{_NO_ADDRESS}"
+    name = configured("GIT_AUTHOR_NAME", "user.name") or login
+    email = configured("GIT_AUTHOR_EMAIL", "user.email") or f"{login}{_NO_ADDRESS}"
     return Person(name, email)

@@ -7,7 +7,7 @@ same.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from typing import Literal, get_args
@@ -23,20 +23,19 @@ from demandops.staterepo.git import tree as trees
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import allowed_signers, message_format
 
+# The trailer that names the branch on which a commit was proposed for approval.
 PROPOSAL = "Proposal"
-"""The trailer that names the branch on which a commit was proposed for approval."""
+# The trailer with the branch and commit where the demand was proposed with other content.
 REPLACES = "Replaces"
-"""The trailer with the branch and commit where the demand was proposed with other content."""
+# The trailer, repeated, with what requires the approval.
 REQUIRED_BY = "Approval-Required-By"
-"""The trailer, repeated, with what requires the approval."""
 
+# The committer of every commit by a generator.
 GENERATOR_NAME = "DemandOps generator"
-"""The committer's name in every commit by a generator."""
 GENERATOR_EMAIL = "generator@demandops.invalid"
-"""The committer's address in every commit by a generator."""
 
+# Of the year 9999: datetime has no later year, but anybody may commit with one.
 _LAST_SECOND = 253402300799
-"""The last second of the year 9999."""
 _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
 
 
@@ -50,18 +49,14 @@ class LogEntry:
     summary: str
     trailers: dict[str, list[str]]
     why: str = ""
+    # Whether the generator is the committer, so that generated files should match the ledger. False
+    # for a commit of a proposal, because a person may merge it onto other changes. Anybody can
+    # commit under the generator's name, so is_by_generator also checks a required signature.
     by_generator: bool = False
-    """Whether the generator is the committer, so that generated files should match the ledger.
-
-    False for a commit of a proposal, because a person may merge the proposal onto other changes.
-    False also without the trailer ``Render-Version``. Anybody can commit under the generator's
-    name, so :func:`is_by_generator` also checks the signature, if a signature is required.
-    """
+    # by the author's clock; for a demand's commit, the time when the demand was received
     authored: datetime | None = None
-    """The author's time; for a demand's commit, the time when the demand was received."""
 
     def first(self, key: str) -> str:
-        """Return the first value of the trailer ``key``, or an empty text."""
         return next(iter(self.trailers.get(key, ())), "")
 
 
@@ -75,24 +70,19 @@ def _time(seconds: int) -> datetime:
 
 
 def author_of(commit: Commit) -> tuple[str, str]:
-    """Return a commit's author as (name, e-mail address)."""
     return _text(commit.author.raw_name), _text(commit.author.raw_email)
 
 
 def _text(raw: bytes) -> str:
-    """Return a text of a commit, decoded as UTF-8 even if the commit names another encoding."""
+    # a commit may name another encoding, also one that does not exist; UTF-8 never fails
     return raw.decode("utf-8", "replace")
 
 
 def entry_of(commit: Commit) -> LogEntry:
-    """Return the log entry of a commit.
-
-    If a person made the commit, the entry has no trailers and no reason, unless the message keeps
-    the trailers of a proposal.
-    """
     text = message_format.parse(_text(commit.raw_message))
     committer = _text(commit.committer.raw_name), _text(commit.committer.raw_email)
     is_ours, is_proposal = committer == (GENERATOR_NAME, GENERATOR_EMAIL), PROPOSAL in text.trailers
+    # a person's message has no trailers for programs, unless it keeps those of a merged proposal
     is_told = is_ours or is_proposal
     return LogEntry(
         commit=str(commit.id),
@@ -107,39 +97,30 @@ def entry_of(commit: Commit) -> LogEntry:
 
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
-    """Return whether the generator made a commit, and signed it if a signature is required.
-
-    A commit of a proposal counts as a person's (:attr:`LogEntry.by_generator`).
-    """
+    """Return whether the generator made a commit, and signed it if a signature is required."""
     return entry_of(commit).by_generator and not allowed_signers.faults(repo, [commit])
 
 
 def commits(
     repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[tuple[Commit, LogEntry]]:
-    """Yield ``tip`` and its ancestors, the newest first, each with its log entry.
-
-    If the commit ``after`` is given, leave out this commit and its ancestors.
-    """
+    """Yield ``tip`` and its ancestors without ``after`` and its ancestors, the newest first."""
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
+    walked: Iterable[Commit] = walker
     if after is not None:
         hidden = commit_of(repo, after).id
         walker.hide(hidden)
-        found = list(walker)
-        if any(len(commit.parent_ids) > 1 for commit in found):
+        walked = list(walker)
+        if any(len(commit.parent_ids) > 1 for commit in walked):
             # with merges, libgit2 goes by the commits' times and may yield commits up to ``after``
             # if a wrong clock has set the times
-            known = {commit.id for commit in repo.walk(hidden)}
-            found = [commit for commit in found if commit.id not in known]
-        return ((commit, entry_of(commit)) for commit in found)
-    return ((commit, entry_of(commit)) for commit in walker)
+            older = {commit.id for commit in repo.walk(hidden)}
+            walked = [commit for commit in walked if commit.id not in older]
+    return ((commit, entry_of(commit)) for commit in walked)
 
 
 def was_rendered_with(repo: Repository, tip: Oid, version: int) -> bool:
-    """Return whether a program of this render version committed at or before ``tip``.
-
-    If no program committed anything, return true, because nothing contradicts the version.
-    """
+    """Return whether a program of this render version committed at or before ``tip``."""
     is_other = False
     for commit in repo.walk(tip):
         # whole messages are parsed only where they matter: the history may be long
@@ -149,16 +130,13 @@ def was_rendered_with(repo: Repository, tip: Oid, version: int) -> bool:
         if entry.first("Render-Version") == str(version) and is_by_generator(repo, commit):
             return True
         is_other = is_other or entry.by_generator
-    return not is_other
+    return not is_other  # if no program committed anything, nothing contradicts the version
 
 
 def person_commits(
     repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[Commit]:
-    """Yield the commits of :func:`commits` that are not by the generator.
-
-    These are people's commits, and the commits of proposals (:func:`is_by_generator`).
-    """
+    """Yield people's commits, and those of proposals (:attr:`LogEntry.by_generator`)."""
     return (
         commit
         for commit, entry in _with_checked_signatures(repo, tip, after)
@@ -169,32 +147,27 @@ def person_commits(
 def _with_checked_signatures(
     repo: Repository, tip: str | Oid, after: str | Oid | None
 ) -> list[tuple[Commit, LogEntry]]:
-    """Return what :func:`commits` yields, with the signatures of the generator's commits checked.
-
-    ``LogEntry.by_generator`` is false if a required signature is missing or not valid.
-    """
-    found = list(commits(repo, tip, after))
-    faults = allowed_signers.faults(repo, [each for each, entry in found if entry.by_generator])
+    """Return :func:`commits`; those without a valid required signature are a person's."""
+    pairs = list(commits(repo, tip, after))
+    faults = allowed_signers.faults(repo, [commit for commit, e in pairs if e.by_generator])
     return [
-        (each, replace(entry, by_generator=entry.by_generator and entry.commit not in faults))
-        for each, entry in found
+        (commit, replace(entry, by_generator=entry.by_generator and entry.commit not in faults))
+        for commit, entry in pairs
     ]
 
 
 def first_parents(repo: Repository, tip: str | Oid) -> Iterator[Commit]:
-    """Yield a commit, then its first parent, and so on along the first parents."""
     walker = repo.walk(commit_of(repo, tip).id)
     walker.simplify_first_parent()
     return iter(walker)
 
 
+# The outcome of a demand that gets no commit of its own. The next commit records the outcome.
 Settled = Literal["unchanged", "waiting", "released", "refused"]
-"""The outcome of a demand that gets no commit of its own. The next commit records the outcome."""
 _Outcome = Literal["changed", Settled]
 
 
 def settled_trailer(outcome: Settled) -> str:
-    """Return the name of the trailer that records a demand with this outcome."""
     return f"{outcome.capitalize()}-Operation-Id"
 
 
@@ -206,28 +179,21 @@ _OUTCOMES: dict[str, _Outcome] = {
 
 @dataclass(frozen=True, slots=True)
 class RecordedOutcome:
-    """The commit that records a demand, and the demand's outcome."""
-
     commit: str
     outcome: _Outcome
 
 
 def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, RecordedOutcome]:
-    """Return a map from operation id to outcome, for every demand that a later commit records.
-
-    The demands of the newest commit come first.
-    Later commits are those up to ``tip`` that ``base`` does not include. If ``base`` is not in the
-    history of ``tip``, for example because the remote was made anew, the whole history is read. A
-    commit by a person records a demand only if it keeps the trailers of a merged proposal.
-    """
+    """Return the outcome of each operation that a commit after ``base`` records, newest first."""
     if str(tip) == base:
         return {}
     try:
-        known = bool(base) and repo.descendant_of(tip, base)
+        is_ancestor = bool(base) and repo.descendant_of(tip, base)
     except (pygit2.GitError, KeyError, ValueError):
-        known = False
+        is_ancestor = False
     outcomes = {}
-    for _, entry in _with_checked_signatures(repo, tip, base if known else None):
+    # if the remote was made anew, ``base`` is unknown, and any commit may record an operation
+    for _, entry in _with_checked_signatures(repo, tip, base if is_ancestor else None):
         is_record = entry.by_generator or PROPOSAL in entry.trailers
         for key, outcome in _OUTCOMES.items() if is_record else ():
             waits = key == "Operation-Id" and entry.first("Operation") == "wait"
@@ -238,14 +204,12 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
 
 def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
     """Return the newest commit of the generator along the first parents, or None."""
-    found = (commit for commit in first_parents(repo, tip) if is_by_generator(repo, commit))
-    return next((commit.id for commit in found), None)
+    commits = first_parents(repo, tip)
+    return next((commit.id for commit in commits if is_by_generator(repo, commit)), None)
 
 
 @dataclass(frozen=True, slots=True)
 class PathChange:
-    """A commit that changed a path, and whether the path existed before and exists after it."""
-
     entry: LogEntry
     existed_before: bool
     exists_after: bool
@@ -296,11 +260,7 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 
 
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
-    """Return the path of the file of the release ``name``.
-
-    If the release was stopped, return its last path. If it never existed, or ``name`` cannot be
-    the name of a release, return None.
-    """
+    """Return the path of the file of the release ``name``, or its last path if it was stopped."""
     if not _NAME.fullmatch(name):
         return None
     files = trees.blobs(commit_of(repo, tip).tree, (CLUSTERS_ROOT,))
@@ -309,10 +269,7 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that were stopped or moved at any time in the history.
-
-    Some of them may run again.
-    """
+    """Return the names of all releases that were ever stopped or moved; some may run again."""
     removed = _removed(repo, tip, "*.yaml")
     names = {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
     return {name for name in names if _NAME.fullmatch(name)}  # a chart's file has a version
@@ -324,8 +281,8 @@ def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[st
     return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
 
 
+# by git, because libgit2 has no walk that is limited to a path
 def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -> list[str]:
-    """Return the items that ``git log`` prints; ``query`` has options for git, then the path."""
     *options, path = query
     commits = [str(commit_of(repo, tip).id), *([f"^{commit_of(repo, after).id}"] if after else [])]
     with git.Repo(repo.path) as opened:
@@ -333,4 +290,4 @@ def _git_log(repo: Repository, tip: str | Oid, after: str | None, *query: str) -
             output = opened.git.log("--no-show-signature", "-z", *options, *commits, "--", path)
         except git.GitCommandError as error:
             raise StateRepoError(f"git cannot read the history of {path}: {error.stderr}") from None
-    return [found for found in output.split("\0") if found]
+    return [item for item in output.split("\0") if item]

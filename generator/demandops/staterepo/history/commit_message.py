@@ -39,42 +39,30 @@ _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")
 _MAX_SUBJECT = 90
 _UNCHANGED = "Desired state: unchanged."
 _UNFIT = re.compile(r"[<>\s\x00-\x1f\x7f]")
-
-
 _CRUD = " .,:;\"'\\"  # Git removes these at both ends of a name, and refuses an empty name
 
 
 def signature(name: str, email: str, time: datetime) -> pygit2.Signature:
-    """Return an author or committer as Git records it: name, address and time.
-
-    Characters that Git refuses are left out or replaced. Long texts are cut. An empty name becomes
-    "unnamed", and an empty address that of the generator.
-    """
+    """Return an author or committer of any name and address, without what Git refuses."""
     address = one_line(_UNFIT.sub("", email), _MAX_AUTHOR).strip(_CRUD) or GENERATOR_EMAIL
     plain = one_line(name.replace("<", "(").replace(">", ")"), _MAX_AUTHOR)
     return pygit2.Signature(plain.strip(_CRUD) or "unnamed", address, int(time.timestamp()), 0)
 
 
 def generator_signature(time: datetime) -> pygit2.Signature:
-    """Return the committer of the generator's commits."""
     return signature(GENERATOR_NAME, GENERATOR_EMAIL, time)
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
-    """Return the author of the commit of a demand, a rollback or a decommission.
-
-    The author of a demand is its requesters. A requester may have any name, also that of a person,
-    so the name says that it is a requester's, and the address is nobody's: no person and no other
-    commit has one of its domain. The author of a rollback or a decommission is the person who ran
-    the command; a decommission that names no person is by the generator. ``received`` is the
-    author's time.
-    """
+    """Return the author of the commit: the demand's requesters, or who ran the command."""
     request = decision.request
     if isinstance(request, Restoration):
         return signature(request.by, request.email, received)
     if isinstance(request, Decommission):
         name, _, email = request.by.removesuffix(">").rpartition(" <")
         return signature(name, email, received) if name else generator_signature(received)
+    # A requester may have any name, also that of a person. So the name says that it is a
+    # requester's, and the address is nobody's: no person has one of its domain.
     requesters = _requesters(decision)
     who = "requester" if len(requesters) == 1 else "requesters"
     names = one_line(", ".join(requesters), _MAX_AUTHOR - len(f" ({who})"))
@@ -87,11 +75,6 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
 def of_decision(
     decision: Decision, operation: str, received: datetime, more: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of the commit of a decision.
-
-    The decision is on a demand, an ended lease, a drained node, a rollback or a decommission.
-    ``more`` are further trailers.
-    """
     request, claims = decision.request, decision.changes.claims
     subjects = decision.changes.subjects()
     more = list(more)
@@ -106,12 +89,13 @@ def of_decision(
         _list("Warnings:", decision.warnings),
     ]
     keys = [change.key for change in claims]
+    demands = dict.fromkeys((*(key.demand for key in keys), *decision.changes.waiting))
     trailers = [
         ("Operation", request.operation),
         ("Operation-Id", operation),
         *more,
         *_operation_trailers(decision),
-        *(("Demand-Id", demand) for demand in _demands(decision)),
+        *(("Demand-Id", demand) for demand in demands),
         *(("Requester", requester) for requester in _requesters(decision)),
         *(("Application", s.id) for s in subjects if s.kind is SubjectKind.APPLICATION),
         *(("Connection", s.id) for s in subjects if s.kind is SubjectKind.CONNECTION),
@@ -120,12 +104,6 @@ def of_decision(
         ("Render-Version", str(RENDER_VERSION)),
     ]
     return compose(paragraphs, trailers)
-
-
-def _demands(decision: Decision) -> Iterable[str]:
-    """Return the demands whose claims changed, or that begin or stop waiting, each once."""
-    keys = (change.key.demand for change in decision.changes.claims)
-    return dict.fromkeys((*keys, *decision.changes.waiting))
 
 
 def _list(head: str, items: Iterable[object]) -> list[str]:
@@ -143,13 +121,13 @@ _VERBS = {
 
 
 def _requesters(decision: Decision) -> tuple[str, ...]:
-    """Return the requesters that the request names, else those of the changed claims."""
+    if named := decision.request.requesters():
+        return named
     changes = decision.changes.claims
     claims = [change.after or change.before for change in changes]
     if isinstance(decision.request, Decommission):  # the requester is in the old claims only
         claims = [change.before for change in changes]
-    found = sorted({who for claim in claims if claim for who in claim.requesters})
-    return decision.request.requesters() or tuple(found)
+    return tuple(sorted({who for claim in claims if claim for who in claim.requesters}))
 
 
 def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
@@ -167,8 +145,8 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
             f"{request.reason}"
         )
     if isinstance(request, Expire):
-        befores = [change.before for change in changes]
-        last = max(one.lease.expires_at for one in befores if one and one.lease)
+        claims = [change.before for change in changes]
+        last = max(claim.lease.expires_at for claim in claims if claim and claim.lease)
         return f"Expire {subjects}", (
             f"the lease of demand '{request.demand}' on {what_of_whom} ended at "
             f"{revisions.format_time(last)} and was not renewed."
@@ -193,7 +171,6 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
         return f"Release {', '.join(decision.changes.waiting)}", (
             f"request '{request.id}', received {time}, releases demands that waited for room."
         )
-    waited = [one for one in decision.changes.waiting if one == request.demand]
     only_leases = all(
         change.before and change.after and change.before.booked == change.after.booked
         for change in changes
@@ -203,12 +180,11 @@ def _title_and_why(decision: Decision, received: datetime) -> tuple[str, str]:
     named = "" if request.is_reference else f" of demand '{request.demand}'"
     why = f"request '{request.id}'{named}, received {time}, {verb} {what_of_whom}."
     placed = "".join(f" {text[0].upper()}{text[1:]}." for text in decision.placed)
-    placed += " It waited for room." if waited else ""
+    placed += " It waited for room." if request.demand in decision.changes.waiting else ""
     return f"{title} {subjects}", why + placed
 
 
 def _operation_trailers(decision: Decision) -> list[tuple[str, str]]:
-    """Return the further trailers of a rollback, a drain or a decommission."""
     request = decision.request
     if isinstance(request, Restoration):
         return [("Restores", request.to), ("Reason", request.reason)]
@@ -217,9 +193,9 @@ def _operation_trailers(decision: Decision) -> list[tuple[str, str]]:
     if not isinstance(request, Decommission):
         return []
     reason = [("Reason", request.reason)]
-    befores = [change.before for change in decision.changes.claims]
+    claims = [change.before for change in decision.changes.claims]
     nodes = request.nodes or (request.id,)
-    needed = any(one.held.needs(node) for one in befores if one for node in nodes)
+    needed = any(claim.held.needs(node) for claim in claims if claim for node in nodes)
     return ([("Node", request.id)] if needed and "node" in request.kinds else []) + reason
 
 
@@ -273,16 +249,12 @@ def of_override_end(
 ) -> str:
     """Return the message of the commit that ends an expired override.
 
-    ``keys`` are the keys of the claims that change because the override ends. They are claims of
-    demands and of ``keep`` overrides.
+    ``keys`` are those of the claims that this changes, of demands and of ``keep`` overrides.
     """
-    why = (
-        f"Why: {override.path} by {override.owner} ({override.reason}) expired at "
-        f"{format_time(override.end) if override.end else ''}."
-    )
+    end = format_time(override.end) if override.end else ""
     paragraphs = [
         [f"End override {override.name}"],
-        [why],
+        [f"Why: {override.path} by {override.owner} ({override.reason}) expired at {end}."],
         _desired_state(releases) if releases else [_UNCHANGED],
     ]
     trailers = [
@@ -298,7 +270,6 @@ def of_override_end(
 def of_scale_down(
     instance: Instance, change: Changeset, more: Iterable[tuple[str, str]] = ()
 ) -> str:
-    """Return the message of the commit that removes a service's expired extra replicas."""
     service, node = instance[1:3]
     names = ", ".join(release.name for release in change.releases) or f"{service} on {node}"
     paragraphs = [
@@ -316,21 +287,16 @@ def of_scale_down(
 
 
 def override_trailers(paths: Iterable[str]) -> list[tuple[str, str]]:
-    """Return a trailer for each override; ``paths`` are the overrides' files."""
     return [("Override", path) for path in sorted(set(paths))]
 
 
 def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
-    """Return the paths of the ``keep`` overrides that add these claims."""
     demands = (key.demand for key in keys if key.demand.startswith(OVERRIDE_PREFIX))
     return [f"{OVERRIDES_ROOT}/{demand.removeprefix(OVERRIDE_PREFIX)}.yaml" for demand in demands]
 
 
 def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
-    """Return a trailer for each demand that has one of these claims.
-
-    A claim that an override adds gets no trailer.
-    """
+    """Return a trailer for each demand that has one of these claims; overrides have none."""
     demands = {key.demand for key in keys if not key.demand.startswith(OVERRIDE_PREFIX)}
     return [("Demand-Id", demand) for demand in sorted(demands)]
 

@@ -25,8 +25,8 @@ _KEY = re.compile(r"[A-Za-z0-9-]+")
 _ESCAPE = r"\\(?:x[0-9a-f]{2}|u[0-9a-f]{4}|U00(?:0[0-9a-f]|10)[0-9a-f]{4}|[nrt\\\"])"
 _ESCAPES = re.compile(_ESCAPE)
 _EDGES, _SPACE = re.compile(r"\A | \Z"), r"\\x20"
+# A quoted value has an escape, because values without escapes are not quoted.
 _QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
-"""Matches a quoted value. It has an escape, because values without escapes are not quoted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,26 +49,17 @@ def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
 
 
 def parse(message: str) -> MessageText:
-    """Return the summary, the reason and the trailers of any commit's message."""
     lines = message.split("\n")
     whys = (line.removeprefix(_WHY) for line in lines if line.startswith(_WHY))
-    return MessageText(lines[0], next(whys, ""), _trailers(message))
-
-
-def _trailers(message: str) -> dict[str, list[str]]:
-    """Return a map from key to values of the trailers.
-
-    The trailers are the lines ``Key: value`` of the last paragraph. If this paragraph has any
-    other line, the message has no trailers.
-    """
     trailers: dict[str, list[str]] = {}
     head, _, last = message.rstrip("\n").rpartition("\n\n")
     for line in last.split("\n") if head else ():
         key, colon, value = line.partition(": ")
         if not colon or not _KEY.fullmatch(key):
-            return {}
+            trailers.clear()  # a paragraph with any other line is text for people
+            break
         trailers.setdefault(key, []).append(_decoded(value))
-    return trailers
+    return MessageText(lines[0], next(whys, ""), trailers)
 
 
 def _encoded(key: str, value: str) -> str:
@@ -82,8 +73,9 @@ def _encoded(key: str, value: str) -> str:
 def _decoded(text: str) -> str:
     if not _QUOTED.fullmatch(text):
         return text
-    return _ESCAPES.sub(lambda escape: _character(escape[0]), text[1:-1])
-
-
-def _character(escape: str) -> str:
-    return escape[1] if escape[1] in '\\"' else escape.encode().decode("unicode_escape")
+    return _ESCAPES.sub(
+        lambda escape: (
+            escape[0][1] if escape[0][1] in '\\"' else escape[0].encode().decode("unicode_escape")
+        ),
+        text[1:-1],
+    )

@@ -20,8 +20,8 @@ from demandops.quoting import quoted
 from demandops.staterepo.git.tree import commit_of
 from demandops.staterepo.history import commit_log
 
+# Examples of the times that parse_time accepts.
 TIMES = "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago)"
-"""Examples of the times that :func:`parse_time` accepts."""
 
 _DATE = re.compile(r"\d{4}-\d{2}-\d{2}")
 _CLOCK = re.compile(r"\d{1,2}:\d{2}(:\d{2})?")
@@ -43,15 +43,16 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
             (``2h``, ``1h30m``, ``2d ago``). A time of day without a date means its last occurrence
             before ``now``.
         now: the current time, with a time zone.
-        end: if true, a date means the end of its day, and a time without seconds means the end of
-            its minute. If false, they mean the beginning.
+        end: whether a date means the end of its day, and a time without seconds the end of its
+            minute, not the beginning.
     """
     text = text.strip()
     try:
         return now - timedelta(seconds=seconds_of(text.removesuffix("ago").rstrip()))
     except ValueError:
         pass
-    precision = _precision(text)
+    has_no_seconds = re.match(r"\d{1,2}:\d{2}(?!:?\d)", re.split(r"[T ]", text)[-1])
+    precision = _DAY if _DATE.fullmatch(text) else _MINUTE if has_no_seconds else _SECOND
     clock = _CLOCK.fullmatch(text)
     if clock:
         hours, minutes = text.split(":", 1)
@@ -67,13 +68,6 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
     return time + (precision - _SECOND) if end else time
 
 
-def _precision(text: str) -> timedelta:
-    if _DATE.fullmatch(text):
-        return _DAY
-    clock = re.split(r"[T ]", text)[-1]
-    return _MINUTE if re.match(r"\d{1,2}:\d{2}(?!:?\d)", clock) else _SECOND
-
-
 def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     """Return the commit that a text from outside names, or raise StateRepoError.
 
@@ -85,23 +79,26 @@ def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
     is_plain = text.isprintable() and len(text.encode(errors="replace")) <= _LONGEST
     match = _REVISION.fullmatch(text) if is_plain else None
     try:
-        found = _found(repo, tip, match[1], match[2], now) if match is not None else None
+        commit = _commit_named(repo, tip, match[1], match[2], now) if match else None
     except (KeyError, ValueError, pygit2.GitError) as error:
         raise StateRepoError(
             f"{quoted(text)} names no commit that can be read: {error.args[0]}; name another "
             "commit, or check the repository with `git fsck`"
         ) from None
-    if found is None:
+    if commit is None:
         raise StateRepoError(
             f"{quoted(text)} is neither a commit of the state repo nor a time; write a branch, a "
             "tag or 4 to 40 digits of an id, with ~N for the Nth commit before it, or a time like "
             f"{TIMES}; `demandops log` lists the commits"
         )
-    return found
+    return commit
 
 
-def _found(repo: Repository, tip: Oid, base: str, steps: str, now: datetime) -> Commit | None:
+def _commit_named(
+    repo: Repository, tip: Oid, base: str, steps: str, now: datetime
+) -> Commit | None:
     names = _names(repo, base)
+    # a branch may be named like a time, such as 2026-01-31
     at = None if names or steps else parse_time(base, now, end=True)
     if at is not None:
         return commit_at_time(repo, tip, at)
@@ -110,6 +107,7 @@ def _found(repo: Repository, tip: Oid, base: str, steps: str, now: datetime) -> 
         commits[base] = commit_of(repo, tip)
     elif _ID.fullmatch(base) and base.lower() in repo:
         named = repo[base.lower()]
+        # digits that also begin the id of a file do not make a name ambiguous
         if not names or isinstance(named, Commit):
             commits[f"the commit {named.id}"] = named.peel(Commit)
     if len({commit.id for commit in commits.values()}) > 1:
@@ -129,7 +127,7 @@ def _found(repo: Repository, tip: Oid, base: str, steps: str, now: datetime) -> 
 
 
 def _names(repo: Repository, base: str) -> list[str]:
-    """Return the branches and tags that a text names; a whole id and ``HEAD`` name none."""
+    # whoever may push a branch must not change what a whole id or HEAD means
     if base == "HEAD" or (len(base) == _WHOLE_ID and _ID.fullmatch(base)):
         return []
     valid = [
@@ -143,10 +141,6 @@ def _names(repo: Repository, base: str) -> list[str]:
 
 
 def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
-    """Return the newest commit along the first parents that was committed at or before ``at``.
-
-    Raises StateRepoError if all commits are later.
-    """
     latest = int(at.timestamp())
     for commit in commit_log.first_parents(repo, tip):
         if commit.commit_time <= latest:

@@ -32,8 +32,8 @@ NO_STATE_REPO = (
     "it; `demandops init DIR` makes a new state repo"
 )
 
+# Path → the blob that is in effect instead of the commit's file; None if no file is in effect.
 Replacements = Mapping[str, Oid | None]
-"""Path → the blob that is in effect instead of the commit's file; None if no file is in effect."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,36 +44,27 @@ class ConfigSource:
     replacements: Replacements = field(default_factory=dict)
 
     def files(self, repo: Repository) -> dict[str, Oid]:
-        """Return the blob of every file in effect, by path."""
         tree = trees.commit_of(repo, self.commit).tree
         files = {path: blob.id for path, blob in trees.blobs(tree, CONFIG_ROOTS)}
         wanted = {**files, **self.replacements}
         return {path: blob for path, blob in wanted.items() if blob is not None}
 
     def texts(self, repo: Repository) -> dict[str, str]:
-        """Return the text of every file in effect, by path."""
         return {path: trees.text_of(repo[blob]) for path, blob in self.files(repo).items()}
 
 
 @dataclass(frozen=True, slots=True)
 class LastValidConfig:
-    """A commit's configuration, with the last valid versions of its invalid files.
+    """A commit's configuration, with the last valid versions of its invalid files."""
 
-    ``source`` is the source of ``config``. If the configuration is not valid even with these
-    versions, ``config`` is None, and ``source`` is the source that was in effect before the commit.
-    """
-
+    # none if it is not valid even so; then the source is the one that was in effect before
     config: Config | None
     source: ConfigSource
     faults: tuple[Fault, ...]
 
 
 def config_at(tree: Tree) -> Config:
-    """Return the configuration of a tree.
-
-    Raises InvalidInput with the faults of all files, or StateRepoError if there is no
-    ``demandops.yaml``.
-    """
+    """Return the configuration of a tree, or raise InvalidInput with the faults of all files."""
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
@@ -81,7 +72,6 @@ def config_at(tree: Tree) -> Config:
 
 
 def end_markers_at(tree: Tree) -> dict[str, str]:
-    """Return the files that mark overrides as ended, as path → text."""
     return trees.texts(tree, (ended_override_file.MARKERS_ROOT,))
 
 
@@ -91,12 +81,8 @@ def ended_overrides_at(tree: Tree) -> dict[str, str]:
 
 
 def refuse_other_render_version(repo: Repository, commit: Oid) -> None:
-    """Raise StateRepoError if a program of another render version serves the state repo.
-
-    Generators of two render versions would undo each other's changes. A version that no program
-    ever wrote here is a person's mistake, and :func:`load_last_valid_config` holds it back like any
-    other file that is not valid. So raise nothing then, or one merge would stop all demands.
-    """
+    """Raise StateRepoError if a program of another render version serves the state repo."""
+    # generators of two render versions would undo each other's changes
     try:
         text = trees.read_text(trees.commit_of(repo, commit).tree, ROOT_FILE)
         data = strict_yaml.load(text or "")
@@ -105,6 +91,8 @@ def refuse_other_render_version(repo: Repository, commit: Oid) -> None:
     version = data.get("renderVersion") if isinstance(data, dict) else None
     if type(version) is not int or version == RENDER_VERSION:
         return
+    # A version that no program ever wrote here is a person's mistake, and load_last_valid_config
+    # holds it back like any other invalid file. Else one merge would stop all demands.
     if not commit_log.was_rendered_with(repo, commit, version):
         return
     remedy = "update the generator"
@@ -133,20 +121,21 @@ def load_last_valid_config(
         load: gets files as path → text, and returns their configuration or raises
             ``InvalidInput``.
     """
-    known, source = before.files(repo), ConfigSource(to)
-    files = source.files(repo)
-    merged = {path for path in {*known, *files} if known.get(path) != files.get(path)}
+    old, source = before.files(repo), ConfigSource(to)
+    new = source.files(repo)
+    changed = {path for path in {*old, *new} if old.get(path) != new.get(path)}
     faults: dict[Fault, None] = {}
     while True:
         try:
             config = load(source.texts(repo))
         except InvalidInput as error:
             faults |= dict.fromkeys(error.faults)
-            broken = {one.file for one in error.faults} & merged - set(source.replacements)
-            if not broken:
+            broken = {fault.file for fault in error.faults} & changed - set(source.replacements)
+            if not broken:  # nothing is left to hold back
                 return LastValidConfig(None, before, tuple(faults))
-            together = merged & _with_files_merged_together(repo, broken, last_valid_commit, to)
-            more = {path: known.get(path) for path in together}
+            # the old version may have faults with another new file, so check the result again
+            together = changed & _with_files_merged_together(repo, broken, last_valid_commit, to)
+            more = {path: old.get(path) for path in together}
             source = ConfigSource(to, {**source.replacements, **more})
         else:
             return LastValidConfig(config, source, tuple(faults))
@@ -155,19 +144,14 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return the broken files, and all files that apply only together with them.
-
-    A file applies only together with all files of each commit that changed the file, and with all
-    files of its application definition. Each of these files in turn applies only together with
-    others, which are returned too.
-    """
+    """Return the broken files, and all files that apply only together with them or with these."""
     together = set(broken)
     merges = [
         {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}
         for commit, _ in commit_log.commits(repo, to, last_valid_commit)
         if commit.parents  # compared with its first parent, a merge changes all files of a branch
     ]
-    known = {
+    paths = {
         path for commit in (to, last_valid_commit) for path in ConfigSource(commit).files(repo)
     }
     size = 0
@@ -179,5 +163,5 @@ def _with_files_merged_together(
         folders = tuple(
             "/".join(path.split("/")[:2]) + "/" for path in together if path.startswith("appdefs/")
         )
-        together |= {path for path in known if path.startswith(folders)} if folders else set()
+        together |= {path for path in paths if path.startswith(folders)}
     return together

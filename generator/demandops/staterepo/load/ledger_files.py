@@ -30,18 +30,14 @@ class ClaimFiles:
     faults: tuple[Fault, ...]
 
     def ledger(self) -> Ledger:
-        """Return the ledger with these claims."""
         ledger = Ledger()
         for claim in self.claims:
             ledger = ledger.replace(claim.key, claim)
         return ledger
 
 
-def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
-    """Return the claims and the faults in files, which are given as (path, text).
-
-    Files that are not claim files are skipped.
-    """
+def read_claims(files: Iterable[tuple[str, str]]) -> ClaimFiles:
+    """Return the claims and the faults in those of the files (path, text) that are claim files."""
     claims, faults = list[Claim](), list[Fault]()
     for path, text in files:
         if claim_file.kind_of(path) is None:
@@ -54,16 +50,12 @@ def read(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
-    """Return the claim at a path, or None if there is no file.
-
-    Raises InvalidInput if the file is not valid.
-    """
+    """Return the claim at a path, if there is a file, or raise InvalidInput if it is not valid."""
     text = trees.read_text(tree, path)
     return claim_file.read(text, path) if text is not None else None
 
 
 def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
-    """Return the claim at a path, or None if there is no valid file."""
     try:
         return claim_at(tree, path)
     except InvalidInput:
@@ -71,20 +63,16 @@ def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
 
 
 def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
-    """Return the key of the ledger's claim whose file has this path, or None.
-
-    This searches the whole ledger.
-    """
+    """Return the key of the claim whose file has this path; a search of the whole ledger."""
     if claim_file.kind_of(path) is None:
         return None
-    return next((one.key for one in ledger if claim_file.path_of(one.key) == path), None)
+    # a path has slugs and digests of the ids, so it does not give the key
+    return next((claim.key for claim in ledger if claim_file.path_of(claim.key) == path), None)
 
 
 def owner_faults(claim: Claim | None, path: str, ledger: Ledger) -> Iterator[Fault]:
-    """Yield a fault if the file at ``path`` belonged to another claim before, that of ``ledger``.
-
-    The generator books no such claim, but a person or an earlier version may replace the file.
-    """
+    """Yield a fault if the file at ``path`` belonged to another claim of ``ledger`` before."""
+    # the generator books no such claim, but a person or an earlier version may replace the file
     owner = key_of(path, ledger) if claim and not ledger.get(claim.key) else None
     if claim is not None and owner is not None:
         message = (
@@ -101,12 +89,6 @@ def last_valid_claims(
 
     If the generator has changed the file since ``last_valid_commit``, this is the claim that it
     wrote last. If not, this is the claim at ``last_valid_commit``.
-
-    Args:
-        repo: the repository.
-        last_valid_commit: the newest commit with only valid files.
-        to: the newest commit to consider.
-        paths: the paths of claim files.
     """
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}
@@ -123,27 +105,21 @@ def last_valid_claims(
 
 
 def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
-    """Return the lease that a claim had on main before its proposal was merged.
-
-    Return None if the claim did not exist then, or had no lease.
-    """
+    """Return the lease that a claim had on main before its proposal was merged, if any."""
     for commit in commit_log.first_parents(repo, to):
         claim = valid_claim_at(commit.tree, path)
+        # a merged proposal's lease has not started; the one before it has
         if claim is None or claim.lease is None or claim.lease.has_started:
             return claim.lease if claim else None
     return None
 
 
 def claims_by_people(
-    repo: Repository, last_valid_commit: Oid, to: Oid, known: Ledger
+    repo: Repository, last_valid_commit: Oid, to: Oid, in_effect: Ledger
 ) -> list[ClaimChange]:
     """Return the valid claims that people added or edited, each with the last valid claim before.
 
-    Args:
-        repo: the repository.
-        last_valid_commit: the newest commit with only valid files; only later changes count.
-        to: the newest commit to consider.
-        known: the ledger in effect until now; a claim that is the same there is left out.
+    A claim that is the same in the ledger ``in_effect`` until now is left out.
     """
     paths = {
         path
@@ -151,25 +127,25 @@ def claims_by_people(
         for path in changed_files(trees.parent_tree(commit), commit.tree)
     }
     tree = trees.commit_of(repo, to).tree
-    found = ((path, valid_claim_at(tree, path)) for path in sorted(paths))
-    written = {path: claim for path, claim in found if claim and known.get(claim.key) != claim}
+    written = {
+        path: claim
+        for path in sorted(paths)
+        if (claim := valid_claim_at(tree, path)) and in_effect.get(claim.key) != claim
+    }
     booked = last_valid_claims(repo, last_valid_commit, to, written)
     changes = (ClaimChange(booked[path], claim) for path, claim in written.items())
     return [change for change in changes if change.before != change.after]
 
 
 def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
-    """Return the keys of the claims at ``to`` that people have added since a commit.
-
-    Merges, and commits that keep the trailers of a proposal, are left out. Return an empty set if
-    the repository lacks the commit ``since``.
-    """
+    """Return the keys of the claims at ``to`` that people themselves have added since a commit."""
     if not since or since not in repo:
         return set()
     before, after = trees.commit_of(repo, since).tree, trees.commit_of(repo, to).tree
     paths = {
         path
         for commit in commit_log.person_commits(repo, to, since)
+        # a merge, or what keeps a proposal's trailers, may add what a generator has proposed
         if len(commit.parents) == 1
         and commit_log.PROPOSAL not in commit_log.entry_of(commit).trailers
         for path in changed_files(commit.parents[0].tree, commit.tree)
@@ -179,20 +155,16 @@ def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
 
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
-    """Return the request to roll back to the ledger of the commit ``to``.
-
-    ``more`` are the other fields of the request. Raises InvalidInput with the faults of all claim
-    files if some are not valid, and StateRepoError if there is no such commit.
-    """
+    """Return the request to roll back to the ledger of the commit ``to``; ``more`` are fields."""
     commit = trees.commit_of(repo, to)
-    found = read(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
-    if found.faults:
-        raise InvalidInput(found.faults)
+    files = read_claims(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
+    if files.faults:
+        raise InvalidInput(files.faults)
     return Restoration(
         id="",
         to=str(commit.id),
         made=commit_log.time_of(commit),
-        claims=found.claims,
+        claims=files.claims,
         **more,  # type: ignore[arg-type]
     )
 
@@ -200,7 +172,7 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
 def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:
     """Return the subjects whose claims differ between two ledgers, sorted."""
     old, new = before.claims, after.claims
-    return sorted((one for one in {*old, *new} if old.get(one) != new.get(one)), key=str)
+    return sorted((subj for subj in {*old, *new} if old.get(subj) != new.get(subj)), key=str)
 
 
 def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
@@ -210,10 +182,7 @@ def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
 
 
 def changes_node(repo: Repository, revision: str | Oid, node: str) -> bool:
-    """Return whether a commit changed a release on a node, or a claim that names the node.
-
-    For the first commit of the history, return false.
-    """
+    """Return whether a commit changed a release on a node, or a claim that names the node."""
     commit = trees.commit_of(repo, revision)
     before, after = trees.parent_tree(commit), commit.tree
     if before is None:

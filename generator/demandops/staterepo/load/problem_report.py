@@ -34,8 +34,8 @@ class Problem:
     message: str
     since: str = ""
     author: str = ""
+    # not written to the report: ``Reader.problems`` finds it in the file
     line: int | None = None
-    """The line of the field in the file; None unless ``Reader.problems`` has found the line."""
 
     def __str__(self) -> str:
         places = (place_text(self.file, self.line), self.field)
@@ -45,37 +45,29 @@ class Problem:
         return f"{text} (since {self.since[:10]} by {self.author})"
 
 
+# From a file's path to the commit that caused the file's fault: its id and author.
 Origin = Callable[[str], tuple[str, str] | None]
-"""A function from a file's path to the commit that caused the file's fault: its id and author.
-
-The function returns None if it finds no commit.
-"""
 
 
 def with_origins(
-    faults: Iterable[Fault], known: Iterable[Problem], origin: Origin
+    faults: Iterable[Fault], reported: Iterable[Problem], origin: Origin
 ) -> tuple[Problem, ...]:
-    """Return a problem for each fault.
-
-    A problem in ``known`` keeps its commit and author. For a new problem, ``origin`` finds the
-    commit and the author. A problem for which the report has no room gets no commit and no author,
-    because the generator would have to search for these again at each demand.
-    """
-    existing = {(old.file, old.field, old.message): old for old in known if old.since}
-    found = sorted({(fault.file, fault.field, fault.message) for fault in faults})
+    """Return a problem for each fault, with the commit and author of one that is ``reported``."""
+    existing = {(old.file, old.field, old.message): old for old in reported if old.since}
+    places = sorted({(fault.file, fault.field, fault.message) for fault in faults})
     problems = []
-    for fault in found[:_MOST]:
-        file, field, message = map(one_line, fault)
+    for place in places[:_MOST]:
+        file, field, message = map(one_line, place)
         if (file, field, message) in existing:
             problems.append(existing[file, field, message])
             continue
-        commit, author = origin(fault[0]) or ("", "")
+        commit, author = origin(place[0]) or ("", "")
         problems.append(Problem(file, field, message, commit, one_line(author)))
-    return (*problems, *(Problem(*fault) for fault in found[_MOST:]))
+    # What the report has no room for gets no commit: it would have to be sought at each demand.
+    return (*problems, *(Problem(*place) for place in places[_MOST:]))
 
 
 def write(problems: tuple[Problem, ...]) -> str | None:
-    """Return the text of the report, or None if there are no problems."""
     if not problems:
         return None
     data: dict[str, object] = {

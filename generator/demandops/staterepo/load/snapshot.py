@@ -37,81 +37,67 @@ from demandops.subject import Subject
 
 Progress = Callable[[int, int], None]
 
+# The folders and files that a snapshot is read from.
 ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
-"""The folders and files that a snapshot is read from."""
 
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A commit and its state: configuration and ledger.
-
-    ``problems``: the faults of invalid files. The last valid versions of the files are in effect.
-    ``last_valid_commit``: the newest commit without problems.
-    ``quarantined_files``: ledger files whose content at this commit is not in effect.
-    ``other_config_source``: the source of the configuration in effect; None means this commit.
-    """
+    """A commit and its state: configuration and ledger."""
 
     commit: Oid
     state: State
+    # the newest commit without problems
     last_valid_commit: Oid
+    # the faults of invalid files, whose last valid versions are in effect
     problems: tuple[Fault, ...] = ()
+    # ledger files whose content at this commit is not in effect
     quarantined_files: tuple[str, ...] = ()
+    # the source of the configuration in effect; None means this commit
     other_config_source: ConfigSource | None = None
+    # whether a generator has written the files of this state; if not, all must be rendered
     is_rendered: bool = True
-    """Whether a generator has written the files of this state; if not, all must be rendered."""
 
     @property
     def config_source(self) -> ConfigSource:
-        """The source of the configuration in effect."""
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot of a commit whose parent is this snapshot's commit.
-
-        Args:
-            commit: the new commit.
-            state: the state at the new commit.
-        """
+        """Return the snapshot of a commit whose parent is this snapshot's commit."""
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
 
 @dataclass(frozen=True, slots=True)
 class Advance:
-    """A later snapshot, and the changes since an earlier one.
-
-    ``subjects`` are the subjects whose claims changed. ``config_changed`` is true if all releases
-    must be rendered again, usually because the configuration changed.
-    """
+    """A later snapshot, and the changes since an earlier one."""
 
     snapshot: Snapshot
+    # those whose claims changed
     subjects: tuple[Subject, ...]
+    # all releases must be rendered again, usually because the configuration changed
     config_changed: bool
 
 
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Read all files of a commit and return its snapshot.
+    """Read all files of a commit and return its snapshot, or raise InvalidInput.
 
     ``progress`` is called with (files read, all files) of the ledger.
-
-    Raises:
-        InvalidInput: files of the configuration or the ledger are not valid.
-        StateRepoError: Git does not know the revision, or the commit is not of a state repo.
     """
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
-    found = ledger_files.read(_claim_texts(commit.tree, progress))
-    if found.faults:
-        raise InvalidInput(found.faults)
+    files = ledger_files.read_claims(_claim_texts(commit.tree, progress))
+    if files.faults:
+        raise InvalidInput(files.faults)
     ended = last_valid_config.ended_overrides_at(commit.tree)
     shutdowns = recent_shutdowns.read_all(
         trees.texts(commit.tree, (recent_shutdowns.SHUTDOWNS_ROOT,))
     )
     waits = waiting.read_all(trees.texts(commit.tree, (waiting.WAITING_ROOT,)))
     kept = kept_replicas.read_all(trees.texts(commit.tree, (kept_replicas.REPLICAS_ROOT,)))
-    ledger = replace(found.ledger(), ended=ended, shutdowns=shutdowns, waiting=waits, kept=kept)
+    ledger = replace(files.ledger(), ended=ended, shutdowns=shutdowns, waiting=waits, kept=kept)
     return Snapshot(commit.id, State(config, ledger, EVALUATE), commit.id)
 
 
@@ -133,22 +119,17 @@ def advance(
 ) -> Advance:
     """Return the snapshot of the commit ``to``, and the changes since the snapshot ``before``.
 
-    Only files that differ are read. Invalid changes are not applied; ``problems`` of the new
-    snapshot has their faults. Raises InvalidInput if the files of ``recorded`` are not valid.
-
-    Args:
-        repo: the repository.
-        before: the earlier snapshot.
-        to: the later commit.
-        recorded: the recorded source of the configuration in effect at ``to``, if any.
+    Only files that differ are read. Invalid changes are not applied, but reported as problems of
+    the snapshot. Raises InvalidInput if the files of ``recorded`` are not valid, which is the
+    recorded source of the configuration in effect at ``to``.
     """
     old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
-    state, known = before.state, LastValidConfig(None, before.config_source, ())
+    state, in_effect = before.state, LastValidConfig(None, before.config_source, ())
     if recorded is not None:
-        known = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
+        in_effect = LastValidConfig(load_config(recorded.texts(repo)), recorded, ())
     elif before.problems or trees.differ(old, new, CONFIG_ROOTS):
-        known = _last_valid_config(repo, before, to)
-    config, ended = known.config or state.config, last_valid_config.ended_overrides_at(new)
+        in_effect = _last_valid_config(repo, before, to)
+    config, ended = in_effect.config or state.config, last_valid_config.ended_overrides_at(new)
     world_changed = config != state.config or ended != state.ledger.ended
     config_changed = (
         world_changed or not before.is_rendered or _must_render_all(repo, before.commit, to)
@@ -160,8 +141,9 @@ def advance(
     for instance, steps in changed_kept_replicas(old, new):
         kept = kept.replace(instance, steps)
     ledger = replace(state.ledger, ended=ended, shutdowns=shutdowns, waiting=waits, kept=kept)
-    state = State(config, ledger, EVALUATE) if known.config else replace(state, ledger=ledger)
-    problems, claims, invalid = list(known.faults), dict[str, Claim | None](), list[str]()
+    state = State(config, ledger, EVALUATE) if in_effect.config else replace(state, ledger=ledger)
+    problems, claims, invalid = list(in_effect.faults), dict[str, Claim | None](), list[str]()
+    # a quarantined file is read again, because another change may have made it valid
     for path in sorted({*ledger_files.changed_files(old, new), *before.quarantined_files}):
         try:
             claims[path] = claim = ledger_files.claim_at(new, path)
@@ -177,8 +159,8 @@ def advance(
     ledger, changes = state.ledger, list[ClaimChange]()
     for path in sorted(claims):
         claim = claims[path]
-        held = claim or ledger_files.valid_claim_at(old, path)
-        key = held.key if held else ledger_files.key_of(path, ledger)
+        keyed = claim or ledger_files.valid_claim_at(old, path)
+        key = keyed.key if keyed else ledger_files.key_of(path, ledger)
         if key is not None and ledger.get(key) != claim:
             changes.append(ClaimChange(ledger.get(key), claim))
             ledger = ledger.replace(key, claim)
@@ -192,7 +174,7 @@ def advance(
         before.last_valid_commit if problems else to,
         tuple(problems),
         tuple(invalid),
-        known.source if known.faults or recorded else None,
+        in_effect.source if in_effect.faults or recorded else None,
     )
     subjects = dict.fromkeys(change.key.subject for change in changes)
     return Advance(snapshot, tuple(subjects), config_changed)
@@ -208,10 +190,7 @@ def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
 
 
 def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instance, Steps]]:
-    """Yield (instance, what it keeps now) for each service instance whose kept replicas changed.
-
-    The second item is empty if the instance no longer keeps replicas.
-    """
+    """Yield (instance, what it keeps now) for each service instance whose kept replicas changed."""
     for path, _ in trees.differences(old, new, (kept_replicas.REPLICAS_ROOT,)):
         texts = [trees.read_text(tree, path) for tree in (old, new)]
         before, after = (kept_replicas.read(text, path) if text else None for text in texts)
@@ -220,15 +199,12 @@ def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instanc
 
 
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether all releases must be rendered again, because generated files may be outdated.
-
-    If a generator made the newest commit, the generated files match the ledger, so the result is
-    false. If a person made the newest commit, people may have edited the generated files, or undone
-    what another generator committed since ``before``.
-    """
+    """Return whether people may have changed generated files since ``before``."""
     people = list(commit_log.person_commits(repo, to, before))
+    # where a generator made the newest commit, the generated files match the ledger
     if not people or people[0].id != to:
         return False
+    # a person's commit may undo what another generator has committed meanwhile
     is_alone = len(people) == sum(1 for _ in commit_log.commits(repo, to, before))
     own = (*GENERATED_ROOTS, kept_replicas.REPLICAS_ROOT)
     roots = own if is_alone else (*own, *ROOTS)
@@ -239,11 +215,9 @@ def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
     )
 
 
+# By their arguments, the newest results of _last_valid_config: an invalid file is judged only once,
+# and not again for each demand.
 _judged: dict[object, LastValidConfig] = {}
-"""The results of the newest calls of :func:`_last_valid_config`, by their arguments.
-
-So an invalid file is judged only once, and not again for each demand.
-"""
 _MOST_JUDGED = 8
 
 
@@ -254,9 +228,9 @@ def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValid
         before.last_valid_commit,
         frozenset(before.state.ledger.ended.items()),
     )
-    found = _judged.get(key)
-    if found is None:
-        found = load_last_valid_config(
+    result = _judged.get(key)
+    if result is None:
+        result = load_last_valid_config(
             repo,
             before.config_source,
             before.last_valid_commit,
@@ -265,18 +239,15 @@ def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValid
         )
         if len(_judged) >= _MOST_JUDGED:
             _judged.clear()
-        _judged[key] = found
-    if found.config is None:
-        return replace(found, source=before.config_source)
-    return replace(found, source=replace(found.source, commit=to))
+        _judged[key] = result
+    # a result may be of another commit with the same files
+    if result.config is None:
+        return replace(result, source=before.config_source)
+    return replace(result, source=replace(result.source, commit=to))
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
-    """Return the configuration in ``files`` (path → text), after a trial.
-
-    If the configuration differs from that of ``state``, sample demands are rendered with it. Raises
-    InvalidInput if the files are not valid, or the samples cannot be rendered.
-    """
+    """Return the configuration in ``files``; if it is new, only if samples render with it."""
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config, in_force = load_config(files), state.config.repo_settings.render_version
@@ -292,34 +263,28 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Remembers what was read, so that the next attempt to publish reads only newer commits.
+    """Remembers what was read, so that the next attempt to publish reads only newer commits."""
 
-    Reading takes time. If each attempt read all commits since this generator's last publication,
-    other generators could publish first every time.
-    """
-
+    # Reading takes time. If each attempt read all commits since this generator's last publication,
+    # other generators could publish first every time.
     def __init__(self) -> None:
-        self._known: Advance | None = None
+        self._earlier: Advance | None = None
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
-        """Return the snapshot of ``tip``, and the changes since the snapshot ``before``.
-
-        Raises StateRepoError if ``tip`` has another render version.
-        """
         last_valid_config.refuse_other_render_version(repo, tip)
-        known = self._known
-        if known is None or self._start != before.commit:
-            known = Advance(before, (), False)
-        start = known.snapshot
+        earlier = self._earlier
+        if earlier is None or self._start != before.commit:
+            earlier = Advance(before, (), False)
+        start = earlier.snapshot
         if start.commit != tip or start.problems or not start.is_rendered:
-            more = advance(repo, start, tip)
-            known = Advance(
-                more.snapshot,
-                tuple(dict.fromkeys((*known.subjects, *more.subjects))),
-                known.config_changed
-                or more.config_changed
+            later = advance(repo, start, tip)
+            earlier = Advance(
+                later.snapshot,
+                tuple(dict.fromkeys((*earlier.subjects, *later.subjects))),
+                earlier.config_changed
+                or later.config_changed
                 or (start.commit != before.commit and _must_render_all(repo, before.commit, tip)),
             )
-        self._known, self._start = known, before.commit
-        return known
+        self._earlier, self._start = earlier, before.commit
+        return earlier

@@ -40,8 +40,8 @@ from demandops.subject import Subject
 
 _NONE = "none"
 _HELD_BACK = "Held-Back"
+# A placeholder for the problems of a recorded state, until the files are checked again.
 _TO_CHECK = Fault("invalid", "", "must be checked again")
-"""A placeholder for the problems of a recorded state, until the files are checked again."""
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
@@ -53,6 +53,7 @@ def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
         ("In-Force", str(snapshot.last_valid_commit)),
         ("Configuration", str(source.commit)),
         *(
+            # quoted, so that a space in a path does not begin the blob
             ("Stands-In", f"{quote(path)} {blob or _NONE}")
             for path, blob in sorted(source.replacements.items())
         ),
@@ -61,14 +62,7 @@ def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
 
 
 def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
-    """Return the state from which a generator starts: the newest state that a commit records.
-
-    The caller then applies later changes by people with
-    :func:`demandops.staterepo.load.snapshot.advance`.
-
-    Raises InvalidInput or StateRepoError if there never was a valid state, and StateRepoError if
-    the state repo needs a generator of another render version.
-    """
+    """Return the newest state that a commit records; the caller then follows people's changes."""
     objects, tip = repository.objects, repository.tip()
     last_valid_config.refuse_other_render_version(objects, tip)
     return start_at(objects, tip, progress)
@@ -108,10 +102,8 @@ def start_at(
     """Return the state in effect at the generator's newest commit at or before ``commit``.
 
     The generator's commit records that state. If the record is missing or wrong, return the state
-    of the newest valid commit up to the generator's commit or, if there is none, up to ``commit``.
-    A commit is valid if all its files are.
-
-    Raises InvalidInput or StateRepoError if no commit is valid.
+    of the newest commit with only valid files up to the generator's commit or, if there is none,
+    up to ``commit``.
     """
     record = record_at(repo, commit)
     tried, faults = set[tuple[Oid | None, ...]](), list[InvalidInput | StateRepoError]()
@@ -119,16 +111,15 @@ def start_at(
         # the record may be forged, or name commits that people have removed from the history
         with suppress(InvalidInput, StateRepoError):
             return recorded_state(repo, record, progress)
-    newer = list(
-        takewhile(lambda one: str(one.id) != record.commit, commit_log.first_parents(repo, commit))
-    )
+    line = commit_log.first_parents(repo, commit)
+    newer = list(takewhile(lambda by_person: str(by_person.id) != record.commit, line))
     for ancestor in chain(commit_log.first_parents(repo, record.commit), newer):
         content = tuple(trees.entry_id(ancestor.tree, root) for root in snapshots.ROOTS)
-        if content not in tried:
+        if content not in tried:  # most commits change other files, and loading takes time
             tried.add(content)
             try:
-                found = snapshots.load(repo, ancestor.id, progress)
-                return replace(found, is_rendered=ancestor not in newer)
+                snapshot = snapshots.load(repo, ancestor.id, progress)
+                return replace(snapshot, is_rendered=ancestor not in newer)
             except (InvalidInput, StateRepoError) as error:
                 faults.append(error)
     raise faults[0]
@@ -139,9 +130,8 @@ def snapshot_at(
 ) -> Snapshot:
     """Return the ledger and the configuration that are in effect at a commit.
 
-    Raises:
-        InvalidInput, StateRepoError: the commit is not valid, and no generator quarantined its
-            files.
+    Raises InvalidInput or StateRepoError if the commit is not valid, and no generator quarantined
+    its files.
     """
     if record_at(repo, revision).first("In-Force"):
         return state_at(repo, revision, progress)
@@ -149,15 +139,12 @@ def snapshot_at(
 
 
 def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
-    """Return the generator's newest commit at or before a revision.
-
-    If there is none, return the revision's own commit, without trailers.
-    """
+    """Return the generator's newest commit, else the revision's own commit without trailers."""
     commit = trees.commit_of(repo, revision)
-    made = commit_log.last_generator_commit(repo, commit.id)
-    if made is None:
+    last = commit_log.last_generator_commit(repo, commit.id)
+    if last is None:
         return replace(commit_log.entry_of(commit), trailers={})
-    return commit_log.entry_of(trees.commit_of(repo, made))
+    return commit_log.entry_of(trees.commit_of(repo, last))
 
 
 def recorded_state(
@@ -171,7 +158,18 @@ def recorded_state(
     if not record.first("In-Force"):
         return snapshots.load(repo, commit.id, progress)
     last_valid = snapshots.load(repo, record.first("In-Force"), progress)
-    source = _source(repo, record)
+    configuration = record.first("Configuration") or record.first("In-Force")
+    replacements: dict[str, Oid | None] = {}
+    try:
+        for line in record.trailers.get("Stands-In", ()):
+            path, _, blob = line.rpartition(" ")
+            replacements[unquote(path)] = None if blob == _NONE else repo[blob].peel(Blob).id
+        source = ConfigSource(Oid(hex=configuration), replacements)
+    except (ValueError, KeyError, GitError):
+        raise StateRepoError(
+            f"commit {record.commit} has unreadable trailers about invalid files; revert it, or "
+            "merge valid files"
+        ) from None
     advance = snapshots.advance(repo, last_valid, commit.id, source)
     held_back = record.trailers.get(_HELD_BACK, ())
     judgement = judge(repo, advance, last_valid, commit.tree, held_back)
@@ -180,61 +178,35 @@ def recorded_state(
     return replace(snapshot, last_valid_commit=last_valid.commit, problems=problems)
 
 
-def _source(repo: Repository, record: LogEntry) -> ConfigSource:
-    commit = record.first("Configuration") or record.first("In-Force")
-    replacements: dict[str, Oid | None] = {}
-    try:
-        for line in record.trailers.get("Stands-In", ()):
-            path, _, blob = line.rpartition(" ")
-            replacements[unquote(path)] = None if blob == _NONE else repo[blob].peel(Blob).id
-        return ConfigSource(Oid(hex=commit), replacements)
-    except (ValueError, KeyError, GitError):
-        raise StateRepoError(
-            f"commit {record.commit} has unreadable trailers about invalid files; revert it, or "
-            "merge valid files"
-        ) from None
-
-
 Faults = Mapping[Subject, tuple[Fault, ...]]
 
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """The faults of people's changes with the new and with the old configuration, by subject.
-
-    ``with_new``: why a subject cannot be planned with the new configuration.
-    ``with_old``: why a subject cannot be planned, or is refused, with the old configuration.
-    ``refused``: why a person's claim on the subject is refused with the new configuration.
-
-    If a subject has a fault with the new configuration only, the configuration is at fault. If it
-    has a fault with both, its claims are at fault. A refused claim is at fault itself.
-    """
+    """The faults of people's changes with the new and with the old configuration, by subject."""
 
     repo: Repository
     before: Snapshot
     advance: Advance
+    # why a subject cannot be planned with the new configuration
     with_new: Faults
+    # why a subject cannot be planned, or is refused, with the old configuration
     with_old: Faults
+    # why a person's claim on the subject is refused with the new configuration
     refused: Faults
+    # the configuration that was in effect before, with the new ledger
     old: State
-    """The configuration that was in effect before, with the new ledger."""
 
     def with_new_config(self) -> Advance:
-        """Return the advance with the new configuration.
-
-        Claims at fault keep their last valid versions.
-        """
+        """Return the advance, but with the last valid versions of claims at fault."""
+        # what has a fault only with the new configuration is not the claims' fault
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
         return self._quarantined(self.advance, _merged(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        """Return the advance with the old configuration.
-
-        Claims at fault keep their last valid versions. ``faults`` are the reasons why the new
-        configuration is refused.
-        """
+        """Return the advance with the old configuration; ``faults`` are those of the new one."""
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
         snapshot = replace(
@@ -254,7 +226,16 @@ class Judgement:
         for subject in (subject for subject in accepted.subjects if subject in faults):
             claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
             keys = {claim_file.path_of(claim.key): claim.key for claim in claims}
-            problems += _located_in_claim_files(faults[subject], snapshot, before, subject)
+            # a fault outside claim files is told at a claim on the subject, best at a changed one
+            now = snapshot.state.ledger.claims_on(subject)
+            changed = [claim for claim in now if before.state.ledger.get(claim.key) != claim]
+            paths = [claim_file.path_of(claim.key) for claim in (changed or now)]
+            problems += [
+                fault.within(paths[0])
+                if paths and claim_file.kind_of(fault.file) is None
+                else fault
+                for fault in faults[subject]
+            ]
             last_valid = ledger_files.last_valid_claims(
                 self.repo, before.last_valid_commit, snapshot.commit, keys
             )
@@ -293,15 +274,15 @@ def judge(
     old = replace(before.state, ledger=state.ledger)
 
     def faults_in(state: State) -> Faults:
-        found = {}
+        faults = {}
         for subject in advance.subjects:
             try:
                 changeset_of_edit(
                     state, ledger, [subject], lambda path: trees.read_text(tree, path)
                 )
             except InvalidInput as error:
-                found[subject] = error.faults
-        return found
+                faults[subject] = error.faults
+        return faults
 
     start, commit = before.last_valid_commit, advance.snapshot.commit
     by_people = list[ClaimChange]()
@@ -309,15 +290,20 @@ def judge(
         by_people = ledger_files.claims_by_people(repo, start, commit, ledger)
 
     def refused_in(state: State) -> Faults:
-        found: dict[Subject, tuple[Fault, ...]] = {}
+        refused: dict[Subject, tuple[Fault, ...]] = {}
         for change in by_people:
             faults = tuple(faults_of_edit(before.state, state, [change]))
             if faults:
-                found[change.key.subject] = (*found.get(change.key.subject, ()), *faults)
-        return found
+                refused[change.key.subject] = (*refused.get(change.key.subject, ()), *faults)
+        return refused
 
-    with_new = faults_in(state)
-    refused = refused_in(state) if held_back is None else _placeholders(advance, held_back)
+    with_new, refused = faults_in(state), refused_in(state)
+    if held_back is not None:
+        refused = {
+            subject: (_TO_CHECK,)
+            for subject in advance.subjects
+            if any(claim_file.path_of(c.key) in held_back for c in state.ledger.claims_on(subject))
+        }
     if state.config == old.config:
         return Judgement(repo, before, advance, with_new, with_new, refused, old)
     with_old = _merged(faults_in(old), refused_in(old))
@@ -326,30 +312,3 @@ def judge(
 
 def _merged(one: Faults, other: Faults) -> Faults:
     return {subject: (*one.get(subject, ()), *other.get(subject, ())) for subject in {*one, *other}}
-
-
-def _placeholders(advance: Advance, held_back: Collection[str]) -> Faults:
-    """Return a placeholder fault for each subject that has a claim file in ``held_back``."""
-    ledger = advance.snapshot.state.ledger
-    return {
-        subject: (_TO_CHECK,)
-        for subject in advance.subjects
-        if any(claim_file.path_of(claim.key) in held_back for claim in ledger.claims_on(subject))
-    }
-
-
-def _located_in_claim_files(
-    faults: Iterable[Fault], snapshot: Snapshot, before: Snapshot, subject: Subject
-) -> list[Fault]:
-    """Return the faults of a subject, each located in a claim file.
-
-    A fault outside claim files gets the path of a claim on the subject, if possible of a changed
-    claim. If the subject has no claim, the fault stays where it is.
-    """
-    claims = snapshot.state.ledger.claims_on(subject)
-    changed = [claim for claim in claims if before.state.ledger.get(claim.key) != claim]
-    paths = [claim_file.path_of(claim.key) for claim in (changed or claims)]
-    return [
-        fault.within(paths[0]) if paths and claim_file.kind_of(fault.file) is None else fault
-        for fault in faults
-    ]

@@ -120,7 +120,7 @@ def check(
     files, faults = files_of(folder)
     start = base_of(folder, base)
     edit = _Edit(files, start, now or REAL.now())
-    claims = ledger_files.read(sorted(files.items()))
+    claims = ledger_files.read_claims(sorted(files.items()))
     faults += claims.faults
     edited = [path for path in edit.changed if _is_written_by_generator(path)]
     result = CheckResult(
