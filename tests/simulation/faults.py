@@ -343,23 +343,23 @@ def push_on_any_tip(patch: Patch) -> None:
 
 
 def put_a_commit_on_the_wrong_parent(patch: Patch) -> None:
-    write = CommitBatch._write
+    commit_files = CommitBatch.commit_files
 
     def on_the_start(batch: CommitBatch, *given: Any) -> Any:
         batch.head = batch.head.with_commit(batch.start.commit, batch.head.state)
-        return write(batch, *given)
+        return commit_files(batch, *given)
 
-    patch(CommitBatch, "_write", on_the_start)
+    patch(CommitBatch, "commit_files", on_the_start)
 
 
 def remove_no_file(patch: Patch) -> None:
-    write = CommitBatch._write
+    commit_files = CommitBatch.commit_files
 
     def without(batch: CommitBatch, files: Any, *given: Any) -> Any:
         kept = {path: text for path, text in files.items() if text is not None}
-        return write(batch, kept, *given)
+        return commit_files(batch, kept, *given)
 
-    patch(CommitBatch, "_write", without)
+    patch(CommitBatch, "commit_files", without)
 
 
 def decide_on_a_stale_tip(patch: Patch) -> None:

@@ -14,7 +14,7 @@ from itertools import islice
 from types import MappingProxyType
 
 import pygit2
-from pygit2 import Oid, Signature
+from pygit2 import Signature
 
 from demandops.config.config import NODES_FILE
 from demandops.config.override import Override
@@ -27,7 +27,7 @@ from demandops.decision import (
 )
 from demandops.decision import scale_down as scaled_down
 from demandops.demand.claim import ClaimKey
-from demandops.errors import Fault, InvalidInput, StateRepoError
+from demandops.errors import InvalidInput, StateRepoError
 from demandops.ledger import claim_file
 from demandops.ledger.claim_changes import claim_changes
 from demandops.ledger.kept_replicas import Instance
@@ -58,11 +58,9 @@ _ATTEMPTS = 5
 _PAUSE_S = 0.02
 
 
+# The effect of people's changes: the snapshot, the changed files, and the keys of the claims that
+# overrides may have changed.
 _Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
-"""The effect of people's changes: snapshot, changed files, and keys of claims.
-
-The keys are those of the claims that overrides may have changed.
-"""
 
 
 class CommitBatch:
@@ -76,18 +74,17 @@ class CommitBatch:
         self._settled: list[tuple[str, str]] = []
         self.start = start
         self.head = start
+        # whether a demand freed room on a node since the caller last set this to false
         self.frees = False
-        """Whether a demand freed room on a node since the caller last set this to false."""
+        # the log line about the follow commit, which renders people's changes; empty if none
         self.followed = ""
-        """The log line about the follow commit, which renders people's changes; empty if none."""
 
     @property
     def is_empty(self) -> bool:
-        """Whether there is nothing to publish."""
         return self.head.commit == self.start.commit
 
     def read(self, path: str) -> str | None:
-        """Return a file's text at the batch's newest commit, or None if the file is missing."""
+        """Return a file's text at the batch's newest commit."""
         return trees.read_text(self._tree, path)
 
     def commit(
@@ -98,10 +95,7 @@ class CommitBatch:
         now: datetime,
         proposal: ProposalRecord | None = None,
     ) -> str:
-        """Commit one demand and return the commit's id.
-
-        ``proposal`` is the proposal with which the demand awaits approval, if it needs approval.
-        """
+        """Commit one demand, for its proposal if it needs approval, and return the commit's id."""
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
             more += [
@@ -124,30 +118,51 @@ class CommitBatch:
         now: datetime,
     ) -> str:
         """Commit the files that lead to ``state``, and return the commit's id."""
-        made = self._write(files, text, author, now)
-        self.head = self.head.with_commit(made, state)
-        return str(made)
+        committer = commit_message.generator_signature(now)
+        for attempt in range(1, _ATTEMPTS + 1):
+            try:
+                tree = trees.write(self._repository.new, self._tree, files)
+                commit = signing.create_commit(
+                    self._repository.new,
+                    self._repository.signer,
+                    (author, committer),
+                    text,
+                    tree,
+                    [self.head.commit],
+                )
+                self._tree = trees.commit_of(self._objects, commit).tree
+                break
+            except signing.SigningFailed:
+                raise
+            except (OSError, pygit2.GitError, KeyError, StateRepoError):
+                # a concurrent `git gc` may move an object to another file while it is read
+                if attempt == _ATTEMPTS:
+                    raise
+                self._repository.runtime.sleep(_PAUSE_S * attempt)
+        self.head = self.head.with_commit(commit, state)
+        return str(commit)
 
     def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:
-        """Record the outcome of a demand that changed nothing, in the next commit of a demand.
-
-        The process may die before it answers the demand. After a restart, the generator must not
-        evaluate the demand again, because later demands could change the outcome. If this batch
-        gets no further commit of a demand, nothing is recorded.
-        """
+        """Record the outcome of a demand that changed nothing, in the next commit of a demand."""
+        # The process may die before it answers the demand. After a restart, it must not evaluate
+        # the demand again, because later demands could change the outcome.
         self._settled.append((commit_log.settled_trailer(outcome), operation))
 
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
         """Render people's changes, and commit the generated files that differ, if any.
 
-        A claim or file may be impossible to plan or render, for example because its node left the
-        inventory. Then its last valid version stays in effect, and the problems of ``head`` list
-        the fault.
+        What cannot be planned or rendered, for example because its node left the inventory, stays
+        in effect in its last valid version, and is a problem of ``head``.
         """
         self.head, change, keys = self._followed(advance, before, now)
         state, tip, problems = self.head.state, self.head.commit, self.head.problems
-        report = self._report(problems, before)
-        files = {**change.files, **report}
+        files, reported = dict(change.files), self.read(problem_report.PATH)
+        origin = authorship.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
+        report = problem_report.write(
+            problem_report.with_origins(problems, problem_report.read(reported), origin)
+        )
+        if report != reported:
+            files[problem_report.PATH] = report
         if not files:
             return
         overrides = [
@@ -167,7 +182,7 @@ class CommitBatch:
                 *authorship.caused_by_trailers(causes),
                 *state_in_effect.trailers_of(self.head),
             ],
-            reports=bool(report),
+            reports=report != reported,
         )
         author = authorship.follow_author(causes, now)
         self.commit_files(files, state, text, author, now)
@@ -175,33 +190,26 @@ class CommitBatch:
         self.followed = one_line(", ".join([title, *sorted(set(overrides))]))
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
-        """Return the effect of people's changes.
-
-        If the new configuration cannot be rendered, the old configuration stays in effect.
-        """
         judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
         accepted = judgement.with_new_config()
         if advance.config_changed:
             try:
-                return self._rendered_whole(accepted, before, now)
+                marked = last_valid_config.end_markers_at(self._tree)
+                state = accepted.snapshot.state
+                applied = update_ledger(before.state, state, accepted.subjects, marked, now)
+                state = replace(state, ledger=applied.ledger)
+                change = self.render_all(state, applied.files)
+                return self._with_started_leases(
+                    accepted.snapshot, state, change, applied.keys, now
+                )
             except InvalidInput as error:
                 accepted = judgement.with_old_config(error.faults)
-        return self._rendered_subjects(accepted, before, now)
-
-    def _rendered_whole(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
-        marked = last_valid_config.end_markers_at(self._tree)
-        state = accepted.snapshot.state
-        applied = update_ledger(before.state, state, accepted.subjects, marked, now)
-        state = replace(state, ledger=applied.ledger)
-        change = self.render_all(state, applied.files)
-        return self._with_started_leases(accepted.snapshot, state, change, applied.keys, now)
-
-    def _rendered_subjects(self, accepted: Advance, before: Snapshot, now: datetime) -> _Followed:
+        # with the configuration as before, only the subjects that people changed are rendered
         state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
         applied = update_claims(old, state, subjects, now)
         touched = claim_changes(state.ledger, applied.ledger, applied.keys)
         state = state.with_ledger(applied.ledger, touched)
-        subjects = tuple(dict.fromkeys((*subjects, *(one.key.subject for one in touched))))
+        subjects = tuple(dict.fromkeys((*subjects, *(change.key.subject for change in touched))))
         change = changeset_of_edit(state, old, subjects, self.read)
         change = replace(change, files={**applied.files, **change.files})
         return self._with_started_leases(accepted.snapshot, state, change, applied.keys, now)
@@ -214,39 +222,23 @@ class CommitBatch:
         keys: Iterable[ClaimKey],
         now: datetime,
     ) -> _Followed:
-        """Return the effect of people's changes, and start the leases of approved claims.
-
-        Such a lease starts only now, because otherwise it could end before the approval.
-        """
+        # an approved claim's lease starts only now, because else it could end before the approval
         ledger, files = state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():
             assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
             path = claim_file.path_of(claim.key)
-            before = ledger_files.lease_before_approval(self._objects, snapshot.commit, path)
-            started = replace(claim, lease=claim.lease.started(now, before))
+            earlier = ledger_files.lease_before_approval(self._objects, snapshot.commit, path)
+            started = replace(claim, lease=claim.lease.started(now, earlier))
             ledger = ledger.replace(claim.key, started)
             files[path] = claim_file.text_of(started)
         # a lease does not affect a release, so the usage of nodes need not be counted again
         snapshot = replace(snapshot, state=state.with_ledger(ledger, ()))
         return snapshot, replace(change, files=files), tuple(keys)
 
-    def _report(self, problems: Iterable[Fault], before: Snapshot) -> dict[str, str | None]:
-        """Return the problem report as path → text if it changed, else an empty mapping.
-
-        The text is None if there are no problems any more, so that the report is removed.
-        """
-        current = self.read(problem_report.PATH)
-        origin = authorship.fault_origin(self._objects, before.last_valid_commit, self.start.commit)
-        wanted = problem_report.write(
-            problem_report.with_origins(problems, problem_report.read(current), origin)
-        )
-        return {} if wanted == current else {problem_report.PATH: wanted}
-
     def end_override(self, override: Override, now: datetime) -> None:
         """Commit the end of an expired override, with its effect on claims and releases.
 
-        Raises Refused or InvalidInput if the state without the override cannot be planned or
-        rendered.
+        Raises InvalidInput if the state without the override cannot be planned or rendered.
         """
         applied = end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
@@ -256,11 +248,9 @@ class CommitBatch:
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
 
     def scale_down(self, instance: Instance, now: datetime) -> str:
-        """Commit the removal of replicas that a service no longer keeps.
+        """Commit the removal of replicas that a service no longer keeps; return the title.
 
-        Return the first line of the commit's message.
-
-        Raises Refused or InvalidInput if the service cannot be planned or rendered.
+        Raises InvalidInput if the service cannot be planned or rendered.
         """
         state, change = scaled_down(self.head.state, instance, now, self.read)
         more = state_in_effect.trailers_of(self.head)
@@ -271,19 +261,17 @@ class CommitBatch:
     def drain(self, node: str, after: str, operation: str, now: datetime) -> Decision:
         """Commit the move of placed applications off a drained node, and return the decision.
 
-        It begins with the application that follows ``after`` (:class:`Drain`).
-        If no application can be moved, there is no commit. The commit's author is the person who
-        last changed the node's file, or the generator if there is no such person.
-
-        Raises Refused or InvalidInput if the state after the move cannot be planned or rendered.
+        It begins with the application that follows ``after`` (:class:`Drain`). If no application
+        can be moved, there is no commit.
         """
         decision = decide(self.head.state, Drain(node, after=after), now, self.read)
         if decision.files:
+            # the author is the person who last changed the node's file, and so drained the node
             config = decision.state.config
             file = config.file_of(NODES_FILE, config.host_of(node))
             changes = commit_log.changes_to(self._objects, self.start.commit, file)
-            by_people = (one.entry.commit for one in changes if not one.entry.by_generator)
-            causes = [trees.commit_of(self._objects, one) for one in islice(by_people, 1)]
+            by_people = (change.entry for change in changes if not change.entry.by_generator)
+            causes = [trees.commit_of(self._objects, e.commit) for e in islice(by_people, 1)]
             caused_by = authorship.caused_by_trailers(causes)
             more = [*caused_by, *state_in_effect.trailers_of(self.head)]
             text = commit_message.of_decision(decision, operation, now, more)
@@ -296,20 +284,21 @@ class CommitBatch:
     ) -> Changeset:
         """Render all files; return those that differ from the batch's newest commit, and ``more``.
 
-        Raises Refused or InvalidInput if a release cannot be planned or rendered.
+        Raises InvalidInput if a release cannot be planned or rendered.
         """
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
         changes = []
-        known = {
-            path: trees.is_file(one) for path, one in trees.entries(self._tree, GENERATED_ROOTS)
+        are_files = {
+            path: trees.is_file(child) for path, child in trees.entries(self._tree, GENERATED_ROOTS)
         }
-        for path, is_file in known.items():
+        for path, is_file in are_files.items():
             if path not in files and not (is_file and trees.is_readme(path)):
                 files[path] = None
         for path in sorted(files):
             old = generated.get(path)
-            if old == files[path] and known.get(path, True):
+            # a link is replaced by a file, even if its text is the right one
+            if old == files[path] and are_files.get(path, True):
                 del files[path]
                 continue
             kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
@@ -317,38 +306,8 @@ class CommitBatch:
             changes.append(ReleaseChange(name, path, path, kind))
         return Changeset({**more, **files}, tuple(changes))
 
-    def _write(
-        self, files: Mapping[str, str | None], text: str, author: Signature, now: datetime
-    ) -> Oid:
-        committer = commit_message.generator_signature(now)
-        for attempt in range(1, _ATTEMPTS + 1):
-            try:
-                tree = trees.write(self._repository.new, self._tree, files)
-                made = signing.create_commit(
-                    self._repository.new,
-                    self._repository.signer,
-                    (author, committer),
-                    text,
-                    tree,
-                    [self.head.commit],
-                )
-                self._tree = trees.commit_of(self._objects, made).tree
-                break
-            except signing.SigningFailed:
-                raise
-            except (OSError, pygit2.GitError, KeyError, StateRepoError):
-                # a concurrent `git gc` may move an object to another file while it is read
-                if attempt == _ATTEMPTS:
-                    raise
-                self._repository.runtime.sleep(_PAUSE_S * attempt)
-        return made
-
     def publish(self) -> bool:
-        """Publish the commits, if any, and return true.
-
-        If the state repo got other commits, or another writer locks it, return false. Raises
-        Unavailable, PushDenied or Unsound like :meth:`StateRepository.publish`.
-        """
+        """Publish the commits, if any, like :meth:`StateRepository.publish`."""
         if self.is_empty:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)

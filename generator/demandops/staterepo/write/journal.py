@@ -26,6 +26,7 @@ from typing import Any
 
 from demandops.demand.lease import UNSTARTED
 from demandops.errors import StateRepoError, Unsound
+from demandops.staterepo.git.new_objects import sync_folder
 from demandops.staterepo.git.repository import disk_error
 
 _MOST_BYTES = 1 << 20
@@ -45,45 +46,36 @@ class DamagedJournal(StateRepoError):
 
 @dataclass(frozen=True, slots=True)
 class ProposalRecord:
-    """The journal's record of a proposal: what a restarted process needs to continue it.
-
-    ``commits``: where the generator left the branch, newest last. There may be two commits, because
-    the push of the newest may have failed.
-    ``base``: the commit of main on which the newest of ``commits`` was made.
-    ``pushed``: whether the branch was pushed. If a pushed branch is missing, somebody deleted it.
-    After a person merges only some of the demands, this is false until the branch is pushed again.
-    ``link``: the address of the branch's merge request, if GitLab printed it at a push, or empty.
-    ``withdrawn``: the reason why the demand was withdrawn, or empty.
-    ``replaces``: branch and commit where the demand waited, before it became another, or empty.
-    """
+    """The journal's record of a proposal: what a restarted process needs to continue it."""
 
     branch: str
+    # where the generator left the branch, newest last; two if the newest's push may have failed
     commits: tuple[str, ...] = ()
+    # the commit of main on which the newest of the commits was made
     base: str = ""
+    # If a pushed branch is missing, somebody deleted it. After a person merges only some of the
+    # demands, this is false until the branch is pushed again.
     pushed: bool = False
+    # the address of the branch's merge request, if GitLab printed it at a push
     link: str = ""
+    # the reason why the demand was withdrawn
     withdrawn: str = ""
+    # branch and commit where the demand waited, before it became another
     replaces: str = ""
 
     @property
     def replaced_branch(self) -> str:
-        """The branch in ``replaces``."""
         return self.replaces.partition(" ")[0]
 
     def as_replaced(self) -> str:
-        """Return ``replaces`` for a proposal that replaces this one.
-
-        Nobody has seen a proposal without a commit, so that is what this proposal replaces.
-        """
+        """Return ``replaces`` for a proposal that replaces this one."""
+        # nobody has seen a proposal without a commit, so the one that it replaces still counts
         return f"{self.branch} {self.commits[-1]}" if self.commits else self.replaces
 
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """An accepted demand: operation id, goal, time received, and the tip known at that time.
-
-    ``proposal``: the proposal with which the demand awaits approval, if any.
-    """
+    """An accepted demand: operation id, goal, time received, and the tip known at that time."""
 
     operation: str
     goal: Any
@@ -92,20 +84,15 @@ class JournalEntry:
     proposal: ProposalRecord | None = None
 
     def record(self) -> dict[str, Any]:
-        """Return the entry as plain data for JSON; without ``proposal`` if there is none.
-
-        The goal is not copied, because it may be deeply nested.
-        """
+        """Return the entry as plain data for JSON; without ``proposal`` if there is none."""
+        # asdict would copy the goal, which may be nested too deeply for that
         record = {field.name: getattr(self, field.name) for field in fields(self)}
         del record["proposal"]
         return record | ({"proposal": asdict(self.proposal)} if self.proposal else {})
 
 
 class Journal:
-    """The journal of one process. It is not thread-safe: the caller must hold a lock.
-
-    The file is rewritten when its size exceeds 1 MiB and has doubled since the last rewrite.
-    """
+    """The journal of one process. It is not thread-safe: the caller must hold a lock."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
@@ -117,19 +104,15 @@ class Journal:
             self._rewrite()
 
     def require_sound(self) -> None:
-        """Raise Unsound if an earlier write left the file in an unknown state.
-
-        Every later write raises the same error.
-        """
+        """Raise Unsound if an earlier write left the file in an unknown state."""
         if self._unsound is not None:
             raise self._unsound
 
     def append(self, entries: Iterable[JournalEntry]) -> None:
         """Write and fsync all ``entries``, or raise StateRepoError and write none of them.
 
-        An entry replaces the pending entry with the same operation id.
-
-        Raises Unsound if nobody knows whether they are written.
+        An entry replaces the pending entry with the same operation id. Raises Unsound if nobody
+        knows whether they are written.
         """
         entries = list(entries)
         if entries:
@@ -139,17 +122,15 @@ class Journal:
             self._rewrite_if_large()
 
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
-        """Remove demands that are published, refused or withdrawn.
+        """Remove demands that are published, refused or withdrawn, if they are pending.
 
-        Operations without a pending demand are ignored.
-
-        If ``durably`` is true, the removal is fsynced; a failure raises StateRepoError and keeps
-        the demands. Otherwise the next :meth:`append` makes the removal durable. If the process or
-        the machine fails before that, the demands may be evaluated again after a restart. This is
-        harmless if a commit records their outcome, but a refused demand could be booked.
-        Raises Unsound if the content of the file is unknown.
+        If ``durably`` is true, the removal is fsynced, and a failure raises StateRepoError and
+        keeps the demands.
         """
-        done = [each for each in dict.fromkeys(operations) if each in self.pending]
+        # Otherwise the next append makes the removal durable. If the machine fails before that, the
+        # demands are evaluated again after a restart. This is harmless if a commit records their
+        # outcome, but a refused demand could be booked.
+        done = [operation for operation in dict.fromkeys(operations) if operation in self.pending]
         records = [{"done": operation} for operation in done]
         if durably and done:
             with self._explained():
@@ -162,8 +143,7 @@ class Journal:
         self._rewrite_if_large()
 
     def close(self) -> None:
-        """Close the journal; pending demands stay for the next process."""
-        # if the write fails, the next process may evaluate again a demand that is done
+        # if this fails, the next process may evaluate again a demand that is done
         with suppress(OSError, Unsound):
             self._write([], durably=True)
         self._file.close()
@@ -175,7 +155,9 @@ class Journal:
         text, chain = _sealed(records, self._chain)
         self._is_broken = True
         try:
-            _write_all(self._file.fileno(), text)
+            left = memoryview(text)
+            while left:  # the system may write only a part
+                left = left[os.write(self._file.fileno(), left) :]
             if durably:
                 os.fdatasync(self._file.fileno())
         except OSError as error:
@@ -216,14 +198,15 @@ class Journal:
             os.fdatasync(self._file.fileno())
         sync_folder(self._path.parent)
         self._is_broken, self._chain, self._size = False, chain, len(text)
+        # so that rewriting costs no more than what was appended
         self._limit = max(_MOST_BYTES, 2 * len(text))
 
     def _require_known(self, error: OSError) -> None:
         """Raise Unsound if the content of the disk is unknown after ``error``."""
-        told = disk_error(error, f"the journal {self._path}")
-        if isinstance(told, Unsound):
-            self._unsound = told
-            raise told from None
+        reason = disk_error(error, f"the journal {self._path}")
+        if isinstance(reason, Unsound):
+            self._unsound = reason
+            raise reason from None
 
     @contextmanager
     def _explained(self, remedy: str = "send the demand again") -> Iterator[None]:
@@ -238,19 +221,12 @@ class Journal:
 
 
 def read(path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands in a journal's file, by operation id; none if it is missing.
-
-    Raises DamagedJournal like :func:`parse`, and OSError if the file cannot be read.
-    """
+    """Return the pending demands in a journal's file, by operation id; none if it is missing."""
     return parse(path.read_bytes() if path.exists() else b"", path)
 
 
 def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands of a journal's text, by operation id, or raise DamagedJournal.
-
-    A last line that is cut off is dropped. A crash interrupted the write, so the line's demand was
-    never acknowledged.
-    """
+    """Return the pending demands of a journal's text, by operation id, or raise DamagedJournal."""
     *lines, last = text.split(b"\n")
     chain = "" if _SEALED.fullmatch((lines or [last])[0]) else None
     pending: dict[str, JournalEntry] = {}
@@ -262,38 +238,24 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
     with suppress(ValueError):
         _apply(last[:-1], chain, {})
         raise DamagedJournal(path, len(lines) + 1)  # only the line break of this line was changed
+    # a crash has cut off an invalid last line, so its demand was never acknowledged
     with suppress(ValueError):
         _apply(last, chain, pending)
     return pending
 
 
 def readable_entries(path: Path) -> list[JournalEntry]:
-    """Return the pending demands that can be read in a journal, even if it is damaged.
-
-    Raises OSError if the file cannot be read.
-    """
+    """Return the pending demands that can be read in a journal, even if it is damaged."""
     pending: dict[str, JournalEntry] = {}
     for line in path.read_bytes().split(b"\n"):
-        found = _SEALED.fullmatch(line)
+        sealed = _SEALED.fullmatch(line)
         with suppress(ValueError):
-            _replay(found[1] + b"}" if found else line, pending)
+            _replay(sealed[1] + b"}" if sealed else line, pending)
     return list(pending.values())
 
 
-def sync_folder(folder: Path) -> None:
-    """Fsync a folder, so that the names in it are durable."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
-
-
 def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
-    """Return the journal's lines for records, and the digest of the last line.
-
-    ``chain`` is the digest of the line before them.
-    """
+    """Return the journal's lines after one with the digest ``chain``, and the last digest."""
     lines = []
     for record in records:
         body = json.dumps(record, ensure_ascii=True)
@@ -307,16 +269,12 @@ def _digest(body: bytes, chain: str) -> str:
 
 
 def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> str | None:
-    """Apply a line to ``pending`` and return the line's digest; raise ValueError if it is damaged.
-
-    ``chain`` is the digest of the previous line. In a journal of the first version, ``chain`` and
-    the result are None.
-    """
-    if chain is not None:
-        found = _SEALED.fullmatch(line)
-        if found is None or _digest(found[1] + b"}", chain) != found[2].decode():
+    """Apply a line after one with the digest ``chain``, and return the line's digest."""
+    if chain is not None:  # else a journal of the first version, which has no digests
+        sealed = _SEALED.fullmatch(line)
+        if sealed is None or _digest(sealed[1] + b"}", chain) != sealed[2].decode():
             raise ValueError("the line has another digest")
-        line, chain = found[1] + b"}", found[2].decode()
+        line, chain = sealed[1] + b"}", sealed[2].decode()
     _replay(line, pending)
     return chain
 
@@ -338,9 +296,3 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         pending[entry.operation] = entry
     except (TypeError, LookupError, AttributeError, RecursionError) as error:
         raise ValueError("the line is not an entry") from error
-
-
-def _write_all(file: int, text: bytes) -> None:
-    left = memoryview(text)
-    while left:
-        left = left[os.write(file, left) :]

@@ -29,14 +29,12 @@ from demandops.staterepo.write.proposal_branch import PendingProposal, ProposalB
 _ATTEMPTS = 5
 _PAUSE_S = 0.2
 
+# Path → the new text; None removes the file.
 Files = Mapping[str, str | None]
-"""Path → the new text; None removes the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommitDetails:
-    """The author and time of a commit, and the summary and reason in its message."""
-
     person: Person
     now: datetime
     summary: str
@@ -44,7 +42,7 @@ class CommitDetails:
 
     @property
     def text(self) -> str:
-        """The message of the commit. The person's reason is as written: it may close an issue."""
+        # the person's reason is as written: it may close an issue
         return compose([[self.summary]], []) + (
             f"\n{one_line(self.reason)}\n" if self.reason else ""
         )
@@ -52,33 +50,21 @@ class CommitDetails:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A published commit and its branch.
-
-    ``link`` is the address of the branch's merge request, or empty.
-    """
+    """A published commit and its branch."""
 
     commit: str
     branch: str
+    # the address of the branch's merge request, if the server printed it
     link: str = ""
 
 
 def commit_to_main(
     repository: StateRepository, make: Callable[[FileReader], Files], details: CommitDetails
 ) -> Published:
-    """Commit files to main, and return what was published.
+    """Commit the files that ``make`` returns to main.
 
-    Args:
-        repository: the state repo.
-        make: returns the files to commit. Its argument is a function that reads a file on main. If
-            main gets other commits meanwhile, ``make`` is called again.
-        details: the person, the time and the message.
-
-    Raises:
-        InvalidInput: with the files, the configuration has faults that main does not have; nothing
-            was changed.
-        StateRepoError: the commit could not be published, or the remote cannot be reached and
-            nobody knows whether it got the commit.
-        Unsound: the disk failed, and nobody knows whether the commit was published.
+    The argument of ``make`` reads a file on main. If main gets other commits meanwhile, ``make`` is
+    called again. Raises InvalidInput if the files give the configuration new faults.
     """
     return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), details)
 
@@ -90,44 +76,33 @@ def commit_to_branch(
     branch: str,
     options: Sequence[str],
 ) -> Published:
-    """Commit files to a new branch on top of main, and return what was published.
+    """Commit files to a new branch on top of main, with push options if the server has them.
 
-    ``options`` are push options, for a server that supports them.
-
-    Raises:
-        InvalidInput: with the files, the configuration has faults that main does not have; nothing
-            was changed.
-        StateRepoError: the branch exists, or could not be pushed.
+    Raises InvalidInput if the files give the configuration new faults.
     """
     tip = trees.commit_of(repository.objects, repository.refresh())
-    made = _commit(repository, tip, files, [tip.id], details)
+    commit = _commit(repository, tip, files, [tip.id], details)
     branches = ProposalBranches(repository)
     if branches.exists(branch):
         raise StateRepoError(f"the branch {branch} exists already; merge or delete it first")
-    link = branches.put(branch, made, "", options)
-    return Published(str(made), branch, link)
+    link = branches.put(branch, commit, "", options)
+    return Published(str(commit), branch, link)
 
 
 def merge(
     repository: StateRepository, proposal: PendingProposal, details: CommitDetails
 ) -> Published:
-    """Merge a proposal into main, and return what was published.
+    """Merge the commit of a proposal, which a person has seen, into main.
 
-    What is merged is the commit ``proposal.commit``, which a person has seen. If the branch is
-    elsewhere now, nothing is merged. If it moves at the very end, this commit is merged all the
-    same: a demand that was changed waits on another branch.
-
-    Raises:
-        InvalidInput: with the proposal, the configuration has faults that main does not have;
-            nothing was changed.
-        StateRepoError: the branch has moved, or main has other changes to the same files, or cannot
-            be written, or the proposal has a file that is not plain text.
-        Unsound: the disk failed, and nobody knows whether the merge was published.
+    Raises InvalidInput if the proposal gives the configuration new faults, and StateRepoError if
+    the branch has moved, or main has other changes to the same files.
     """
     objects = repository.objects
     head = trees.commit_of(objects, proposal.commit)
 
     def make(tip: Commit) -> tuple[Files, list[Oid]]:
+        # If the branch moves only after this, its commit is merged all the same: a demand that was
+        # changed waits on another branch.
         if ProposalBranches(repository).heads().branches.get(proposal.branch) != proposal.commit:
             raise StateRepoError(
                 f"{proposal.branch} is no longer at commit {proposal.commit}, so nothing was "
@@ -147,11 +122,15 @@ def merge(
                 "a running generator has made the branch anew, then try again; if the branch has "
                 "commits by a person, the generator leaves it alone, so merge it with git"
             )
-        odd = next((path for path in proposed if not _is_plain(head.tree, path)), None)
-        if odd is not None:
-            raise StateRepoError(
-                f"{odd} in {proposal.branch} is not a plain text file; merge the branch with git"
-            )
+        for path in proposed:
+            # files are written anew from their text, so a link or another encoding would be lost
+            blob = trees.entry(head.tree, path)
+            is_text = isinstance(blob, Blob) and trees.text_of(blob).encode() == blob.data
+            if blob is not None and not (is_text and blob.filemode == FileMode.BLOB):
+                raise StateRepoError(
+                    f"{path} in {proposal.branch} is not a plain text file; merge the branch with "
+                    "git"
+                )
         read = _reader(head.tree)
         return {path: read(path) for path in proposed}, [tip.id, head.id]
 
@@ -166,9 +145,9 @@ def _publish(
     for attempt in range(1, _ATTEMPTS + 1):
         tip = trees.commit_of(repository.objects, repository.refresh())
         files, parents = make(tip)
-        made = _commit(repository, tip, files, parents, details)
-        if repository.publish(tip.id, made):
-            return Published(str(made), MAIN_BRANCH)
+        commit = _commit(repository, tip, files, parents, details)
+        if repository.publish(tip.id, commit):
+            return Published(str(commit), MAIN_BRANCH)
         repository.new.forget()
         REAL.sleep(_PAUSE_S * attempt)
     if repository.always_current and repository.tip() == tip.id:
@@ -190,6 +169,7 @@ def _commit(
     details: CommitDetails,
 ) -> Oid:
     tree = trees.write(repository.new, tip.tree, dict(files))
+    # faults that main has already do not stop a person, who may be mending them one by one
     new_faults = _faults(repository.objects[tree].peel(Tree)) - _faults(tip.tree)
     if new_faults:
         raise InvalidInput(sorted(new_faults, key=str))
@@ -205,14 +185,6 @@ def _faults(tree: Tree) -> set[Fault]:
     except InvalidInput as error:
         return {*error.faults}
     return set()
-
-
-def _is_plain(tree: Tree, path: str) -> bool:
-    """Return whether a path has nothing, or a file of text that is not executable."""
-    found = trees.entry(tree, path)
-    if not isinstance(found, Blob):
-        return found is None
-    return found.filemode == FileMode.BLOB and trees.text_of(found).encode() == found.data
 
 
 def _reader(tree: Tree) -> FileReader:

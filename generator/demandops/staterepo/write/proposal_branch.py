@@ -51,11 +51,7 @@ def branch_name(name: str, operation: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The newest commits of main and of the proposals' branches.
-
-    ``main`` is empty if there is no main. ``branches`` maps the name of a branch to its newest
-    commit.
-    """
+    """The newest commits of main, empty if there is none, and of the proposals' branches."""
 
     main: str
     branches: dict[str, str]
@@ -69,34 +65,26 @@ class ProposalBranches:
         self._remote = repository if isinstance(repository, RemoteRepository) else None
 
     def heads(self) -> BranchHeads:
-        """Return the newest commits of main and of the proposals' branches.
-
-        Raises Unavailable if git cannot read from the remote now.
-        """
         if self._remote is None:
             repo = Repository(self._repository.objects.path)
             names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
-            named = ((name, repo.references.get(name)) for name in [MAIN, *names])
-            found = {name: str(one.target) for name, one in named if one is not None}
+            # another process may delete a branch meanwhile, so a name may have no reference
+            pairs = ((name, repo.references.get(name)) for name in [MAIN, *names])
+            commits = {name: str(ref.target) for name, ref in pairs if ref is not None}
         else:
-            found = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
-        heads = {name.removeprefix(_HEADS): commit for name, commit in found.items()}
+            commits = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
+        heads = {name.removeprefix(_HEADS): commit for name, commit in commits.items()}
         return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
     def exists(self, branch: str) -> bool:
-        """Return whether ``branch`` exists, or raise Unavailable.
-
-        The branch's name need not begin with ``demand/``.
-        """
+        """Return whether any branch exists, also one that does not begin with ``demand/``."""
         reference = f"{_HEADS}{branch}"
         if self._remote is None:
             return reference in self._repository.objects.references
         return reference in self._remote.list_references(reference)
 
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
-        """Make a branch point to ``commit``, durably.
-
-        Return the link that the server printed, or an empty text.
+        """Make a branch point to ``commit``, durably, and return the link that the server printed.
 
         Args:
             branch: the branch's name.
@@ -113,19 +101,12 @@ class ProposalBranches:
             return self._move(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
-        """Delete a branch, if it exists.
-
-        Raises:
-            BranchMoved: the branch is at another commit.
-            Unavailable, PushDenied: the deletion could not be pushed for another reason.
-            GitError, OSError: the repository on this disk could not be written.
-        """
+        """Delete a branch, if it exists, with the errors of :meth:`put`."""
         self._move(branch, None, expected)
 
     def _move(
         self, branch: str, commit: Oid | None, expected: str, options: Sequence[str] = ()
     ) -> str:
-        """Move or delete a branch; return the link that the server printed, or an empty text."""
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
             try:
@@ -135,7 +116,11 @@ class ProposalBranches:
             return ""
         try:
             spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
-            return _link(self._remote.push(spec, lease, options))
+            output = self._remote.push(spec, lease, options)
+            lines = [line for line in output.splitlines() if line.startswith("remote:")]
+            links = [link[0] for line in lines if (link := _LINK.search(line))]
+            # GitLab prints how to make a merge request, or the one that exists
+            return next((link for link in links if "/merge_requests/" in link), "")
         except git.GitCommandError as error:
             if options and _NO_OPTIONS.search(str(error.stderr)):
                 return self._move(branch, commit, expected)
@@ -147,9 +132,9 @@ class ProposalBranches:
             raise self._why_denied(branch) or self._remote.push_error(error) from None
 
     def _why_denied(self, branch: str) -> PushDenied | None:
-        """Return an error if ``branch`` is like ``a/b`` and a branch ``a`` exists, else None."""
         folders = (branch[:end] for end, letter in enumerate(branch) if letter == "/")
         taken = next(filter(self.exists, folders), "")
+        # Git may store each branch as a file, so that a branch ``a`` takes the folder of ``a/b``
         if not taken:
             return None
         return PushDenied(
@@ -172,7 +157,7 @@ class ProposalBranches:
             references.create(reference, commit)
 
     def message(self, commit: str) -> str:
-        """Return a commit's message; empty if this repository lacks the commit."""
+        """Return a commit's message, empty if this repository lacks the commit."""
         try:
             return commit_of(self._repository.objects, commit).message
         except StateRepoError:
@@ -183,17 +168,15 @@ class ProposalBranches:
     ) -> bool:
         """Return whether a proposal merges into main cleanly, and changes exactly ``files``.
 
-        Return False if this repository lacks the proposal or its base.
-
         Args:
             tip: the current commit of main.
             commit: the proposal, on top of ``base``.
             base: the commit of main that the proposal was made on.
             files: path → text of the files that the demands would change on the current main.
         """
-        if (found := self._trees(tip, commit, base, files)) is None:
+        if (compared := self._trees(tip, commit, base, files)) is None:
             return False
-        old, proposal, now, new = found
+        old, proposal, now, new = compared
         proposed = dict(trees.differences(old, proposal))
         if proposed != dict(trees.differences(now, new)):
             return False
@@ -204,12 +187,11 @@ class ProposalBranches:
     ) -> bool:
         """Return whether a proposal would book the same on the current main, leases aside.
 
-        Return True if this repository lacks the proposal or its base. The arguments are those of
-        :meth:`is_up_to_date`.
+        The arguments are those of :meth:`is_up_to_date`. Return True for an unknown proposal.
         """
-        if (found := self._trees(tip, commit, base, files)) is None:
+        if (compared := self._trees(tip, commit, base, files)) is None:
             return True
-        old, proposal, now, new = found
+        old, proposal, now, new = compared
         paths = {*ledger_files.changed_files(old, proposal), *ledger_files.changed_files(now, new)}
         pairs = (map(ledger_files.valid_claim_at, (proposal, new), (path,) * 2) for path in paths)
         return all((a and a.booked) == (b and b.booked) for a, b in pairs)
@@ -217,7 +199,6 @@ class ProposalBranches:
     def _trees(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> tuple[Tree, Tree, Tree, Tree] | None:
-        """Return the trees of base and proposal, and those that they would be now, if known."""
         objects = self._repository.objects
         try:
             old, proposal = commit_of(objects, base).tree, commit_of(objects, commit).tree
@@ -227,30 +208,21 @@ class ProposalBranches:
         return old, proposal, now, objects[trees.write(self._repository.new, now, files)].peel(Tree)
 
 
-def _link(output: str) -> str:
-    """Return the address of the merge request that GitLab prints, or an empty text."""
-    lines = [line for line in output.splitlines() if line.startswith("remote:")]
-    links = [found[0] for line in lines if (found := _LINK.search(line))]
-    return next((link for link in links if "/merge_requests/" in link), "")
-
-
 @dataclass(frozen=True, slots=True)
 class PendingProposal:
-    """A proposal that awaits approval, with data from the messages of its commits.
-
-    ``commit`` is the newest commit of the branch, perhaps by a person. ``since`` is the time when
-    the first demand was received. ``required_by`` is what requires approval. ``replaces`` has the
-    branch and the commit where the demand waited before it was changed.
-    """
+    """A proposal that awaits approval, with data from the messages of its commits."""
 
     branch: str
+    # the newest of the branch, perhaps by a person
     commit: str
     summary: str
+    # when the first demand was received
     since: datetime
     requesters: tuple[str, ...]
     demands: tuple[str, ...]
     operations: tuple[str, ...]
     required_by: tuple[str, ...] = ()
+    # the branch and the commit where the demand waited before it was changed
     replaces: tuple[str, ...] = ()
 
     def require(self, commit: str) -> None:
@@ -277,14 +249,13 @@ def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
     for name in sorted(name for name in repo.references if name.startswith(space)):
         try:
             head = repo.references[name].resolve().target
-            found = list(commit_log.commits(repo, head, main))
+            commits = list(commit_log.commits(repo, head, main))
         except (KeyError, ValueError, TypeError, GitError, StateRepoError):
             _warn_of_unreadable(name)
             continue
-        proposed = [pair for pair in found if commit_log.PROPOSAL in pair[1].trailers]
-        if not proposed:
+        entries = [entry for _, entry in commits if commit_log.PROPOSAL in entry.trailers]
+        if not entries:
             continue
-        entries = [entry for _, entry in proposed]
         yield PendingProposal(
             branch=f"{PREFIX}{name.removeprefix(space)}",
             commit=str(head),

@@ -10,13 +10,13 @@ from pathlib import Path
 from typing import IO
 
 from demandops.errors import StateRepoError
+from demandops.staterepo.git.new_objects import sync_folder
 from demandops.staterepo.write.journal import (
     DamagedJournal,
     Journal,
     JournalEntry,
     read,
     readable_entries,
-    sync_folder,
 )
 
 _MAX_SLOTS = 256
@@ -31,13 +31,7 @@ class Slot:
     """
 
     def __init__(self, root: Path) -> None:
-        """Take a slot below ``root``.
-
-        Raises:
-            StateRepoError: ``root`` cannot be made or has no free slot, or a journal is damaged or
-                cannot be written.
-            OSError: the slot's folder cannot be used.
-        """
+        """Take a slot below ``root``; raise StateRepoError, or OSError about the slot's folder."""
         try:
             root.mkdir(parents=True, exist_ok=True, mode=0o700)
         except OSError as error:
@@ -55,42 +49,33 @@ class Slot:
             raise StateRepoError(f"{_MAX_SLOTS} processes already use {root}; stop some of them")
         try:
             self.journal = Journal(self.folder / _JOURNAL)
-            self._adopt_orphans(root)
+            # Take over the journals of dead processes. Each entry is written here before the old
+            # journal is removed. If a crash in between leaves the entry in both journals, it still
+            # counts once, because its operation id is the same.
+            for journal in sorted(root.glob(f"slot-*/{_JOURNAL}")):
+                lock = _lock(journal.parent) if journal.parent != self.folder else None
+                if lock is not None:
+                    with lock:
+                        self.journal.append(read(journal).values())
+                        journal.unlink()
         except BaseException:
             self._lock.close()
             raise
 
-    def _adopt_orphans(self, root: Path) -> None:
-        """Take over the journals of dead processes.
-
-        Each entry is written to this process's journal before the old journal is removed. If a
-        crash in between leaves the entry in both journals, the entry still counts once, because its
-        operation id is the same.
-        """
-        for journal in sorted(root.glob(f"slot-*/{_JOURNAL}")):
-            lock = _lock(journal.parent) if journal.parent != self.folder else None
-            if lock is not None:
-                with lock:
-                    self.journal.append(read(journal).values())
-                    journal.unlink()
-
     def close(self) -> None:
-        """Close the journal and release the slot."""
         self.journal.close()
         self._lock.close()
 
 
 @dataclass(frozen=True, slots=True)
 class FoundJournal:
-    """A journal on this machine, and its demands that are not done.
-
-    If the journal is damaged, ``demands`` has only those that can be read. ``damage`` is the error
-    of reading the journal, or empty. ``set_aside`` is the file's new path if the file was renamed.
-    """
+    """A journal on this machine, and its demands that are not done and can be read."""
 
     file: Path
     demands: list[JournalEntry]
+    # the error of reading the journal, if any
     damage: str = ""
+    # the file's new path, if it was renamed
     set_aside: Path | None = None
 
 
@@ -98,7 +83,6 @@ def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[Fou
     """Yield the journals in a data folder that have demands or are damaged.
 
     If ``set_aside`` is true, each damaged journal is renamed, unless a running process uses it.
-    Raises StateRepoError if a journal cannot be read.
     """
     for file in sorted(root.glob(f"slot-*/{_JOURNAL}")):
         try:
@@ -121,6 +105,7 @@ def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[Fou
 def _lock(folder: Path) -> IO[str] | None:
     folder.mkdir(exist_ok=True, mode=0o700)
     handle = (folder / "lock").open("w")
+    # the kernel releases this lock when the process dies in any way
     try:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
