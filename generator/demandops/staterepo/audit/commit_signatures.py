@@ -14,17 +14,13 @@ from demandops.staterepo.history.commit_log import entry_of
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return the verdicts, each with the result of checking its commit's signature.
-
-    Only commits by the generator are checked. If a required signature is missing or not valid,
-    ``holds`` of the verdict is false.
-    """
-    found = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
+    """Return the verdicts; one of a generator's commit fails if it lacks a required signature."""
+    pairs = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
     checks = allowed_signers.checks(
-        repo, [commit for _, commit in found if entry_of(commit).by_generator]
+        repo, [commit for _, commit in pairs if entry_of(commit).by_generator]
     )
     signed = []
-    for verdict, commit in found:
+    for verdict, commit in pairs:
         check = checks.get(verdict.commit, allowed_signers.Check())
         signed.append(
             replace(

@@ -26,8 +26,9 @@ from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.load import ledger_files
 
 _OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
+# Operations that may record or forget recent shutdowns.
 _RECORDING = ("shutdown", "join", "rollback")
-"""Operations that may record or forget recent shutdowns."""
+# The folders of the ledger that have records, such as recent shutdowns, instead of claims.
 _RECORDS = tuple(
     f"{root}/"
     for root in (
@@ -36,11 +37,10 @@ _RECORDS = tuple(
         kept_replicas.REPLICAS_ROOT,
     )
 )
-"""The folders of the ledger that have records, such as recent shutdowns, instead of claims."""
+# Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
-"""Operations that may rewrite a claim, to start its lease or to change its schema."""
+# Operations that may add or remove the marker of an ended override.
 _ENDING = ("follow", "upgrade", "expire-override")
-"""Operations that may add or remove the marker of an ended override."""
 
 
 def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
@@ -48,12 +48,14 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
 
     These are files that people write, claims of demands that the message does not name, claims in
     another format than the generator's, and records that the commit's operation must not change.
-    The first commit may change everything, and an upgrade also ``demandops.yaml``.
     """
-    if not commit.parents:
+    if not commit.parents:  # `demandops init` writes everything
         return
     before, operation = commit.parents[0].tree, entry.first("Operation")
-    named = _claims_named_by(entry)
+    demands = {*entry.trailers.get("Demand-Id", ())}
+    for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
+        demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
+    named = {f"{claim_file.segment(demand)}.yaml" for demand in demands}
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
         if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
@@ -72,17 +74,10 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
             yield path
 
 
-def _claims_named_by(entry: LogEntry) -> set[str]:
-    demands = {*entry.trailers.get("Demand-Id", ())}
-    for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
-        demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
-    return {f"{claim_file.segment(demand)}.yaml" for demand in demands}
-
-
 def _only_rewrites(commit: Commit, path: str) -> bool:
     """Return whether a commit changed at most the schema of a claim and the start of its lease."""
     before, after = (
-        ledger_files.valid_claim_at(one.tree, path) for one in (commit.parents[0], commit)
+        ledger_files.valid_claim_at(tree, path) for tree in (commit.parents[0].tree, commit.tree)
     )
     if before is None or after is None:
         return False
@@ -101,7 +96,6 @@ def _is_canonical(commit: Commit, path: str) -> bool:
 
 
 def _may_record(commit: Commit, path: str, operation: str) -> bool:
-    """Return whether an operation may write or remove the record at ``path``."""
     text = trees.read_text(commit.tree, path) or ""
     if path.startswith(f"{ended_override_file.MARKERS_ROOT}/"):
         return operation in _ENDING and (not text or bool(ended_override_file.read({path: text})))

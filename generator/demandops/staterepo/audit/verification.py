@@ -44,62 +44,49 @@ _CHARTS = "/_charts/"
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The result of verifying one commit.
-
-    ``holds`` is true if no fault was found, also in a commit that was skipped. ``skipped`` is the
-    reason why the commit was not rendered again, or empty. ``fault`` is the error of reading or
-    rendering the commit again, or empty. ``differing`` lists the generated files that differ from
-    the rendered ones. ``touched`` lists the files that the commit changed, but was not allowed to
-    change. ``signed`` is true if the commit has a signature, valid or not. ``signature`` is the
-    reason why a required signature is not valid, or empty. ``signer`` names who signed the commit,
-    if a signature is required and valid; otherwise it is empty.
-    """
+    """The result of verifying one commit."""
 
     commit: str
     summary: str
+    # whether no fault was found, also in a commit that was skipped
     holds: bool
+    # why the commit was not rendered again
     skipped: str = ""
+    # the error of reading or rendering the commit again
     fault: str = ""
+    # the generated files that differ from the rendered ones
     differing: tuple[str, ...] = ()
+    # the files that the commit changed, but was not allowed to change
     touched: tuple[str, ...] = ()
+    # whether the commit has a signature, valid or not
     signed: bool = False
+    # who signed, if a signature is required and valid; else why it is not
     signer: str = ""
     signature: str = ""
 
 
 class _Proof:
-    """The files that a commit should have, rendered again to compare with its committed files.
-
-    For a later commit, :meth:`advance` renders only the releases that the commit affects.
-    """
+    """The files that a commit should have, rendered again to compare with its committed files."""
 
     def __init__(self, state: State, commit: Commit) -> None:
         self.state, self._commit = state, commit
         self._plan = TracedPlan(state.config)
         self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
+        # with an override that sets ``hold``: such a file's text depends on the parent commit
         self._held: dict[ReleaseKey, Release] = {}
-        """The releases with an override that sets ``hold``.
-
-        The text of such a release's file depends on the parent commit.
-        """
         base_files = manifests.base_files(state.config)
         self._undemanded = {path: _blob(text) for path, text in base_files.items()}
         self._committed = _generated_files(commit.tree)
         self._render(())
 
     def can_advance_to(self, commit: Commit) -> bool:
-        """Return whether :meth:`advance` can go to a later commit.
-
-        It cannot if the configuration, the problem report or a marker of an ended override differs.
-        """
+        # The configuration and ended overrides may affect all releases. With a problem report, some
+        # files are not in effect.
         roots = (*CONFIG_ROOTS, NOTES_ROOT, ended_override_file.MARKERS_ROOT)
         return not trees.differ(self._commit.tree, commit.tree, roots)
 
     def advance(self, commit: Commit) -> None:
-        """Advance to a later commit, and render the releases that its changes affect.
-
-        Raises _Unreadable if a changed claim file is not valid.
-        """
+        """Advance to a later commit, and render only the releases that its changes affect."""
         before, after = self._commit.tree, commit.tree
         try:
             changes = [
@@ -122,11 +109,7 @@ class _Proof:
         self._render(changes, kept)
 
     def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
-        """Plan and render the releases that ``changes`` or ``kept`` affect.
-
-        ``kept`` lists the service instances whose kept replicas changed. Releases with an override
-        that sets ``hold`` are always rendered again.
-        """
+        """Render what changed claims, or changed kept replicas of instances, affect."""
         for key, release in self._plan.advance(self.state.ledger, changes, kept).items():
             self._planned.pop(key, None)
             self._held.pop(key, None)
@@ -159,16 +142,7 @@ class _Proof:
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
-    """Yield a verdict on each of ``commits``.
-
-    Args:
-        repo: the repository.
-        commits: the commits to verify, oldest first.
-        whole: whether all commits are verified whole; otherwise most are verified by differences.
-
-    Raises:
-        StateRepoError: the repository lacks one of the commits.
-    """
+    """Yield a verdict on each of ``commits``, whose oldest is first."""
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
@@ -181,7 +155,11 @@ def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> 
         before, proof = proof, None  # proof stays None if the commit cannot be read
         try:
             if whole or place == len(commits) or entry.first("In-Force"):
-                differing = _differing_whole(commit, _loaded(repo, entry))
+                state = _loaded(repo, entry)
+                parent = trees.parent_tree(commit) if _holds(state) else None
+                held = trees.texts(parent, GENERATED_ROOTS) if parent is not None else {}
+                wanted = {path: _blob(t) for path, t in rendered_files(state, held).items()}
+                differing = _differing(wanted, _generated_files(commit.tree))
             else:
                 if before is not None and before.can_advance_to(commit):
                     before.advance(commit)
@@ -212,14 +190,6 @@ def _loaded(repo: Repository, entry: LogEntry) -> State:
         raise _Unreadable(error.faults[0]) from None
 
 
-def _differing_whole(commit: Commit, state: State) -> tuple[str, ...]:
-    """Render all generated files of a commit, and return the paths at which the commit differs."""
-    before = trees.parent_tree(commit) if _holds(state) else None
-    held = trees.texts(before, GENERATED_ROOTS) if before is not None else {}
-    wanted = {path: _blob(text) for path, text in rendered_files(state, held).items()}
-    return _differing(wanted, _generated_files(commit.tree))
-
-
 def _differing(wanted: Mapping[str, Oid], committed: Mapping[str, Oid]) -> tuple[str, ...]:
     return tuple(
         path
@@ -242,7 +212,7 @@ def _holds(world: World) -> bool:
 
 
 def _generated_files(tree: Tree) -> dict[str, Oid]:
-    return {path: found.id for path, found in trees.entries(tree, GENERATED_ROOTS)}
+    return {path: child.id for path, child in trees.entries(tree, GENERATED_ROOTS)}
 
 
 def _blob(text: str) -> Oid:

@@ -31,7 +31,8 @@ def _confine(seconds: int) -> None:
         with suppress(ValueError, OSError):
             resource.setrlimit(limit, (allowed, allowed))
     unshare = getattr(ctypes.CDLL(None), "unshare", None)
-    # Some kernels and containers allow neither; then the program's own settings must do.
+    # A user without rights may make a network namespace only in a user namespace of its own. Some
+    # kernels and containers allow neither; then the program's own settings must do.
     if unshare and unshare(_NEW_USER | _NEW_NETWORK):
         unshare(_NEW_NETWORK)
 

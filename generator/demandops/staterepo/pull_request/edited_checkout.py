@@ -40,44 +40,29 @@ _SHALLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    """The commit that an edit started from, and its files.
-
-    ``state`` is the state in effect at this commit, or None if there never was a valid state.
-    """
+    """The commit that an edit started from, and its files."""
 
     commit: str
     files: Mapping[str, str]
+    # in effect at this commit, with last valid versions; None if there never was a valid state
     state: State | None
+    # whether all files of the commit are valid
     valid: bool
-    """Whether all files of the commit are valid.
-
-    If a file is not valid, ``state`` has its last valid version, if there ever was one.
-    """
+    # the merge target as git names it, such as ``origin/main``, if there is one
     target: str = ""
-    """The merge target as git names it, such as ``origin/main``; empty if there is none."""
+    # how many commits of the merge target the checkout lacks
     newer: int = 0
-    """How many commits of the merge target the checkout lacks."""
+    # the merge target's generated files, if the checkout lacks commits of it
     merged: Mapping[str, str] = field(default_factory=dict)
-    """The merge target's generated files, if the target has commits that the checkout lacks.
-
-    Otherwise it is empty.
-    """
 
     def releases(self) -> dict[ReleaseKey, Release]:
-        """Return the releases of ``state``."""
         return merge_preview.planned_releases(self.state) if self.state else {}
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
-    """Return the state repo's files as path → text, and a fault for each entry that is not read.
-
-    Only plain files inside of the folder are read: no links, devices or pipes, and nothing of a
-    repository in the repository. No other code of the check reads the checkout.
-
-    Raises:
-        StateRepoError: the folder is not a checked-out state repo; or a file cannot be read; or the
-            files are too many or too large.
-    """
+    """Return the state repo's files as path → text, and a fault for each entry that is not read."""
+    # The author of a pull request may be hostile, so only plain files inside of the folder are
+    # read, and no other code of the check reads the checkout.
     if not os.path.lexists(folder / "demandops.yaml"):  # is_file follows a link, and may fail
         if (folder / "HEAD").is_file():
             raise StateRepoError(
@@ -96,7 +81,7 @@ def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
         name = os.fsencode(parts).decode("utf-8", "backslashreplace")
         try:
             status = path.lstat()
-            if message := _refused(path.name, len(parts.parts), status):
+            if message := _why_not_read(path.name, len(parts.parts), status):
                 faults.append(fault("", message).within(name))
             elif stat.S_ISDIR(status.st_mode):
                 waiting += sorted(path.iterdir(), reverse=True)
@@ -115,13 +100,12 @@ def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:
     return files, faults
 
 
-def _refused(name: str, depth: int, status: os.stat_result) -> str:
-    """Return why an entry of a checkout is not read; empty if it is."""
+def _why_not_read(name: str, depth: int, status: os.stat_result) -> str:
     if stat.S_ISLNK(status.st_mode):  # it may point to a file that the report must not show
         return "is a symbolic link, which is not followed; replace it by a file"
     if not (stat.S_ISDIR(status.st_mode) or stat.S_ISREG(status.st_mode)):
         return "is neither a file nor a folder; remove it"
-    if name.lower() == ".git":
+    if name.lower() == ".git":  # some file systems do not tell .GIT from .git
         return "belongs to another Git repository, whose files are not read; remove it"
     if stat.S_ISDIR(status.st_mode):
         deep = f"is more than {trees.MAX_DEPTH} folders deep; move it up"
@@ -131,19 +115,10 @@ def _refused(name: str, depth: int, status: os.stat_result) -> str:
 
 
 def base_of(folder: Path, revision: str | None) -> Base | None:
-    """Return the commit that an edit is compared with, or None.
+    """Return the commit that an edit is compared with, if the folder is a checkout with a commit.
 
-    None means that the folder is not a Git checkout, or has no commit yet.
-
-    Args:
-        folder: the checkout.
-        revision: the merge target; by default ``origin/main``, else ``main``. If there is neither,
-            the edit is compared with HEAD.
-
-    Raises:
-        StateRepoError: there is no such commit, or it has no ancestor in common with HEAD; or Git
-            cannot open the checkout; or the checkout lacks files or commits; or ``revision`` is
-            given, but the folder is not a Git checkout.
+    ``revision`` is the merge target; by default ``origin/main``, else ``main``. If there is
+    neither, the edit is compared with HEAD.
     """
     try:
         repo = Repository(str(folder))
@@ -161,27 +136,20 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
     if repo.is_empty or repo.head_is_unborn:
         return None
     with reading(str(folder), repo):
-        return _base_in(repo, revision)
-
-
-def _base_in(repo: Repository, revision: str | None) -> Base:
-    target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
-    tip = _tip_of(repo, target) if target else None
-    commit = _started_from(repo, target, tip)
-    base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
-    if tip is not None:
-        _, newer = repo.ahead_behind(repo.head.peel(Commit).id, tip.id)
-        merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
-        base = replace(base, target=_short(target), newer=newer, merged=merged)
-    try:
-        snapshot = state_in_effect.state_at(repo, commit.id)
-    except (InvalidInput, StateRepoError):
-        return base
-    return replace(base, state=snapshot.state, valid=not snapshot.problems)
-
-
-def _short(reference: str) -> str:
-    return reference.removeprefix("refs/remotes/").removeprefix("refs/heads/")
+        target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
+        tip = _tip_of(repo, target) if target else None
+        commit = _started_from(repo, target, tip)
+        base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
+        if tip is not None:
+            _, newer = repo.ahead_behind(repo.head.peel(Commit).id, tip.id)
+            merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
+            name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
+            base = replace(base, target=name, newer=newer, merged=merged)
+        try:
+            snapshot = state_in_effect.state_at(repo, commit.id)
+        except (InvalidInput, StateRepoError):
+            return base
+        return replace(base, state=snapshot.state, valid=not snapshot.problems)
 
 
 def _tip_of(repo: Repository, target: str) -> Commit:
@@ -213,7 +181,7 @@ def _started_from(repo: Repository, target: str, tip: Commit | None) -> Commit:
 
 
 def author_of(folder: Path) -> str:
-    """Return the name of the checked-out commit's author; empty if no commit is checked out."""
+    """Return the name of the checked-out commit's author, if one is checked out."""
     try:
         repo = Repository(str(folder))
         return str(repo.head.peel(Commit).author.name)

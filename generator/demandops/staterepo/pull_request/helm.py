@@ -21,8 +21,8 @@ from demandops.quoting import quoted
 from demandops.staterepo.git import child_processes
 from demandops.staterepo.pull_request import confined
 
+# The environment variable that names the program, instead of ``helm`` on ``PATH``.
 HELM_BIN = "HELM_BIN"
-"""The environment variable that names the program, instead of ``helm`` on ``PATH``."""
 
 # helm renders a chart in a tenth of a second. The limit of processor time ends a chart that loops,
 # also on a busy machine; the other one ends a helm that waits.
@@ -43,14 +43,13 @@ _PLACE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Helm's output for a chart: API group and kind of each rendered object; faults; warnings.
+    """Helm's output for a chart."""
 
-    ``ended`` is False if helm was stopped because of its limits.
-    """
-
+    # API group and kind of each rendered object
     kinds: tuple[tuple[str, str], ...] = ()
     faults: tuple[Fault, ...] = ()
     warnings: tuple[Fault, ...] = ()
+    # not, if helm was stopped because of its limits
     ended: bool = True
 
 
@@ -62,20 +61,15 @@ class Helm:
 
     @staticmethod
     def find() -> Helm | None:
-        """Return the program that ``HELM_BIN`` names, or None if there is none.
-
-        If ``HELM_BIN`` is not set, return ``helm`` on ``PATH``.
-        """
         program = shutil.which(os.environ.get(HELM_BIN) or "helm")
         return Helm(str(Path(program).absolute())) if program else None
 
     def lint(self, chart: Path, values: Path, home: Path) -> Report:
-        """Return the faults and warnings of ``helm lint``."""
         code, out, err = self._run(home, "lint", str(chart), f"--values={values}")
-        found = parsed_lint(out[:_MOST_LINT], chart.name)
-        if code != 0 and not found.faults:
+        report = parsed_lint(out[:_MOST_LINT], chart.name)
+        if code != 0 and not report.faults:
             return Report(faults=(parsed_error(err or out, chart.name),), ended=code > 0)
-        return found
+        return report
 
     def template(
         self, chart: Path, values: Path, home: Path, release: str, namespace: str
@@ -102,6 +96,7 @@ class Helm:
             **child_processes.mark(),
         }
         command = [sys.executable, "-IS", confined.__file__, str(_CPU_SECONDS), self.program]
+        # files, because a pipe would keep in memory whatever a hostile chart prints
         files = home / "out", home / "err"
         with files[0].open("wb") as out, files[1].open("wb") as err:
             try:
@@ -143,26 +138,23 @@ def parsed_lint(out: str, chart: str) -> Report:
 
     A fault whose template helm does not name is located at ``chart``, the chart's folder.
     """
-    found: dict[str, list[Fault]] = {"ERROR": [], "WARNING": []}
+    by_level: dict[str, list[Fault]] = {"ERROR": [], "WARNING": []}
     for entry in re.split(r"\n(?=\[|\n)", out):
         match = _LINT.match(entry.strip())
         if match:
-            found[match["level"]].append(_fault(entry.strip()[match.start("text") :], chart))
-    return Report(faults=tuple(found["ERROR"]), warnings=tuple(found["WARNING"]))
+            by_level[match["level"]].append(_fault(entry.strip()[match.start("text") :], chart))
+    return Report(faults=tuple(by_level["ERROR"]), warnings=tuple(by_level["WARNING"]))
 
 
 def parsed_error(err: str, chart: str) -> Fault:
-    """Return helm's error message as a fault, located at the last template and line in it.
-
-    If helm names no template, the fault is located at ``chart``.
-    """
+    """Return helm's error message as a fault at the last template in it, else at ``chart``."""
     text = err.partition("Error: ")[2] or err
     return _fault(text.partition("\n\nUse --debug")[0].strip(), chart)
 
 
 def _fault(text: str, chart: str) -> Fault:
     text = text[:_MOST_MESSAGE]
-    places = [*_PLACE.finditer(text)]
+    places = [*_PLACE.finditer(text)]  # helm names first who includes, and last what is at fault
     place = places[-1] if places else None
     file = place["path"] if place else chart
     line = int(place["line"]) if place and place["line"] else None

@@ -60,7 +60,9 @@ def effects_of(
     is_service = isinstance(release, ServiceRelease)
     if isinstance(release, ServiceRelease):
         images = [(config.images[name].repository, name) for name in release.images]
-        names = {one: name for one, name in images if [each for each, _ in images].count(one) == 1}
+        # a repository of two images does not tell which of them an edit means
+        repositories = [repository for repository, _ in images]
+        names = {repo: name for repo, name in images if repositories.count(repo) == 1}
         for path in _VALUES:
             was, now = _take(old, path), _take(new, path)
             if isinstance(was, dict) and isinstance(now, dict):
@@ -90,7 +92,7 @@ def effects_of(
 
 
 def _take(documents: list[Any], path: tuple[str, ...]) -> Any:  # noqa: ANN401
-    """Remove what is at a path of the first document, and return it; None if it is missing."""
+    """Remove what is at a path of the first document, and return it."""
     part = documents[0] if documents else None
     for key in path[:-1]:
         part = part.get(key) if isinstance(part, dict) else None

@@ -53,17 +53,16 @@ _MOST_LEFT = 5
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """A suggested override that replaces the manual edit of a generated file.
+    """A suggested override that replaces the manual edit of a generated file."""
 
-    ``instead_of`` is the path of the edited file. ``file`` is the path of the override, ``text``
-    its content. ``not_covered`` lists the parts of the edit that the override leaves out.
-    ``other_releases`` lists the other releases to which the override also applies.
-    """
-
+    # the path of the edited file
     instead_of: str
+    # path and content of the override
     file: str
     text: str
+    # the parts of the edit that the override leaves out
     not_covered: tuple[str, ...]
+    # the other releases to which the override also applies
     other_releases: tuple[str, ...]
 
 
@@ -71,26 +70,23 @@ class Suggestion:
 class CheckResult:
     """The result of checking a checkout before it is merged.
 
-    ``base`` is the commit that the checkout is compared with, if any. If ``base_valid`` is False,
-    that commit has files that are not valid, and their last valid versions are compared instead.
-    ``preview`` and ``bookkeeping`` show what the merge changes. Both are None if the configuration
-    is not valid or the desired state cannot be rendered. Claims that are not valid are left out of
-    both. ``bookkeeping`` is also None if the bookkeeping of ``base`` is not known, and empty if
-    there is no ``base``.
-
-    ``target`` is the name of the merge target, and ``newer`` counts the commits that it has and the
-    checkout lacks. ``warnings`` point out likely mistakes and what a person has to do after the
-    merge.
+    What the merge changes leaves out claims that are not valid. It is None if the configuration is
+    not valid or the desired state cannot be rendered.
     """
 
     faults: tuple[Fault, ...]
     suggestions: tuple[Suggestion, ...] = ()
     preview: MergePreview | None = None
+    # also None if the base's bookkeeping is not known; empty if there is no base
     bookkeeping: tuple[EntryChange, ...] | None = None
+    # the commit that the checkout is compared with
     base: str | None = None
+    # if not, the last valid versions of its files are compared
     base_valid: bool = True
+    # the name of the merge target, and how many commits it has that the checkout lacks
     target: str = ""
     newer: int = 0
+    # likely mistakes, and what a person has to do after the merge
     warnings: tuple[Fault, ...] = ()
     charts: RenderedCharts | None = None
 
@@ -112,10 +108,6 @@ def check(
         now: the time of the check, by default the current time. Overrides that ended before this
             time do not apply.
         require_helm: whether a missing helm is a fault.
-
-    Raises:
-        StateRepoError: the folder is not a state repo; or Git cannot open it; or it lacks files or
-            commits; or ``base`` is not a commit that has an ancestor in common with HEAD.
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
@@ -151,10 +143,15 @@ def check(
         charts = rendered_charts.render_charts(
             state,
             edit.changed if start else None,
-            {each.path for each in preview.files},
+            {file.path for file in preview.files},
         )
-        faults += [*charts.faults, *(_helm_is_missing(charts) if require_helm else ())]
+        faults += charts.faults
+        if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
+            faults.append(fault("", rendered_charts.NO_HELM))
         idle = override_report.warnings(override_report.override_report(state, edit.now))
+        # a topic that was lacking before is not of this edit
+        old = missing_inputs(start.state) if start and start.state else ()
+        lacking = {(topic.application, topic.reason) for topic in old}
         result = replace(
             result,
             preview=preview,
@@ -166,7 +163,11 @@ def check(
                 *unmatched_patterns.warnings(state.config),
                 *misspelled_topics.warnings(state),
                 *edit.changed_bootstraps(wanted),
-                *_newly_missing(start, state),
+                *(
+                    topic.warning
+                    for topic in missing_inputs(state)
+                    if (topic.application, topic.reason) not in lacking
+                ),
                 *charts.warnings,
             ),
         )
@@ -188,23 +189,6 @@ def check(
     )
 
 
-def _helm_is_missing(charts: RenderedCharts) -> Iterator[Fault]:
-    if rendered_charts.MISSING in charts.not_rendered.values():
-        yield fault("", rendered_charts.NO_HELM)
-
-
-def _newly_missing(start: Base | None, state: State) -> Iterator[Fault]:
-    """Yield a warning for each topic that an application lacks only after the merge.
-
-    If the state before the merge is not known, yield one for each topic that is lacking.
-    """
-    old = start.state if start else None
-    known = {(one.application, one.reason) for one in missing_inputs(old)} if old else set()
-    for one in missing_inputs(state):
-        if (one.application, one.reason) not in known:
-            yield one.warning
-
-
 def _generated(path: str) -> bool:
     return path.split("/", maxsplit=1)[0] in GENERATED_ROOTS
 
@@ -224,7 +208,7 @@ def _suggestions(
 ) -> dict[str, Suggestion]:
     """Return the overrides that replace manual edits, each by the path of the edited file."""
     releases = {path_of(release): release for release in start.releases().values()}
-    found, taken = dict[str, Suggestion](), set(files)
+    suggestions, taken = dict[str, Suggestion](), set(files)
     for path in edited:
         release, before, after = releases.get(path), start.files.get(path), files.get(path)
         if start.state is None or release is None or before is None or after is None:
@@ -235,10 +219,10 @@ def _suggestions(
         names = chain([release.name], (f"{release.name}-{number}" for number in count(2)))
         file = next(f for name in names if (f := f"{OVERRIDES_ROOT}/{name}.yaml") not in taken)
         taken.add(file)
-        others = [one.name for one in releases.values() if manual_edits.also_applies(release, one)]
+        others = [r.name for r in releases.values() if manual_edits.also_applies(release, r)]
         text = manual_edits.override_text(effects, release, owner)
-        found[path] = Suggestion(path, file, text, tuple(left), tuple(sorted(others)))
-    return found
+        suggestions[path] = Suggestion(path, file, text, tuple(left), tuple(sorted(others)))
+    return suggestions
 
 
 def _remedy(path: str, before: str | None, after: str | None, suggestion: Suggestion | None) -> str:
@@ -290,10 +274,6 @@ class _Edit:
 
     @property
     def before(self) -> Mapping[str, str]:
-        """The files at the commit that the edit started from.
-
-        If this commit is not known, the edited files.
-        """
         return self.start.files if self.start else self.files
 
     @property
@@ -303,7 +283,6 @@ class _Edit:
 
     @property
     def generated_before(self) -> dict[str, str]:
-        """The generated files in :attr:`before`, without READMEs."""
         return {
             path: text
             for path, text in self.before.items()
@@ -311,24 +290,17 @@ class _Edit:
         }
 
     def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
-        """Return the generated files before the merge, as path → text.
-
-        ``wanted`` has the generated files after the merge. At paths where the merge target already
-        equals ``wanted``, the result equals ``wanted`` too. At all other paths, the result is as at
-        the commit that the edit started from.
-        """
-        found, there = self.generated_before, self.start.merged if self.start else {}
-        for path in {*there, *found} if there else ():
-            if there.get(path) == wanted.get(path):
-                found.pop(path, None)
-                found |= {path: wanted[path]} if path in wanted else {}
-        return found
+        """Return the generated files before the merge, which makes those in ``wanted`` of them."""
+        files, merged = self.generated_before, self.start.merged if self.start else {}
+        for path in {*merged, *files} if merged else ():
+            # what the merge target has already is no effect of this merge
+            if merged.get(path) == wanted.get(path):
+                files.pop(path, None)
+                files |= {path: wanted[path]} if path in wanted else {}
+        return files
 
     def config(self) -> Config:
-        """Return the edited configuration.
-
-        Raises InvalidInput if it is not valid, or has an older render version.
-        """
+        """Return the edited configuration, or raise InvalidInput."""
         files = {p: text for p, text in self.files.items() if p.split("/")[0] in CONFIG_ROOTS}
         config = load(files)
         version = config.repo_settings.render_version
@@ -342,10 +314,7 @@ class _Edit:
         return config
 
     def merged_state(self, config: Config, ledger: Ledger) -> State:
-        """Return the state that the generator reaches after the edit is merged.
-
-        Raises InvalidInput if the configuration cannot be rendered.
-        """
+        """Return the state that the generator reaches after the merge, or raise InvalidInput."""
         root = f"{ended_override_file.MARKERS_ROOT}/"
         markers = {path: text for path, text in self.files.items() if path.startswith(root)}
         ended = ended_override_file.read(markers)
@@ -353,7 +322,7 @@ class _Edit:
         kept = {path: text for path, text in self.files.items() if path.startswith(root)}
         ledger = replace(ledger, kept=kept_replicas.read_all(kept))
         expired = expired_overrides(World(config, replace(ledger, ended=ended)), self.now)
-        ended |= {one.name: format_time(one.end) for one in expired if one.end}
+        ended |= {override.name: format_time(override.end) for override in expired if override.end}
         state = State(config, replace(ledger, ended=ended), EVALUATE)
         try_configuration(state)
         if self.start is None or self.start.state is None:
@@ -364,17 +333,14 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        """Yield the reasons why the generator would refuse claims.
-
-        Only claims that the edit adds or changes are checked. If the state before the edit is not
-        known, none is checked.
-        """
+        """Yield the reasons why the generator would refuse claims that the edit changes."""
         old = self.start.state if self.start else None
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
-            found = changes_on(old.ledger, state.ledger, subjects)
-            paths = {claim_file.path_of(one.key): one for one in found if one.after}
-            written = {path: one for path, one in paths.items() if path in self.files}
+            changes = changes_on(old.ledger, state.ledger, subjects)
+            by_path = {claim_file.path_of(change.key): change for change in changes if change.after}
+            # an override may change claims too, but not their files in the checkout
+            written = {path: change for path, change in by_path.items() if path in self.files}
             for path, change in written.items():
                 if path in self.before:
                     yield from ledger_files.owner_faults(change.after, path, old.ledger)
@@ -385,8 +351,8 @@ class _Edit:
         try:
             return rendered_files(state, self.generated_before)
         except InvalidInput as error:
-            found = merge_preview.render_faults(state, state.evaluate, self.changed)
-            raise InvalidInput(found or error.faults) from None
+            faults = merge_preview.render_faults(state, state.evaluate, self.changed)
+            raise InvalidInput(faults or error.faults) from None
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
         """Yield a warning for each bootstrap file that a person must apply after the merge."""
@@ -414,7 +380,7 @@ class _Edit:
         for folder, (name, source) in sorted(sources.items()):
             metadata = f"{folder}/Chart.yaml"
             folders = chart_files.folders(folder, self.files)
-            changed = sorted(path for one in folders for path in chart_files.below(one, edited))
+            changed = sorted(path for part in folders for path in chart_files.below(part, edited))
             if not changed or metadata not in self.before:
                 continue
             if _version(self.before[metadata]) == source.version:

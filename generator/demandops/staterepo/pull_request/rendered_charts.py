@@ -48,15 +48,14 @@ _MOST_SECONDS = 1800  # 5,000 releases take about 1,000 s
 class RenderedCharts:
     """Which charts helm rendered, for how many releases and examples, and the faults found.
 
-    ``rendered`` has each chart that helm tried to render, even if there were faults.
-    ``not_rendered`` maps a chart to the reason why helm could not try: helm is missing, the chart
-    is in a registry, or a dependency is missing. A chart that is not used, or whose lint or schema
-    has a fault, is in neither.
+    A chart that is not used, or whose lint or schema has a fault, is in neither of the two.
     """
 
+    # each chart that helm tried to render, even if there were faults
     rendered: tuple[str, ...] = ()
     releases: int = 0
     examples: int = 0
+    # chart → why helm could not try: helm or a dependency is missing, or the chart is in a registry
     not_rendered: Mapping[str, str] = field(default_factory=dict)
     faults: tuple[Fault, ...] = ()
     warnings: tuple[Fault, ...] = ()
@@ -80,8 +79,9 @@ def render_charts(
     for folder, pairs in by_folder.items():
         if not _concerned(folder, config, changed):
             by_folder[folder] = [pair for pair in pairs if path_of(pair[0]) in wanted]
-    for release in (one for found in trial_releases(config).values() for one in found):
-        by_folder.setdefault(release.chart.folder, []).append((release, True))
+    for examples in trial_releases(config).values():
+        for release in examples:
+            by_folder.setdefault(release.chart.folder, []).append((release, True))
     run = _Run(Helm.find(), state)
     for folder, pairs in by_folder.items():
         if pairs:
@@ -90,16 +90,12 @@ def render_charts(
 
 
 def _concerned(folder: str | None, config: Config, changed: Collection[str] | None) -> bool:
-    """Return whether an edit could affect the objects of all releases of a chart.
-
-    This is also true if the changed paths are unknown, and for charts in a registry, which are then
-    reported as not rendered.
-    """
-    if changed is None or not folder:
+    """Return whether an edit could affect the objects of all releases of a chart."""
+    if changed is None or not folder:  # a chart in a registry is reported as not rendered
         return True
     edited = sorted(changed)
     return any(
-        chart_files.below(each, edited) for each in chart_files.folders(folder, config.files)
+        chart_files.below(part, edited) for part in chart_files.folders(folder, config.files)
     )
 
 
@@ -119,10 +115,9 @@ class _Run:
 
     def result(self) -> RenderedCharts:
         if self._helm is None:
-            services = (
-                one for found in self._state.config.services.values() for one in found.values()
-            )
-            self._not_rendered = dict.fromkeys((one.chart for one in services), MISSING)
+            apps = self._state.config.services.values()
+            charts = (service.chart for services in apps for service in services.values())
+            self._not_rendered = dict.fromkeys(charts, MISSING)
         return RenderedCharts(
             tuple(sorted(self._rendered)),
             self._counts[False],
@@ -214,11 +209,11 @@ class _Run:
     def _check_libraries(self, folder: str, values: Mapping[str, Any]) -> None:
         """Check the values of the charts in ``charts/`` against their schemas, as Helm does."""
         above = chart_files.merged(chart_files.defaults(folder, self._files), values)
-        for one in chart_files.dependencies(folder, self._files):
-            own = above.get(one.alias)
-            if one.optional or not isinstance(own, dict | None):
+        for dependency in chart_files.dependencies(folder, self._files):
+            own = above.get(dependency.alias)
+            if dependency.optional or not isinstance(own, dict | None):
                 continue
-            library = one.folder or f"{folder}/charts/{one.name}"
+            library = dependency.folder or f"{folder}/charts/{dependency.name}"
             try:
                 chart_files.defaults(library, self._files)
             except InvalidInput:  # YAML that only Helm reads, for example with anchors
@@ -229,35 +224,28 @@ class _Run:
                 self._state.evaluate(
                     self._files, SchemaTask(schema, inner, f"{folder}/values.yaml")
                 )
-            if one.folder:
+            if dependency.folder:
                 self._check_libraries(library, inner)
 
     def _add(self, report: Report, folder: str, files: Mapping[str, str]) -> None:
-        """Add the faults and warnings of a report to the result.
-
-        A path in the report starts with the name of the chart. In the result, the path is that of
-        the file in the state repo.
-        """
-        for found, into in ((report.faults, self._faults), (report.warnings, self._warnings)):
-            for one in found:
-                place = one.file.partition("/")[2]
-                into[one.within(files.get(place, f"{folder}/{place}".rstrip("/")))] = None
+        """Add the faults and warnings of a report, with the paths of files in the state repo."""
+        for faults, into in ((report.faults, self._faults), (report.warnings, self._warnings)):
+            for said in faults:
+                place = said.file.partition("/")[2]  # helm's path starts with the chart's name
+                into[said.within(files.get(place, f"{folder}/{place}".rstrip("/")))] = None
 
     def _may_run(self, release: ServiceRelease) -> bool:
-        """Return whether the domain's rules allow an application that has the release's service.
-
-        A domain without rules allows every application.
-        """
-        rules, services = release.domain.rules, self._state.config.services
-        appdefs = [name for name, known in services.items() if release.key.service in known]
+        """Return whether the domain's rules allow an application that has the release's service."""
+        rules, apps = release.domain.rules, self._state.config.services
+        names = [name for name, services in apps.items() if release.key.service in services]
         return not rules or any(
-            matches(one, rule.applications) for rule in rules for one in appdefs
+            matches(name, rule.applications) for rule in rules for name in names
         )
 
     def _refused(self, report: Report, release: ServiceRelease) -> Iterator[Fault]:
         """Yield a fault for each rendered object whose kind the access domain does not allow."""
         domain = release.domain
-        allowed = {(one.group, one.kind) for one in domain.allowed_kinds}
+        allowed = {(entry.group, entry.kind) for entry in domain.allowed_kinds}
         for group, kind in report.kinds:
             if (group, kind) not in allowed:
                 file = self._state.config.file_of(DOMAINS_FILE, domain.name)
