@@ -30,7 +30,7 @@ def init(  # noqa: PLR0913 - what a state repo begins with
     schemas: Mapping[str, str] | None = None,
     signer: Signer | None = None,
 ) -> str:
-    """Make a state repo and return the id of its first commit.
+    """Make a state repo and return the id of its first commit, or make nothing.
 
     Args:
         target: the folder of the state repo; it must be empty or not exist.
@@ -39,12 +39,9 @@ def init(  # noqa: PLR0913 - what a state repo begins with
         url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
         example: whether to include the fleet and the application of the paper's experiment.
         schemas: name → JSON Schema, which is written to the folder ``schemas/``.
-        signer: signs the first commit; if None, the commit is not signed.
+        signer: signs the first commit.
 
-    Raises:
-        StateRepoError: the folder is not empty or cannot be made, or the signer failed; no state
-            repo was made.
-        InvalidInput: clusters cannot fetch from ``url``.
+    Raises InvalidInput if clusters cannot fetch from ``url``.
     """
     target = target.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):
@@ -56,6 +53,7 @@ def init(  # noqa: PLR0913 - what a state repo begins with
     content |= {f"{SCHEMAS_ROOT}/{name}.json": text for name, text in (schemas or {}).items()}
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        # so that a crash leaves no half of a state repo under the final name
         partial = target.with_name(f".{target.name}.partial")
         shutil.rmtree(partial, ignore_errors=True)
         try:

@@ -42,18 +42,14 @@ class Reader:
     """Reads a state repo at its newest commit, or a checkout at the commit that is checked out."""
 
     def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
-        """Read ``repository`` at the commit ``tip``; ``slot`` has the folder of its clone."""
         self.repository, self._tip, self._slot = repository, tip, slot
         self._objects = repository.objects
 
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
-        """Return a reader of the state repo at an address.
-
-        A URL is cloned, and the clone stays on the disk for later readers. The folder of a checkout
-        is allowed only with ``only_read``. Raises StateRepoError if the address cannot be used.
-        """
+        """Return a reader of the state repo at an address; of a checkout only if ``only_read``."""
         try:
+            # the clone of a URL stays on the disk for later readers
             slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
         except OSError as error:
             raise access_error(error, f"the data folder of {address}") from None
@@ -73,11 +69,7 @@ class Reader:
             self._slot.close()
 
     def refresh(self) -> str:
-        """Fetch and return the newest commit, and let this reader read that commit from now on.
-
-        Raises:
-            StateRepoError: if the state repo cannot be reached or read.
-        """
+        """Fetch and return the newest commit, and let this reader read that commit from now on."""
         try:
             self._tip = self.repository.refresh()
         except (pygit2.GitError, KeyError, OSError) as error:
@@ -85,11 +77,7 @@ class Reader:
         return str(self._tip)
 
     def for_another_thread(self) -> Reader:
-        """Return a new reader at the same commit, without a fetch, for use in another thread.
-
-        Raises:
-            StateRepoError: if the state repo cannot be read.
-        """
+        """Return a new reader at the same commit, without a fetch, for use in another thread."""
         other = Reader(self.repository, self._tip)
         try:
             other._objects = self.repository.reopened()
@@ -102,10 +90,7 @@ class Reader:
         last_valid_config.refuse_other_render_version(self._objects, self._tip)
 
     def commit(self, revision: str | None = None) -> str:
-        """Return the id of the commit that a revision or a time names; by default the newest.
-
-        Raises StateRepoError if there is no such commit.
-        """
+        """Return the id of the commit that a revision or a time names; by default the newest."""
         if not revision:
             return str(self._tip)
         return str(revisions.resolve(self._objects, self._tip, revision, REAL.now()).id)
@@ -128,8 +113,7 @@ class Reader:
     ) -> Snapshot:
         """Return the snapshot of a commit, with the last valid versions of invalid files.
 
-        Unlike :meth:`snapshot`, this works before a generator has quarantined the files. Raises
-        InvalidInput or StateRepoError if there never was a valid state.
+        Unlike :meth:`snapshot`, this works before a generator has quarantined the files.
         """
         try:
             return self.snapshot(revision, progress)
@@ -137,12 +121,9 @@ class Reader:
             return state_in_effect.state_at(self._objects, self.commit(revision), progress)
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        """Return :meth:`last_valid_snapshot` of the newest commit.
-
-        ``before`` is an earlier snapshot. If possible, only the changes since this snapshot are
-        read.
-        """
+        """Return :meth:`last_valid_snapshot` of the newest commit, if possible from ``before``."""
         is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
+        # only a whole look tells the last valid versions that a generator has recorded
         if before.problems or is_recorded:
             return self.last_valid_snapshot(str(self._tip))
         return state_in_effect.state_after(self._objects, before, self._tip)
@@ -152,23 +133,17 @@ class Reader:
         read = self.file_reader(revision)
         lines = FieldLines(read)
         return tuple(
-            replace(one, line=lines.of(one.file, one.field))
-            for one in problem_report.read(read(problem_report.PATH))
+            replace(problem, line=lines.of(problem.file, problem.field))
+            for problem in problem_report.read(read(problem_report.PATH))
         )
 
     def problems_of(self, snapshot: Snapshot) -> tuple[problem_report.Problem | Fault, ...]:
-        """Return the problems that the generator reports at a snapshot's commit.
-
-        If the commit has no report, return the problems that were found while loading the snapshot.
-        """
+        """Return the problems that the generator reports, else those found while loading."""
         return self.problems(str(snapshot.commit)) or snapshot.problems
 
     def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
-        """Return the paths of the generated files that a generator has yet to write or remove.
-
-        There can be such files only after a commit by a person. If the state cannot be rendered,
-        the set is empty.
-        """
+        """Return the paths of the generated files that a generator has yet to write or remove."""
+        # only a person's commit may leave such files, and rendering everything takes time
         commit = trees.commit_of(self._objects, snapshot.commit)
         if commit_log.is_by_generator(self._objects, commit):
             return frozenset()
@@ -187,11 +162,9 @@ class Reader:
         )
 
     def edited_files(self, before: str, after: Snapshot) -> list[str]:
-        """Return the files that differ between two commits and are more than demands, sorted.
-
-        Left out are claims that are new or gone, and files that are as rendered from the claims,
-        whoever committed them: anybody can commit under the generator's name.
-        """
+        """Return the files that differ between two commits and are more than demands, sorted."""
+        # Files that are as rendered from the claims are left out, whoever committed them: anybody
+        # can commit under the generator's name.
         old, new = self._tree(before), self._tree(str(after.commit))
         changed = trees.differences(old, new, settings.GENERATED_ROOTS)
         as_rendered = set[str]()
@@ -210,26 +183,19 @@ class Reader:
         return trees.commit_of(self._objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
-        """Return a function that gets a path and returns the file's text at a commit.
-
-        The function returns None if the commit has no such file.
-        """
+        """Return a function from a path to the file's text at a commit, if there is a file."""
         tree = self._tree(revision)
         return lambda path: trees.read_text(tree, path)
 
     def config(self) -> Config:
-        """Return the configuration at the newest commit.
-
-        Raises InvalidInput if it is not valid, and StateRepoError if there is none.
-        """
+        """Return the configuration at the newest commit, or raise InvalidInput."""
         return last_valid_config.config_at(self._tree())
 
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
         """Yield commits, newest first.
 
         ``spec`` is ``REV`` for the commits up to REV, ``A..B`` for those after A up to B, or None
-        for all. With ``path``, yield only the commits that changed this file or folder. Raises
-        StateRepoError if there is no such commit.
+        for all. With ``path``, yield only the commits that changed this file or folder.
         """
         since, until = self._sides(spec or "")
         if path is not None:
@@ -241,7 +207,7 @@ class Reader:
         """Return the ids of the commits that ``spec`` names, oldest first.
 
         ``spec`` is ``REV`` for one commit, ``A..B`` for the commits after A up to B, or None for
-        the newest commit. Raises StateRepoError if there is no such commit.
+        the newest commit.
         """
         since, until = self._sides(spec or "")
         if since is None:
@@ -250,7 +216,6 @@ class Reader:
         return [entry.commit for _, entry in walked][::-1]
 
     def _sides(self, spec: str) -> tuple[str | None, str]:
-        """Return the ids of A and B for ``A..B``, or None and the id of REV for ``REV``."""
         first, dots, last = spec.partition("..")
         if not dots:
             return None, self.commit(first)
@@ -265,11 +230,7 @@ class Reader:
         whole: bool = False,
         progress: Progress = lambda done, total: None,
     ) -> list[Verdict]:
-        """Return a verdict on the files and the signature of each of ``commits``.
-
-        ``commits`` are listed oldest first. With ``whole``, all files of each commit are rendered
-        again. Otherwise most commits are verified only by their differences from the one before.
-        """
+        """Return a verdict on the files and the signature of each of ``commits``, oldest first."""
         verdicts = list[Verdict]()
         for verdict in verification.verify(self._objects, commits, whole=whole):
             verdicts.append(verdict)
@@ -277,28 +238,16 @@ class Reader:
         return commit_signatures.with_signatures(self._objects, verdicts)
 
     def history(self, path: str, revision: str, most: int) -> PathHistory:
-        """Return the history of a file or folder up to a commit."""
         return commit_log.history_of(self._objects, revision, path, most)
 
     def release_path(self, name: str, revision: str) -> str | None:
-        """Return the path of a release's file; None if there was no release up to ``revision``.
-
-        If the release was stopped, return its last path.
-        """
         return commit_log.release_path(self._objects, revision, name)
 
     def stopped_release_names(self, revision: str) -> set[str]:
-        """Return the names of all releases that a commit up to ``revision`` stopped or moved.
-
-        Some of these releases may run again.
-        """
         return commit_log.stopped_release_names(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str] = ()) -> list[str]:
-        """Return the files below these folders that differ between two commits, sorted.
-
-        Without folders, these are all files.
-        """
+        """Return the files that differ between two commits, sorted, if given below ``roots``."""
         changed = trees.differences(self._tree(before), self._tree(after), roots)
         return sorted(path for path, _ in changed)
 
@@ -309,31 +258,22 @@ class Reader:
 
     def changed_roots(self, commit: str) -> tuple[str, ...]:
         """Return the top-level files and folders that a commit changed, sorted."""
-        made = trees.commit_of(self._objects, commit)
-        before = {entry.name: entry.id for entry in trees.parent_tree(made) or ()}
-        after = {entry.name: entry.id for entry in made.tree}
+        opened = trees.commit_of(self._objects, commit)
+        before = {entry.name: entry.id for entry in trees.parent_tree(opened) or ()}
+        after = {entry.name: entry.id for entry in opened.tree}
         return tuple(
             sorted(str(name) for name in {*before, *after} if before.get(name) != after.get(name))
         )
 
     def files_changed_by(self, commit: str) -> list[str]:
-        """Return the files that a commit changed, sorted."""
-        made = trees.commit_of(self._objects, commit)
-        return sorted(path for path, _ in trees.differences(trees.parent_tree(made), made.tree))
+        after = trees.commit_of(self._objects, commit)
+        return sorted(path for path, _ in trees.differences(trees.parent_tree(after), after.tree))
 
     def changes_node(self, commit: str, node: str) -> bool:
-        """Return whether a commit changed a release on a node, or a claim that names the node.
-
-        For the first commit of the state repo, return false.
-        """
         return ledger_files.changes_node(self._objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
-        """Return the commits by people whose changes the generator's commit ``entry`` renders.
-
-        The list has the newest ``most`` commits, newest first. It is empty if ``entry`` does not
-        render changes by people.
-        """
+        """Return the newest commits by people that the generator's commit ``entry`` renders."""
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (entry.by_generator and since and follows):
             return []
@@ -341,24 +281,15 @@ class Reader:
         return [commit_log.entry_of(commit) for commit in islice(people, most)]
 
     def restoration(self, to: str, **more: object) -> Restoration:
-        """Return the request to roll back to the commit ``to``.
-
-        ``more`` are the other fields of the request.
-        """
         return ledger_files.restoration(self._objects, to, **more)
 
     def operator(self) -> Person:
-        """Return the person who runs this program."""
         return authorship.operator(self._objects.path)
 
 
 @contextmanager
 def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
-    """Yield a reader of the state repo at an address, and close it after the block.
-
-    The folder of a checkout is allowed only with ``only_read``. Raises StateRepoError if the state
-    repo cannot be read, also during the block, and Unsound if its disk fails.
-    """
+    """Yield a reader, and raise StateRepoError or Unsound also for errors during the block."""
     with (
         closing(Reader.of(address, only_read=only_read)) as reader,
         reading(address, reader.repository.objects),
@@ -368,13 +299,10 @@ def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
 
 @contextmanager
 def opened_offline(address: str) -> Iterator[Reader | None]:
-    """Yield a reader that does not use the network.
-
-    Yield None for a URL that no reader on this machine has cloned.
-    """
+    """Yield a reader that does not use the network; None for a URL that nobody has cloned here."""
     if not is_url(address):
-        with opened(address) as found:
-            yield found
+        with opened(address) as reader:
+            yield reader
         return
     clones = sorted((settings.data_home(address) / "reader").glob("slot-*/clone.git"))
     if not clones:

@@ -31,9 +31,6 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
         gitops: the GitOps controller, ``flux`` or ``argocd``.
         url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
         example: whether to include the fleet and the application of the paper's experiment.
-
-    Raises:
-        InvalidInput: clusters cannot fetch from ``url``.
     """
     contents = _read(data_folder("skeleton"), "")
     contents |= _read(data_folder("appdefs"), "appdefs/")
@@ -59,22 +56,22 @@ def files_of_library(folder: str) -> dict[str, str]:
 
 def _without_example(contents: Mapping[str, str]) -> dict[str, str]:
     """Return the skeleton, but with an empty fleet and without the experiment's application."""
-    found = {
+    files = {
         path: _ENTRIES.sub(r"\1: []\n", text).replace("charts: []", "charts: {}")
         if path.startswith(("inventory/", "registry/charts"))
         else text
         for path, text in contents.items()
         if not path.startswith(_EXPERIMENT)
     }
-    images = found["registry/images.yaml"]
+    images = files["registry/images.yaml"]
     start, end = images.index("  object-detection:"), images.index("  # Zenoh connections")
-    found["registry/images.yaml"] = images[:start] + images[end:]
+    files["registry/images.yaml"] = images[:start] + images[end:]
     policy = "policy/access-domains.yaml"
-    found[policy] = found[policy].replace("perception", "fleet")
+    files[policy] = files[policy].replace("perception", "fleet")
     nodes, example = "inventory/nodes.yaml", " These are examples; replace them\n# with yours."
-    found[nodes] = found[nodes].replace(example, "\n#")
-    found["README.md"] = found["README.md"].replace(_FIRST_STEP, "")
-    return found
+    files[nodes] = files[nodes].replace(example, "\n#")
+    files["README.md"] = files["README.md"].replace(_FIRST_STEP, "")
+    return files
 
 
 def _read(folder: Path, prefix: str) -> dict[str, str]:

@@ -41,33 +41,28 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
+# The first render version whose claims mark the further topics of a source.
 _FIRST_WITH_MARKS = 2
-"""The first render version whose claims mark the further topics of a source."""
-
+# How many parts the path ``clusters/<cluster>/<access domain>`` has.
 _FOLDER_DEPTH = 3
-"""How many parts the path ``clusters/<cluster>/<access domain>`` has."""
+_NAMES = {"flux": "Flux", "argocd": "Argo CD"}
 
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    """What an upgrade changes, besides rendering everything again.
+    """What an upgrade changes, besides rendering everything again."""
 
-    ``gitops`` is the new GitOps controller; None keeps the current one. ``url`` is the URL from
-    which a controller that has no section in ``demandops.yaml`` yet fetches the state repo; None
-    means the URL of the current controller.
-    """
-
+    # the new GitOps controller; None keeps the current one
     gitops: str | None = None
+    # where a controller without a section in demandops.yaml fetches; None: as the current one does
     url: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """The files that an upgrade changes, and the configuration before and after it.
+    """The files that an upgrade changes, and the configuration before and after it."""
 
-    ``commit`` is the commit of the upgrade. If no commit was made, ``commit`` is the tip.
-    """
-
+    # of the upgrade, or the tip if no commit was made
     commit: str
     old: Config
     new: Config
@@ -81,12 +76,10 @@ class Upgrade:
 
 @dataclass(frozen=True, slots=True)
 class _Plan:
-    """An upgrade, its commit batch, the state after it, and the claims that it may change."""
-
     upgrade: Upgrade
     batch: CommitBatch
     state: State
-    keys: tuple[ClaimKey, ...]
+    keys: tuple[ClaimKey, ...]  # of the claims that the upgrade may change
 
 
 def plan(
@@ -95,13 +88,7 @@ def plan(
     now: datetime,
     progress: Progress = lambda done, total: None,
 ) -> Upgrade:
-    """Return what :func:`upgrade` would do; write nothing.
-
-    Raises:
-        InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
-        StateRepoError: the state repo cannot be read.
-        Unsound: the disk failed.
-    """
+    """Return what :func:`upgrade` would do, and write nothing."""
     with reader.opened(address) as repo:
         return _plan(repo.repository, request, now, progress).upgrade
 
@@ -113,23 +100,10 @@ def upgrade(
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
 ) -> Upgrade:
-    """Render everything again, publish all changed files in one commit, and return the result.
+    """Render everything again, and publish all changed files, if any, in one commit.
 
-    If no file changes, there is no commit.
-
-    Args:
-        address: a folder with a bare repository, or a URL that git clones.
-        request: the GitOps controller to change to, if any, and the URL for a controller that has
-            no section in ``demandops.yaml`` yet.
-        now: the time of the commit.
-        progress: called with (files read, all files) while the ledger is read.
-        signer: signs the commit, if given.
-
-    Raises:
-        InvalidInput: the state repo is not valid, or the request cannot be fulfilled.
-        StateRepoError: the state repo cannot be read or written, or another process wrote to it
-            or locked it during each attempt.
-        Unsound: the disk failed.
+    Raises InvalidInput if the state repo is not valid, or the request cannot be fulfilled.
+    ``progress`` is called with (files read, all files) while the ledger is read.
     """
     with reader.opened(address) as repo:
         repository = repo.repository
@@ -167,18 +141,31 @@ def _plan(
     state = State(config, snapshot.state.ledger, EVALUATE)
     # people's changes since the generator's last commit are applied too
     start = state_in_effect.start_at(objects, tip)
-    known = start.state
-    edited = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, known.ledger)
-    refused = list(faults_of_edit(known, state, edited))
+    edits = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, start.state.ledger)
+    refused = list(faults_of_edit(start.state, state, edits))
     if refused:
         raise InvalidInput(refused)
-    subjects = ledger_files.changed_subjects(known.ledger, state.ledger)
-    applied = update_ledger(known, state, subjects, last_valid_config.end_markers_at(tree), now)
+    subjects = ledger_files.changed_subjects(start.state.ledger, state.ledger)
+    markers = last_valid_config.end_markers_at(tree)
+    applied = update_ledger(start.state, state, subjects, markers, now)
     state = replace(state, ledger=applied.ledger)
     if old.repo_settings.render_version < _FIRST_WITH_MARKS:
         state = replace(state, ledger=with_booked_topics_marked(state.ledger, config))
     if old.repo_settings.gitops != config.repo_settings.gitops:
-        _refuse_held(state)
+        # a held file would stay rendered for the old controller
+        held = [
+            fault(
+                "hold",
+                f"keeps the file of {release.name} as rendered for the old controller; remove the "
+                "hold, and add it again after the upgrade",
+            ).within(override.path)
+            for release in planned_releases(state).values()
+            if isinstance(release, ServiceRelease) and release.shaping.held
+            for override, effects in release.shaping.by
+            if "hold" in effects
+        ]
+        if held:
+            raise InvalidInput(held)
     files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)
     changed = dict(batch.render_all(state, {**files_of_ledger, **applied.files}).files)
     if files[ROOT_FILE] != before:
@@ -188,10 +175,7 @@ def _plan(
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    """Return the claim files and markers that change if this program writes them.
-
-    The result maps each path to the new text.
-    """
+    """Return the claim files and markers that change if this program writes them."""
     written = {}
     for path, text in files.items():
         new = text
@@ -203,26 +187,6 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
         if new != text:
             written[path] = new
     return written
-
-
-def _refuse_held(state: State) -> None:
-    """Raise InvalidInput if an override with ``hold`` keeps the file of a service unchanged.
-
-    The file would stay rendered for the old controller.
-    """
-    faults = [
-        fault(
-            "hold",
-            f"keeps the file of {release.name} as rendered for the old controller; remove the "
-            "hold, and add it again after the upgrade",
-        ).within(override.path)
-        for release in planned_releases(state).values()
-        if isinstance(release, ServiceRelease) and release.shaping.held
-        for override, effects in release.shaping.by
-        if "hold" in effects
-    ]
-    if faults:
-        raise InvalidInput(faults)
 
 
 def _root(text: str, config: Config, request: UpgradeRequest) -> str:
@@ -237,8 +201,8 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
         section = getattr(repository, gitops)
         if section is None:
             # both controllers fetch the same repo, so the URL of the configured controller fits
-            known = getattr(repository, repository.gitops)
-            text = strict_yaml.set_key(text, gitops, {"url": request.url or known.url})
+            current = getattr(repository, repository.gitops)
+            text = strict_yaml.set_key(text, gitops, {"url": request.url or current.url})
         elif request.url not in (None, section.url):
             what = f"is set to {section.url} already; change" if section.url else "is missing; add"
             message = f"{what} it in this file, or leave out --url"
@@ -248,21 +212,21 @@ def _root(text: str, config: Config, request: UpgradeRequest) -> str:
     return text
 
 
-def _message(made: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
-    old, new = made.old.repo_settings, made.new.repo_settings
+def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
+    old, new = upgrade.old.repo_settings, upgrade.new.repo_settings
     title = "Render everything again"
-    if made.switches:
+    if upgrade.switches:
         title += f", for {_NAMES[new.gitops]}"
     why = f"with render version {new.render_version}"
     if old.render_version != new.render_version:
         why += f" instead of {old.render_version}"
-    if made.switches:
+    if upgrade.switches:
         why += f", for {_NAMES[new.gitops]} instead of {_NAMES[old.gitops]}"
-    counts = Counter("/".join(path.split("/")[:_FOLDER_DEPTH]) for path in made.files)
+    counts = Counter("/".join(path.split("/")[:_FOLDER_DEPTH]) for path in upgrade.files)
     trailers = [
         ("Operation", "upgrade"),
         ("From-Render-Version", str(old.render_version)),
-        ("From-Gitops", old.gitops if made.switches else ""),
+        ("From-Gitops", old.gitops if upgrade.switches else ""),
         ("Gitops", new.gitops),
         *commit_message.override_trailers(commit_message.keep_override_paths(keys)),
         *commit_message.demand_trailers(keys),
@@ -275,6 +239,3 @@ def _message(made: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         ["Files written or removed:", *files],
     ]
     return message_format.compose(paragraphs, trailers)
-
-
-_NAMES = {"flux": "Flux", "argocd": "Argo CD"}
