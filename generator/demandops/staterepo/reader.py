@@ -86,7 +86,6 @@ class Reader:
         return other
 
     def refuse_other_render_version(self) -> None:
-        """Raise StateRepoError if the repo has another render version than this program."""
         last_valid_config.refuse_other_render_version(self._objects, self._tip)
 
     def commit(self, revision: str | None = None) -> str:
@@ -123,13 +122,11 @@ class Reader:
     def snapshot_after(self, before: Snapshot) -> Snapshot:
         """Return :meth:`last_valid_snapshot` of the newest commit, if possible from ``before``."""
         is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
-        # only a whole look tells the last valid versions that a generator has recorded
         if before.problems or is_recorded:
             return self.last_valid_snapshot(str(self._tip))
         return state_in_effect.state_after(self._objects, before, self._tip)
 
     def problems(self, revision: str | None = None) -> tuple[problem_report.Problem, ...]:
-        """Return the problems that the generator reports at a commit, located by line."""
         read = self.file_reader(revision)
         lines = FieldLines(read)
         return tuple(
@@ -183,12 +180,10 @@ class Reader:
         return trees.commit_of(self._objects, self.commit(revision)).tree
 
     def file_reader(self, revision: str | None = None) -> FileReader:
-        """Return a function from a path to the file's text at a commit, if there is a file."""
         tree = self._tree(revision)
         return lambda path: trees.read_text(tree, path)
 
     def config(self) -> Config:
-        """Return the configuration at the newest commit, or raise InvalidInput."""
         return last_valid_config.config_at(self._tree())
 
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
@@ -247,7 +242,6 @@ class Reader:
         return commit_log.stopped_release_names(self._objects, revision)
 
     def changed_files(self, before: str, after: str, roots: Sequence[str] = ()) -> list[str]:
-        """Return the files that differ between two commits, sorted, if given below ``roots``."""
         changed = trees.differences(self._tree(before), self._tree(after), roots)
         return sorted(path for path, _ in changed)
 
@@ -257,7 +251,6 @@ class Reader:
         return str(base or self._tip)
 
     def changed_roots(self, commit: str) -> tuple[str, ...]:
-        """Return the top-level files and folders that a commit changed, sorted."""
         opened = trees.commit_of(self._objects, commit)
         before = {entry.name: entry.id for entry in trees.parent_tree(opened) or ()}
         after = {entry.name: entry.id for entry in opened.tree}

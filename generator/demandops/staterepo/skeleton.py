@@ -32,8 +32,8 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
         url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
         example: whether to include the fleet and the application of the paper's experiment.
     """
-    contents = _read(data_folder("skeleton"), "")
-    contents |= _read(data_folder("appdefs"), "appdefs/")
+    contents = _read_folder(data_folder("skeleton"), "")
+    contents |= _read_folder(data_folder("appdefs"), "appdefs/")
     if not example:
         contents = _without_example(contents)
     roots = {"flux": contents.pop(ROOT_FILE), "argocd": contents.pop("demandops.argocd.yaml")}
@@ -50,12 +50,11 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
 
 def files_of_library(folder: str) -> dict[str, str]:
     """Return the files of the library chart that ``init`` puts into ``folder``, as path → text."""
-    appdefs = _read(data_folder("appdefs"), "appdefs/")
+    appdefs = _read_folder(data_folder("appdefs"), "appdefs/")
     return {path: text for path, text in appdefs.items() if path.startswith(f"{folder}/")}
 
 
 def _without_example(contents: Mapping[str, str]) -> dict[str, str]:
-    """Return the skeleton, but with an empty fleet and without the experiment's application."""
     files = {
         path: _ENTRIES.sub(r"\1: []\n", text).replace("charts: []", "charts: {}")
         if path.startswith(("inventory/", "registry/charts"))
@@ -74,7 +73,7 @@ def _without_example(contents: Mapping[str, str]) -> dict[str, str]:
     return files
 
 
-def _read(folder: Path, prefix: str) -> dict[str, str]:
+def _read_folder(folder: Path, prefix: str) -> dict[str, str]:
     return {
         prefix + path.relative_to(folder).as_posix(): path.read_text()
         for path in sorted(folder.rglob("*"))

@@ -74,14 +74,6 @@ class Upgrade:
         return self.old.repo_settings.gitops != self.new.repo_settings.gitops
 
 
-@dataclass(frozen=True, slots=True)
-class _Plan:
-    upgrade: Upgrade
-    batch: CommitBatch
-    state: State
-    keys: tuple[ClaimKey, ...]  # of the claims that the upgrade may change
-
-
 def plan(
     address: str,
     request: UpgradeRequest,
@@ -90,7 +82,7 @@ def plan(
 ) -> Upgrade:
     """Return what :func:`upgrade` would do, and write nothing."""
     with reader.opened(address) as repo:
-        return _plan(repo.repository, request, now, progress).upgrade
+        return _plan(repo.repository, request, now, progress)[0]
 
 
 def upgrade(
@@ -109,16 +101,15 @@ def upgrade(
         repository = repo.repository
         repository.signer = signer
         for attempt in range(1, _ATTEMPTS + 1):
-            planned = _plan(repository, request, now, progress)
-            files = planned.upgrade.files
-            if not files:
-                return planned.upgrade
+            planned, batch, state, keys = _plan(repository, request, now, progress)
+            if not planned.files:
+                return planned
             who = authorship.operator(repository.objects.path)
             author = commit_message.signature(who.name, who.email, now)
-            text = _message(planned.upgrade, planned.keys)
-            commit = planned.batch.commit_files(files, planned.state, text, author, now)
-            if planned.batch.publish():
-                return replace(planned.upgrade, commit=commit)
+            text = _message(planned, keys)
+            commit = batch.commit_files(planned.files, state, text, author, now)
+            if batch.publish():
+                return replace(planned, commit=commit)
             REAL.sleep(_PAUSE_S * attempt * REAL.uniform(0.5, 1.0))
             repository.refresh()
     raise StateRepoError(
@@ -129,7 +120,8 @@ def upgrade(
 
 def _plan(
     repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
-) -> _Plan:
+) -> tuple[Upgrade, CommitBatch, State, tuple[ClaimKey, ...]]:
+    """Return the upgrade, the batch and the state to commit, and the claims that may change."""
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
     batch, old = CommitBatch(repository, snapshot), snapshot.state.config
@@ -171,7 +163,7 @@ def _plan(
     if files[ROOT_FILE] != before:
         changed[ROOT_FILE] = files[ROOT_FILE]
     upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
-    return _Plan(upgrade, batch, state, applied.keys)
+    return upgrade, batch, state, applied.keys
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:

@@ -44,8 +44,6 @@ _CHARTS = "/_charts/"
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The result of verifying one commit."""
-
     commit: str
     summary: str
     # whether no fault was found, also in a commit that was skipped
@@ -86,7 +84,6 @@ class _Proof:
         return not trees.differ(self._commit.tree, commit.tree, roots)
 
     def advance(self, commit: Commit) -> None:
-        """Advance to a later commit, and render only the releases that its changes affect."""
         before, after = self._commit.tree, commit.tree
         try:
             changes = [

@@ -23,7 +23,6 @@ def checkout_around(folder: Path) -> Path | None:
 
 
 def origin_of(checkout: Path) -> str | None:
-    """Return the URL of a checkout's remote ``origin``."""
     try:
         remotes = {remote.name: remote.url for remote in Repository(str(checkout)).remotes}
     except pygit2.GitError:

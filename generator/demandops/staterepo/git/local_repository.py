@@ -144,7 +144,6 @@ class LocalRepository(StateRepository):
         return True
 
     def write_anew(self, since: str) -> None:
-        """Write main and its commits after ``since`` to new files, and sync these files."""
         branch = Path(self.objects.path) / MAIN
         lock = branch.with_name(f"{branch.name}.lock")
         try:

@@ -213,7 +213,7 @@ class RemoteRepository(StateRepository):
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.
         spec = f"+{MAIN}:{_REMOTE_MAIN}"
-        self._read(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
+        self._read_remote(repo, ("fetch", "--no-tags"), spec, urgent=urgent, timeout=timeout)
 
     def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
         self._fetch(self._git, urgent)
@@ -251,7 +251,7 @@ class RemoteRepository(StateRepository):
 
         The patterns are those of ``git ls-remote``. Raises Unavailable if git cannot read now.
         """
-        out = self._read(self._git, ("ls-remote",), *patterns)
+        out = self._read_remote(self._git, ("ls-remote",), *patterns)
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
@@ -261,7 +261,7 @@ class RemoteRepository(StateRepository):
         If the remote has deleted such a branch, this clone deletes its copy of the branch.
         """
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
-        self._read(self._git, ("fetch", "--no-tags", "--prune"), spec)
+        self._read_remote(self._git, ("fetch", "--no-tags", "--prune"), spec)
 
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
         """Push one reference and return git's output, or raise GitCommandError.
@@ -308,7 +308,7 @@ class RemoteRepository(StateRepository):
             return PushDenied(f"{self.address} rejects the push: {reason}")
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
-    def _read(
+    def _read_remote(
         self,
         repo: git.Repo,
         command: Sequence[str],

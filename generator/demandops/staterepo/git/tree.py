@@ -68,7 +68,7 @@ def place_of(repo: Repository, wanted: Oid) -> str | None:
         walker = repo.walk(None, SortMode.TIME)
         for name in repo.references:
             walker.push(repo.references[name].peel(Commit).id)
-        for commit in islice(walker, 10_000):  # each reads its new folders; a history has millions
+        for commit in islice(walker, 10_000):  # each reads folders, and a history may be long
             path = "the top folder" if commit.tree_id == wanted else path_in(commit.tree, "")
             if path is not None:
                 return f"{path} of commit {str(commit.id)[:10]}"
@@ -94,7 +94,6 @@ def entry_id(tree: Tree | None, path: str) -> Oid | None:
 
 
 def read_text(tree: Tree | None, path: str) -> str | None:
-    """Return the text of the file at a path, or None if there is no file."""
     blob = entry(tree, path)
     return text_of(blob) if isinstance(blob, Blob) else None
 
@@ -153,7 +152,6 @@ def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
 
 
 def differ(one: Tree | None, other: Tree | None, paths: Iterable[str]) -> bool:
-    """Return whether the file or folder at any of ``paths`` differs between two trees."""
     return any(entry_id(one, path) != entry_id(other, path) for path in paths)
 
 
@@ -245,7 +243,7 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
 def _raw_name(name: str, entries: Entries) -> bytes:
     """Return the raw name of the entry that the program shows as ``name``; if none, in UTF-8."""
     raw = name.encode()
-    if raw in entries or b"\\" not in raw:  # only _printable writes a backslash
+    if raw in entries or b"\\" not in raw:  # a backslash may stand for a byte that is not UTF-8
         return raw
     raw_names = (key.removesuffix(b"/") for key in entries)
     return next((known for known in raw_names if _printable(known) == name), raw)

@@ -40,7 +40,6 @@ _good: dict[str, Check] = {}
 
 
 def are_listed(repo: Repository, commit: Oid) -> bool:
-    """Return whether a commit contains the file that lists the keys that may sign."""
     return trees.entry(trees.commit_of(repo, commit).tree, ALLOWED_SIGNERS) is not None
 
 

@@ -87,7 +87,6 @@ def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
 
 
 def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
-    """Return the author of a follow commit that renders the commits ``causes``."""
     if not causes:
         return commit_message.generator_signature(now)
     people = list(dict.fromkeys(author_of(commit) for commit in reversed(causes)))

@@ -41,8 +41,6 @@ _NAME = re.compile(r"[a-z0-9]([a-z0-9-]*[a-z0-9])?")
 
 @dataclass(frozen=True, slots=True)
 class LogEntry:
-    """A commit of the state repo, with the parts of its message."""
-
     commit: str
     time: datetime
     author: str
@@ -120,7 +118,6 @@ def commits(
 
 
 def was_rendered_with(repo: Repository, tip: Oid, version: int) -> bool:
-    """Return whether a program of this render version committed at or before ``tip``."""
     is_other = False
     for commit in repo.walk(tip):
         # whole messages are parsed only where they matter: the history may be long
@@ -242,7 +239,6 @@ def changes_to(
 
 
 def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHistory:
-    """Return the history of a path up to ``tip``, with at most ``most`` of its changes."""
     started = stopped = None
     changes: list[LogEntry] = []
     more = 0

@@ -31,8 +31,6 @@ _QUOTED = re.compile(rf'"(?=.*\\)(?:[^"\\]|{_ESCAPE})*"')
 
 @dataclass(frozen=True, slots=True)
 class MessageText:
-    """The parts of a message that programs read."""
-
     summary: str
     why: str
     trailers: dict[str, list[str]]

@@ -170,19 +170,16 @@ def restoration(repo: Repository, to: str, **more: object) -> Restoration:
 
 
 def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:
-    """Return the subjects whose claims differ between two ledgers, sorted."""
     old, new = before.claims, after.claims
     return sorted((subj for subj in {*old, *new} if old.get(subj) != new.get(subj)), key=str)
 
 
 def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
-    """Yield the paths of the claim files that differ between two trees, sorted."""
     changed = trees.differences(before, after, (claim_file.LEDGER_ROOT,))
     return (path for path, _ in changed if claim_file.kind_of(path) is not None)
 
 
 def changes_node(repo: Repository, revision: str | Oid, node: str) -> bool:
-    """Return whether a commit changed a release on a node, or a claim that names the node."""
     commit = trees.commit_of(repo, revision)
     before, after = trees.parent_tree(commit), commit.tree
     if before is None:

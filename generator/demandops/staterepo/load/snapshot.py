@@ -43,8 +43,6 @@ ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
 
 @dataclass(frozen=True, slots=True)
 class Snapshot:
-    """A commit and its state: configuration and ledger."""
-
     commit: Oid
     state: State
     # the newest commit without problems
@@ -63,15 +61,12 @@ class Snapshot:
         return self.other_config_source or ConfigSource(self.commit)
 
     def with_commit(self, commit: Oid, state: State) -> Snapshot:
-        """Return the snapshot of a commit whose parent is this snapshot's commit."""
         last_valid_commit = self.last_valid_commit if self.problems else commit
         return replace(self, commit=commit, state=state, last_valid_commit=last_valid_commit)
 
 
 @dataclass(frozen=True, slots=True)
 class Advance:
-    """A later snapshot, and the changes since an earlier one."""
-
     snapshot: Snapshot
     # those whose claims changed
     subjects: tuple[Subject, ...]

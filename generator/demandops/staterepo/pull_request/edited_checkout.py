@@ -40,8 +40,6 @@ _SHALLOW = (
 
 @dataclass(frozen=True, slots=True)
 class Base:
-    """The commit that an edit started from, and its files."""
-
     commit: str
     files: Mapping[str, str]
     # in effect at this commit, with last valid versions; None if there never was a valid state
@@ -181,7 +179,6 @@ def _started_from(repo: Repository, target: str, tip: Commit | None) -> Commit:
 
 
 def author_of(folder: Path) -> str:
-    """Return the name of the checked-out commit's author, if one is checked out."""
     try:
         repo = Repository(str(folder))
         return str(repo.head.peel(Commit).author.name)

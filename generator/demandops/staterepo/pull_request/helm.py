@@ -43,8 +43,6 @@ _PLACE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    """Helm's output for a chart."""
-
     # API group and kind of each rendered object
     kinds: tuple[tuple[str, str], ...] = ()
     faults: tuple[Fault, ...] = ()
@@ -74,7 +72,6 @@ class Helm:
     def template(
         self, chart: Path, values: Path, home: Path, release: str, namespace: str
     ) -> Report:
-        """Render the chart for a release, and return the kinds of the objects, or a fault."""
         code, out, err = self._run(
             home,
             *("template", release, str(chart), "--include-crds", "--skip-tests"),

@@ -206,7 +206,6 @@ def _is_written_by_generator(path: str) -> bool:
 def _suggestions(
     files: Mapping[str, str], start: Base, edited: Iterable[str], owner: str
 ) -> dict[str, Suggestion]:
-    """Return the overrides that replace manual edits, each by the path of the edited file."""
     releases = {path_of(release): release for release in start.releases().values()}
     suggestions, taken = dict[str, Suggestion](), set(files)
     for path in edited:
@@ -226,7 +225,6 @@ def _suggestions(
 
 
 def _remedy(path: str, before: str | None, after: str | None, suggestion: Suggestion | None) -> str:
-    """Return what is wrong with a manual edit of a generated file, and what to do instead."""
     lost = "is generated, so a manual edit is lost; revert it"
     root = path.split("/", maxsplit=1)[0]
     if suggestion is not None:
@@ -300,7 +298,6 @@ class _Edit:
         return files
 
     def config(self) -> Config:
-        """Return the edited configuration, or raise InvalidInput."""
         files = {p: text for p, text in self.files.items() if p.split("/")[0] in CONFIG_ROOTS}
         config = load(files)
         version = config.repo_settings.render_version
@@ -314,7 +311,6 @@ class _Edit:
         return config
 
     def merged_state(self, config: Config, ledger: Ledger) -> State:
-        """Return the state that the generator reaches after the merge, or raise InvalidInput."""
         root = f"{ended_override_file.MARKERS_ROOT}/"
         markers = {path: text for path, text in self.files.items() if path.startswith(root)}
         ended = ended_override_file.read(markers)
@@ -347,7 +343,6 @@ class _Edit:
             yield from faults_of_edit(old, state, written.values())
 
     def rendered(self, state: State) -> dict[str, str]:
-        """Return every generated file as path → text, or raise InvalidInput with all faults."""
         try:
             return rendered_files(state, self.generated_before)
         except InvalidInput as error:
@@ -369,7 +364,6 @@ class _Edit:
                 yield fault("", message).within(path)
 
     def unversioned_charts(self, config: Config) -> Iterator[Fault]:
-        """Yield a fault for each chart that changed without a new version."""
         sources = {
             source.folder: (name, source)
             for name, chart in sorted(config.charts.items())
@@ -383,7 +377,7 @@ class _Edit:
             changed = sorted(path for part in folders for path in chart_files.below(part, edited))
             if not changed or metadata not in self.before:
                 continue
-            if _version(self.before[metadata]) == source.version:
+            if _chart_version(self.before[metadata]) == source.version:
                 first = changed[0].removeprefix(f"{folder}/")
                 yield fault(
                     "version",
@@ -405,7 +399,7 @@ def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange,
     return bookkeeping_changes(old, bookkeeping(state))
 
 
-def _version(text: str) -> object:
+def _chart_version(text: str) -> object:
     try:
         data = strict_yaml.load(text)
     except InvalidInput:

@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 from demandops.charts import chart_files
-from demandops.config.config import DOMAINS_FILE, Config
+from demandops.config.config import DOMAINS_FILE
 from demandops.config.policy import matches
 from demandops.decision import State
 from demandops.errors import Fault, InvalidInput, fault
@@ -76,8 +76,13 @@ def render_charts(
     for release in merge_preview.planned_releases(state).values():
         if isinstance(release, ServiceRelease):
             by_folder.setdefault(release.chart.folder, []).append((release, False))
+    edited = sorted(changed or ())
     for folder, pairs in by_folder.items():
-        if not _concerned(folder, config, changed):
+        if changed is None or not folder:  # a chart in a registry is reported as not rendered
+            continue
+        # where the chart's own files stay, only these releases may get other objects
+        parts = chart_files.folders(folder, config.files)
+        if not any(chart_files.below(part, edited) for part in parts):
             by_folder[folder] = [pair for pair in pairs if path_of(pair[0]) in wanted]
     for examples in trial_releases(config).values():
         for release in examples:
@@ -89,19 +94,7 @@ def render_charts(
     return run.result()
 
 
-def _concerned(folder: str | None, config: Config, changed: Collection[str] | None) -> bool:
-    """Return whether an edit could affect the objects of all releases of a chart."""
-    if changed is None or not folder:  # a chart in a registry is reported as not rendered
-        return True
-    edited = sorted(changed)
-    return any(
-        chart_files.below(part, edited) for part in chart_files.folders(folder, config.files)
-    )
-
-
 class _Run:
-    """Runs helm on one chart after the other, and collects the results."""
-
     def __init__(self, helm: Helm | None, state: State) -> None:
         self._helm, self._state = helm, state
         self._files = state.config.files
@@ -204,7 +197,7 @@ class _Run:
             if not report.ended:
                 return
             if not example or self._may_run(release):
-                self._faults |= dict.fromkeys(self._refused(report, release))
+                self._faults |= dict.fromkeys(self._kinds_refused(report, release))
 
     def _check_libraries(self, folder: str, values: Mapping[str, Any]) -> None:
         """Check the values of the charts in ``charts/`` against their schemas, as Helm does."""
@@ -235,14 +228,13 @@ class _Run:
                 into[said.within(files.get(place, f"{folder}/{place}".rstrip("/")))] = None
 
     def _may_run(self, release: ServiceRelease) -> bool:
-        """Return whether the domain's rules allow an application that has the release's service."""
         rules, apps = release.domain.rules, self._state.config.services
         names = [name for name, services in apps.items() if release.key.service in services]
         return not rules or any(
             matches(name, rule.applications) for rule in rules for name in names
         )
 
-    def _refused(self, report: Report, release: ServiceRelease) -> Iterator[Fault]:
+    def _kinds_refused(self, report: Report, release: ServiceRelease) -> Iterator[Fault]:
         """Yield a fault for each rendered object whose kind the access domain does not allow."""
         domain = release.domain
         allowed = {(entry.group, entry.kind) for entry in domain.allowed_kinds}

@@ -84,7 +84,6 @@ class CommitBatch:
         return self.head.commit == self.start.commit
 
     def read(self, path: str) -> str | None:
-        """Return a file's text at the batch's newest commit."""
         return trees.read_text(self._tree, path)
 
     def commit(
@@ -117,7 +116,6 @@ class CommitBatch:
         author: Signature,
         now: datetime,
     ) -> str:
-        """Commit the files that lead to ``state``, and return the commit's id."""
         committer = commit_message.generator_signature(now)
         for attempt in range(1, _ATTEMPTS + 1):
             try:

@@ -68,7 +68,6 @@ class ProposalRecord:
         return self.replaces.partition(" ")[0]
 
     def as_replaced(self) -> str:
-        """Return ``replaces`` for a proposal that replaces this one."""
         # nobody has seen a proposal without a commit, so the one that it replaces still counts
         return f"{self.branch} {self.commits[-1]}" if self.commits else self.replaces
 

@@ -50,8 +50,6 @@ class CommitDetails:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """A published commit and its branch."""
-
     commit: str
     branch: str
     # the address of the branch's merge request, if the server printed it
@@ -170,7 +168,7 @@ def _commit(
 ) -> Oid:
     tree = trees.write(repository.new, tip.tree, dict(files))
     # faults that main has already do not stop a person, who may be mending them one by one
-    new_faults = _faults(repository.objects[tree].peel(Tree)) - _faults(tip.tree)
+    new_faults = _config_faults(repository.objects[tree].peel(Tree)) - _config_faults(tip.tree)
     if new_faults:
         raise InvalidInput(sorted(new_faults, key=str))
     who = commit_message.signature(*details.person, details.now)
@@ -179,7 +177,7 @@ def _commit(
     )
 
 
-def _faults(tree: Tree) -> set[Fault]:
+def _config_faults(tree: Tree) -> set[Fault]:
     try:
         last_valid_config.config_at(tree)
     except InvalidInput as error:

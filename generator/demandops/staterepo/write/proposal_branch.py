@@ -210,8 +210,6 @@ class ProposalBranches:
 
 @dataclass(frozen=True, slots=True)
 class PendingProposal:
-    """A proposal that awaits approval, with data from the messages of its commits."""
-
     branch: str
     # the newest of the branch, perhaps by a person
     commit: str
