@@ -201,8 +201,8 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
 
 def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
     """Return the newest commit of the generator along the first parents, or None."""
-    commits = first_parents(repo, tip)
-    return next((commit.id for commit in commits if is_by_generator(repo, commit)), None)
+    line = first_parents(repo, tip)
+    return next((commit.id for commit in line if is_by_generator(repo, commit)), None)
 
 
 @dataclass(frozen=True, slots=True)

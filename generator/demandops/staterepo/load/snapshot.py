@@ -263,23 +263,23 @@ class ReadAhead:
     # Reading takes time. If each attempt read all commits since this generator's last publication,
     # other generators could publish first every time.
     def __init__(self) -> None:
-        self._earlier: Advance | None = None
+        self._so_far: Advance | None = None
         self._start: Oid | None = None
 
     def advance(self, repo: Repository, before: Snapshot, tip: Oid) -> Advance:
         last_valid_config.refuse_other_render_version(repo, tip)
-        earlier = self._earlier
-        if earlier is None or self._start != before.commit:
-            earlier = Advance(before, (), False)
-        start = earlier.snapshot
+        so_far = self._so_far
+        if so_far is None or self._start != before.commit:
+            so_far = Advance(before, (), False)
+        start = so_far.snapshot
         if start.commit != tip or start.problems or not start.is_rendered:
             later = advance(repo, start, tip)
-            earlier = Advance(
+            so_far = Advance(
                 later.snapshot,
-                tuple(dict.fromkeys((*earlier.subjects, *later.subjects))),
-                earlier.config_changed
+                tuple(dict.fromkeys((*so_far.subjects, *later.subjects))),
+                so_far.config_changed
                 or later.config_changed
                 or (start.commit != before.commit and _must_render_all(repo, before.commit, tip)),
             )
-        self._earlier, self._start = earlier, before.commit
-        return earlier
+        self._so_far, self._start = so_far, before.commit
+        return so_far

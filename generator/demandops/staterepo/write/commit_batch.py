@@ -56,8 +56,6 @@ from demandops.staterepo.write.journal import ProposalRecord
 
 _ATTEMPTS = 5
 _PAUSE_S = 0.02
-
-
 # The effect of people's changes: the snapshot, the changed files, and the keys of the claims that
 # overrides may have changed.
 _Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
