@@ -49,7 +49,8 @@ class Reader:
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
         """Return a reader of the state repo at an address; of a checkout only if ``only_read``."""
         try:
-            # the clone of a URL stays on the disk for later readers
+            # The clone of a URL stays on the disk for later readers. It is in a folder of readers,
+            # so that none takes over a generator's journal.
             slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
         except OSError as error:
             raise access_error(error, f"the data folder of {address}") from None

@@ -55,6 +55,7 @@ class LocalRepository(StateRepository):
         self.new = NewObjects(self.objects)
         try:
             self._require_usable(path)
+            _ = self.objects[self.tip()].peel(pygit2.Commit).tree
         except (pygit2.GitError, KeyError, OSError) as error:
             raise disk_error(error, self.address) or self._unreadable(str(error)) from None
 
@@ -106,7 +107,6 @@ class LocalRepository(StateRepository):
             )
         if self.tip() not in self.objects:
             raise self._unreadable(f"its commit {self.tip()} is missing")
-        _ = self.objects[self.tip()].peel(pygit2.Commit).tree
 
     def tip(self) -> Oid:
         """Return the newest commit of main, or raise StateRepoError if main is no plain branch."""
