@@ -43,7 +43,7 @@ def test_what_to_do_about_a_kind(field: str, kind: tuple[str, str], remedy: str)
     state = MemoryRepo(files).state
     release = next(one for found in trial_releases(state.config).values() for one in found)
     run = _Run(None, state)
-    (fault,) = run._refused(Report((kind,)), release)
+    (fault,) = run._kinds_refused(Report((kind,)), release)
     assert fault.message == (
         f"renders a {kind[1]}, which is not among the kinds of access domain 'perception', so the "
         f"domain's cluster would refuse the object; {remedy}, or leave the object out"
