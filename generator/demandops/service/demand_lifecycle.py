@@ -331,7 +331,7 @@ class Demands:
     def answer(
         self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
     ) -> None:
-        """Answer each demand without an answer; remove it from the journal unless ``keep`` is set."""
+        """Answer each demand that has no answer; the journal forgets it unless ``keep`` is set."""
         results = list(results)
         # Notify before the journal forgets the demand. In the reverse order, a crash could lose
         # the refusal, because a refused demand has no commit.

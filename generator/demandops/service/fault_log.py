@@ -22,7 +22,6 @@ class FaultLog:
         self._warned_of_signers = False
 
     def log_changes(self, problems: Iterable[Fault]) -> None:
-        """Log each fault of ``problems`` that is new, and each file that is valid again."""
         current = list(dict.fromkeys(problems))
         for problem in current:
             if problem not in self._logged:
@@ -32,7 +31,7 @@ class FaultLog:
         self._logged = frozenset(current)
 
     def warn_if_unsigned(self, snapshot: Snapshot) -> None:
-        """Warn once if the state repo lists allowed signing keys and this generator has no key."""
+        """Warn once if the state repo lists who may sign and this generator has no key."""
         if self._repository.signer is not None or self._warned_of_signers:
             return
         if allowed_signers.are_listed(self._repository.objects, snapshot.commit):

@@ -8,14 +8,13 @@ FIRST_S, LONGEST_S = 1.0, 60.0
 
 
 class Rest:
-    """A pause after an error; each further error doubles it, up to a minute, until a success."""
+    """A pause after an error; each further error doubles it until a success."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._next, self._until = FIRST_S, runtime.monotonic()
 
     def __bool__(self) -> bool:
-        """Return whether the pause goes on."""
         return self._runtime.monotonic() < self._until
 
     @property
@@ -28,10 +27,8 @@ class Rest:
         return self._until - self._runtime.monotonic()
 
     def begin(self) -> None:
-        """Begin a pause now."""
         self._until = self._runtime.monotonic() + self._next
         self._next = min(2 * self._next, LONGEST_S)
 
     def succeeded(self) -> None:
-        """Make the next pause short again."""
         self._next = FIRST_S
