@@ -32,23 +32,21 @@ class ConfigMapWatch:
         kubeconfig: Path | None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Start to watch.
+        """Start to watch; ``on_data`` is called from the thread of the watch.
 
-        Args:
-            namespace: the ConfigMap's namespace.
-            name: the ConfigMap's name. The ConfigMap need not exist yet. If it is deleted, the last
-                data stay valid.
-            on_data: called with the data, from the thread of the watch.
-            kubeconfig: the file with the access to the cluster; if None, this process must be a
-                pod in the cluster.
-            runtime: provides the threads.
-
-        Raises:
-            InvalidInput: if the kubeconfig cannot be used, or this process is not a pod.
+        The ConfigMap need not exist yet. Without a kubeconfig, this process must be a pod in the
+        cluster.
         """
         self._name, self._on_data = f"ConfigMap {namespace}/{name}", on_data
         self._request = {"namespace": namespace, "field_selector": f"metadata.name={name}"}
-        self._client = _client(kubeconfig)
+        if kubeconfig is None:
+            self._client = own_cluster_api("without --kubeconfig").api_client
+        else:
+            try:
+                self._client = ClusterAccess(kubeconfig=kubeconfig).api().api_client
+            except Exception as error:  # the library raises errors of many kinds
+                reason = f"cannot be used: {one_line(str(error))}"
+                raise InvalidInput.at("--kubeconfig", reason, file=str(kubeconfig)) from None
         self._data: dict[str, str] | None = None
         self._told = ""
         self._closed = runtime.event()
@@ -99,7 +97,7 @@ class ConfigMapWatch:
                 self._tell("is gone; its last data stay valid")
 
     def _take(self, item: Any) -> None:  # noqa: ANN401 - the library has no types
-        self._told = ""
+        self._told = ""  # so that the next failure is logged again
         data = dict(item.data or {})
         with self._calling:
             if data != self._data and not self._closed.is_set():
@@ -111,13 +109,3 @@ class ConfigMapWatch:
             if text != self._told and not self._closed.is_set():
                 self._told = text
                 log.warning("%s %s", self._name, text)
-
-
-def _client(kubeconfig: Path | None) -> Any:  # noqa: ANN401 - the library has no types
-    if kubeconfig is None:
-        return own_cluster_api("without --kubeconfig").api_client
-    try:
-        return ClusterAccess(kubeconfig=kubeconfig).api().api_client
-    except Exception as error:  # the library raises errors of many kinds
-        reason = f"cannot be used: {one_line(str(error))}"
-        raise InvalidInput.at("--kubeconfig", reason, file=str(kubeconfig)) from None
