@@ -21,8 +21,6 @@ _MOST_PROBLEMS = 20
 
 
 class Diagnostics:
-    """Publishes the status of a node and of its generator's state repo."""
-
     def __init__(self, node: Node, generator: Generator, others: OtherServers) -> None:
         self._node, self._generator, self._others = node, generator, others
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -31,9 +29,12 @@ class Diagnostics:
     def _publish(self) -> None:
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        of_each = (_of_state_repo, _of_configuration, _of_parts)
-        message.status = [of_one(self._generator) for of_one in of_each]
-        message.status.append(_of_actions(self._generator, self._others.find()))
+        message.status = [
+            _of_state_repo(self._generator),
+            _of_configuration(self._generator),
+            _of_parts(self._generator),
+            _of_actions(self._generator, self._others.find()),
+        ]
         self._publisher.publish(message)
 
 

@@ -57,17 +57,12 @@ _RANGES = {
 
 
 def read(given: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return the value of each parameter.
+    """Return the value of each parameter, or raise click.UsageError.
 
-    A temporary node reads them, because the generator starts before the node.
-
-    Args:
-        given: values that replace defaults; None and "" keep the default. A value in the ROS
-            arguments replaces both.
-
-    Raises:
-        click.UsageError: if a value is not valid.
+    ``given`` replaces defaults, except with None and "". A value in the ROS arguments replaces
+    both.
     """
+    # a temporary node reads them, because the generator starts before the node
     defaults = DEFAULTS | {name: value for name, value in given.items() if value}
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:

@@ -16,8 +16,6 @@ _MOST_REFUSALS = 20
 
 
 class DetectorDiagnostics:
-    """Publishes three statuses: of the rules, of the data and of the demands."""
-
     def __init__(self, node: Node, rules: str) -> None:
         self._node, self._rules = node, rules
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -30,7 +28,6 @@ class DetectorDiagnostics:
         sender: DemandSender,
         is_started: bool,
     ) -> None:
-        """Publish the current statuses."""
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
         message.status = [
@@ -46,7 +43,7 @@ class DetectorDiagnostics:
             level = DiagnosticStatus.WARN
             text = "the file cannot be read or is invalid; the last valid rules are in effect"
         values = {"rules": str(len(detector.file.rules))}
-        values |= {f"problem {at}": one for at, one in enumerate(problems, start=1)}
+        values |= {f"problem {at}": problem for at, problem in enumerate(problems, start=1)}
         return status("demandops_detector: rules", self._rules, level, text, values)
 
     def _of_data(

@@ -17,14 +17,14 @@ from demandops_ros import ros_process
 from demandops_ros.parameter_sync.parameter_file import parameters_of
 from demandops_ros.parameter_sync.parameter_setter import ParameterSetter
 
+# The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
+# without its `period`, because a watch does not poll.
 _PARAMETERS = {
     "configmap_name": "",
     "namespace": "",
     "ros_params_file_name": "params.yml",
     "target_ros_node": "",
 }
-"""The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
-without its ``period``, because a watch does not poll."""
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
