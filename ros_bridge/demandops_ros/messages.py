@@ -64,7 +64,14 @@ def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
         "operation": _word(_OPERATIONS, goal.operation),
         **_data(goal, _DEMAND),
         "applications": [_application(app) for app in goal.applications],
-        "connections": [_connection(connection) for connection in goal.connections],
+        "connections": [
+            {
+                **_data(connection, _CONNECTION),
+                "type": _word(_TYPES[:-1], connection.type),
+                "topics": [_data(route, _ROUTE) for route in connection.topics],
+            }
+            for connection in goal.connections
+        ],
         "positions": [_data(position, _POSITION) for position in goal.positions],
         "answer": _word(ANSWER_LEVELS, goal.answer),
     }
@@ -137,14 +144,6 @@ def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
         ],
         connect=_number(_TYPES, data.get("connect", "auto"), "connect"),
     )
-
-
-def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401
-    return {
-        **_data(connection, _CONNECTION),
-        "type": _word(_TYPES[:-1], connection.type),
-        "topics": [_data(route, _ROUTE) for route in connection.topics],
-    }
 
 
 def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401

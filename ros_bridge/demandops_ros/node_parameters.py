@@ -57,9 +57,7 @@ _RANGES = {
 
 
 def read(given: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return the value of each parameter, or raise click.UsageError.
-
-    ``given`` replaces defaults, except with None and "". A value in the ROS arguments replaces
+    """Return each parameter's value; ``given`` replaces defaults, and the ROS arguments replace
     both.
     """
     # a temporary node reads them, because the generator starts before the node

@@ -79,8 +79,6 @@ def stop_signals() -> Iterator[Callable[[], None]]:
 
 
 class RosLogHandler(logging.Handler):
-    """Passes the generator's log records to ROS's log."""
-
     def __init__(self, logger: RcutilsLogger) -> None:
         super().__init__()
         self._log = logger
@@ -102,7 +100,7 @@ class RosLogHandler(logging.Handler):
 def started(
     arguments: Sequence[str], signals: SignalHandlerOptions = SignalHandlerOptions.ALL
 ) -> Iterator[list[str]]:
-    """Run the block with ROS initialized from ``arguments``, and yield the arguments as a list."""
+    """Run the block with ROS initialized, and yield its arguments."""
     ros_args = list(arguments)
     if ros_args and ros_args[0] != "--ros-args":
         raise click.UsageError(

@@ -14,8 +14,6 @@ from demandops.render.gitops.paths import bootstrap_path
 
 @dataclass(frozen=True, slots=True)
 class OldBootstrap:
-    """A cluster without the current bootstrap file, and the command that applies the file."""
-
     cluster: str
     file: str
     domains: tuple[str, ...]  # whose objects are old or missing

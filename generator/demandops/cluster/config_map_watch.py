@@ -18,6 +18,8 @@ _WATCH_S = 240
 _CONNECT_S = 5
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
+_GONE = "is gone; its last data stay valid"
+
 OnData = Callable[[Mapping[str, str]], object]
 
 
@@ -64,37 +66,34 @@ class ConfigMapWatch:
         pause = _FIRST_PAUSE_S
         while not self._closed.is_set():
             try:
-                self._read_and_watch()
+                from kubernetes import client, watch  # noqa: PLC0415 - slow (half a second)
+
+                read = client.CoreV1Api(self._client).list_namespaced_config_map
+                listed = read(**self._request, _request_timeout=(_CONNECT_S, _WATCH_S))
+                for item in listed.items:
+                    self._take(item)
+                if not listed.items:
+                    is_new = self._data is None
+                    self._tell("does not exist yet" if is_new else _GONE)
+                for event in watch.Watch().stream(
+                    read,
+                    **self._request,
+                    resource_version=listed.metadata.resource_version,
+                    timeout_seconds=_WATCH_S,
+                    _request_timeout=(_CONNECT_S, _WATCH_S + 30),
+                ):
+                    if self._closed.is_set():
+                        return
+                    if event["type"] in ("ADDED", "MODIFIED"):
+                        self._take(event["object"])
+                    elif event["type"] == "DELETED":
+                        self._tell(_GONE)
                 pause = _FIRST_PAUSE_S
             except Exception as error:  # the library raises errors of many kinds
                 reason = getattr(error, "reason", None) or error or type(error).__name__
                 self._tell(f"cannot be read: {one_line(str(reason))[:300]}; retrying")
                 self._closed.wait(pause)
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
-
-    def _read_and_watch(self) -> None:
-        from kubernetes import client, watch  # noqa: PLC0415 - slow (half a second), so only on use
-
-        read = client.CoreV1Api(self._client).list_namespaced_config_map
-        listed = read(**self._request, _request_timeout=(_CONNECT_S, _WATCH_S))
-        for item in listed.items:
-            self._take(item)
-        if not listed.items:
-            is_new = self._data is None
-            self._tell("does not exist yet" if is_new else "is gone; its last data stay valid")
-        for event in watch.Watch().stream(
-            read,
-            **self._request,
-            resource_version=listed.metadata.resource_version,
-            timeout_seconds=_WATCH_S,
-            _request_timeout=(_CONNECT_S, _WATCH_S + 30),
-        ):
-            if self._closed.is_set():
-                return
-            if event["type"] in ("ADDED", "MODIFIED"):
-                self._take(event["object"])
-            elif event["type"] == "DELETED":
-                self._tell("is gone; its last data stay valid")
 
     def _take(self, item: Any) -> None:  # noqa: ANN401 - the library has no types
         self._told = ""  # so that the next failure is logged again

@@ -25,7 +25,6 @@ _NO_COMMIT = "0" * 40
 
 
 def call_flux(url: str, secret: bytes | None) -> None:
-    """Call a Receiver of Flux, or raise NoAnswer."""
     # a Receiver ignores the body
     _send(url, b"{}", secret, "X-Signature", {})
 

@@ -35,8 +35,6 @@ _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-
 
 
 class Leadership:
-    """Competes for the Lease and, as the leader, renews it."""
-
     def __init__(
         self,
         lease: str,

@@ -28,8 +28,6 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
 class ObjectCache:
-    """Caches objects of one cluster."""
-
     def __init__(
         self,
         name: str,
@@ -59,7 +57,6 @@ class ObjectCache:
             self._runtime.keep_running(name, partial(self._keep_watching, selector))
 
     def objects(self) -> dict[Key, dict[str, Any]]:
-        """Return the objects that have been read so far."""
         with self._lock:
             return dict(self._objects)
 

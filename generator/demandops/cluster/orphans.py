@@ -12,8 +12,6 @@ from demandops.cluster.object_cache import ObjectCache
 
 @dataclass(frozen=True, slots=True)
 class Orphan:
-    """An object that is left on a cluster, although its release is gone."""
-
     cluster: str
     kind: str
     namespace: str

@@ -136,23 +136,19 @@ class ReconcileTrigger:
         now, before = self._runtime.monotonic(), self._wakes
         self._wakes = {}
         for cluster in sorted(self._clusters):
-            for domains in self._woken_together(cluster, config):
-                key = (cluster, *(domain.name for domain in domains))
-                wake = self._wakes[key] = before.get(key) or _Wake(cluster, domains)
-                wake.domains = domains
+            access = self._clusters[cluster]
+            domains = tuple(domain for name, domain in domains_in_use(config) if name == cluster)
+            argocd = config.repo_settings.gitops == "argocd"
+            # one call of a webhook wakes all domains, but the API needs a call for each
+            together = bool(access.webhook if argocd else access.receiver) or not access.kubeconfig
+            for woken in [domains] if together else [(domain,) for domain in domains]:
+                key = (cluster, *(domain.name for domain in woken))
+                wake = self._wakes[key] = before.get(key) or _Wake(cluster, woken)
+                wake.domains = woken
                 wake.pushed = now if wake.pushed is None else wake.pushed
                 wake.next_try, wake.pause = now, _FIRST_RETRY_S
-            if cluster in self._caches and config.repo_settings.gitops == "flux":
-                self._caches[cluster].watch(_followed(_domains(cluster, config)))
-
-    def _woken_together(self, cluster: str, config: Config) -> list[tuple[AccessDomain, ...]]:
-        """Return the domains of a cluster, grouped by the call that wakes them."""
-        # one call of a webhook wakes all domains, but the API needs a call for each
-        access, domains = self._clusters[cluster], _domains(cluster, config)
-        argocd = config.repo_settings.gitops == "argocd"
-        if (access.webhook if argocd else access.receiver) or not access.kubeconfig:
-            return [tuple(domains)]
-        return [(domain,) for domain in domains]
+            if cluster in self._caches and not argocd:
+                self._caches[cluster].watch(_followed(domains))
 
     def _note_idle(self, wake: _Wake) -> None:
         cache, is_idle = self._caches.get(wake.cluster), True  # also if its state is not known
@@ -243,12 +239,8 @@ def _on_cluster(wake: _Wake, domain: AccessDomain) -> ClusterDomain:
     return ClusterDomain(wake.cluster, domain.name, domain.namespace)
 
 
-def _domains(cluster: str, config: Config) -> tuple[AccessDomain, ...]:
-    return tuple(domain for name, domain in domains_in_use(config) if name == cluster)
-
-
 def _concerns(path: str, cluster: str) -> bool:
-    """Return whether a changed file may affect a cluster."""
+    # files of the ledger and of other clusters do not
     first, _, rest = path.partition("/")
     return rest.startswith(f"{cluster}/") if first == "clusters" else first != "ledger"
 

@@ -20,8 +20,6 @@ from demandops.cluster.object_cache import ObjectCache
 
 @dataclass(frozen=True, slots=True)
 class ReleaseStatus:
-    """The health of a release, as its cluster reports it."""
-
     health: Health
     seen: str = ""  # the commit that the release's access domain has applied, if that is known
     since: str = ""  # when the state last changed, if that is known
@@ -46,7 +44,6 @@ def statuses(
     history: History,
     changed: ChangedPaths = lambda seen, commit: None,
 ) -> list[ReleaseStatus]:
-    """Return the status of each release at a commit, from the caches of the clusters."""
     changed = cache(changed)
     history = _CachedHistory(history)
     objects = {name: store.objects() for name, store in caches.items()}

@@ -53,8 +53,6 @@ class _Rollout:
 
 
 class RolloutWatcher:
-    """Follows releases on the clusters that the operator's file names."""
-
     def __init__(
         self,
         clusters: Mapping[str, ClusterAccess],

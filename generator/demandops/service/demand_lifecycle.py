@@ -55,8 +55,6 @@ _NEXT: dict[State, tuple[State, ...]] = {
 
 
 class Demands:
-    """The demands that have no answer yet, and the journal."""
-
     def __init__(
         self, journal: Journal, limit: int, requester_limit: int | None, runtime: Runtime
     ) -> None:
@@ -184,7 +182,6 @@ class Demands:
             self._take_in()
 
     def journal_arrivals(self) -> None:
-        """Journal demands as they arrive, until no more are accepted."""
         # demands that arrive during an fsync of the journal share the next fsync
         while not self._closed:
             self._arrival.wait()

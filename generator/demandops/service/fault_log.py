@@ -14,8 +14,6 @@ log = logging.getLogger("demandops")
 
 
 class FaultLog:
-    """Logs faults of the state repo's files, and warns if this generator lacks a signing key."""
-
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
         self._logged: frozenset[Fault] = frozenset()

@@ -140,7 +140,6 @@ class Generator:
         return self._runtime.failures
 
     def fetch_now(self) -> None:
-        """Make a fetch due now, because a Git server reported a push."""
         self._worker.fetch_now()
 
     def submit(
@@ -203,18 +202,11 @@ class Generator:
         return commit, self._repository.changed_paths(since, commit)
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand; return whether the demand is withdrawn now.
-
-        A demand that is unknown, committed or answered cannot be withdrawn. Neither can a demand
-        while the journal cannot be written.
-        """
+        """Withdraw a demand that is not committed or answered; return whether it is withdrawn."""
         return self._demands.withdraw(operation)
 
     def on_publish(self, listener: Callable[[Config], None]) -> None:
-        """Register a listener for each change of the published state.
-
-        The worker thread calls it with the configuration in effect; it must return at once.
-        """
+        """Have the worker call a listener, which must return at once, after each publication."""
         self._worker.listeners.append(listener)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
@@ -253,7 +245,6 @@ class Generator:
         return not any(thread.is_alive() for thread in self._threads)
 
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
-        """Stop, wait for the threads to end, and return the result of :meth:`stop`."""
         return self.stop(timeout).result()
 
 

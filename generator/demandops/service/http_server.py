@@ -34,8 +34,6 @@ _BYTES_IN_A_PIECE = 256
 
 
 class HttpServer:
-    """A running HTTP server, in a thread of its own."""
-
     def __init__(
         self,
         listening: socket.socket,
@@ -162,12 +160,10 @@ def bound(address: str, option: str) -> socket.socket:
 
 
 def is_local(listening: socket.socket) -> bool:
-    """Return whether only programs on this machine can connect."""
     host = listening.getsockname()[0]
     return ipaddress.ip_address(host.partition("%")[0]).is_loopback
 
 
 def url_of(listening: socket.socket) -> str:
-    """Return the URL of the server, without a path."""
     host, port = listening.getsockname()[:2]
     return f"http://{f'[{host}]' if ':' in host else host}:{port}"

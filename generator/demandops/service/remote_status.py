@@ -39,7 +39,6 @@ class RemoteMonitor:
         self.status = replace(self.status, unreachable=reason, unreachable_since=since)
 
     def record_reached(self, *, pushed: bool = False) -> None:
-        """Record that the remote was reached; log this if it was unreachable before."""
         now, before = self._runtime.now(), self.status
         if before.unreachable_since is not None:
             away = self._runtime.monotonic() - self._away_from

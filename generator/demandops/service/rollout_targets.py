@@ -62,7 +62,6 @@ def domains_of_state(state: State) -> list[ClusterDomain]:
 
 
 def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
-    """Return an access domain on a cluster, in the form that :mod:`demandops.cluster` needs."""
     application = None  # with Argo CD, the Application that applies the folder of the domain
     if repository.gitops == "argocd" and repository.argocd:
         application = ObjectName(repository.argocd.namespace, project_of(domain, repository))
@@ -70,6 +69,5 @@ def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings)
 
 
 def target_of(release: Release, repository: RepoSettings, *, wanted: bool = True) -> Target:
-    """Return the target of a release; ``wanted`` says whether the cluster should run it."""
     domain = cluster_domain(release.node.cluster, release.domain, repository)
     return Target(domain, release.name, isinstance(release, ServiceRelease), wanted)

@@ -134,7 +134,6 @@ def receipt_of(
 
 
 def reason_of(error: DemandOpsError) -> str:
-    """Return the error of a refused demand as text for people."""
     return error.text_with_codes() if isinstance(error, InvalidInput) else str(error)
 
 

@@ -44,8 +44,6 @@ _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class DetectorNode(Node):  # type: ignore[misc]
-    """Watches the topics of its rules and sends the demands of these rules."""
-
     def __init__(self, rules: str | None) -> None:
         super().__init__("demandops_detector")
         settings = detector_parameters.declare(self, rules)
@@ -158,22 +156,18 @@ class DetectorNode(Node):  # type: ignore[misc]
                 return
             self._start(self._bookkeeping, now)
         observations = [self._observations.popleft() for _ in range(len(self._observations))]
-        self._follow_clock(now)
-        for event, want in self._detector.step(observations, now):
-            self._log("info", f"rule {event.rule}: {event.why}")
-            self._sender.want([want])
-
-    def _follow_clock(self, now: float) -> None:
-        """Adjust the detector's times if the clock was set since the last call."""
-        look = REAL.monotonic()
-        passed = now - self._last_now
+        # if the clock was set since the last step, the detector's times are moved with it
+        look, passed = REAL.monotonic(), now - self._last_now
         # a simulated clock may run at any speed, so only one that goes back was set
-        simulated = bool(self.get_parameter("use_sim_time").value)
-        jumped = min(passed, 0.0) if simulated else passed - (look - self._last_look)
+        is_simulated = bool(self.get_parameter("use_sim_time").value)
+        jumped = min(passed, 0.0) if is_simulated else passed - (look - self._last_look)
         self._last_now, self._last_look = now, look
         if abs(jumped) > _SET_CLOCK_S:
             self._log("warning", f"the clock has jumped by {jumped:.1f} s")
             self._detector.set_clock(jumped)
+        for event, want in self._detector.step(observations, now):
+            self._log("info", f"rule {event.rule}: {event.why}")
+            self._sender.want([want])
 
     def _reload_if_changed(self) -> None:
         """If the file is invalid, keep the last valid rules; log the problems if they changed."""

@@ -49,10 +49,7 @@ LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
 def declare(node: Node, rules: str | None) -> dict[str, Any]:
-    """Declare all parameters of a node and return their values, or raise click.UsageError.
-
-    ``rules`` is the file of rules that the command line names; the parameter ``rules`` replaces it.
-    """
+    """Declare all parameters of a node, where ``rules`` is a default, and return their values."""
     values = {}
     for name, (default, description, span) in PARAMETERS.items():
         described = ParameterDescriptor(description=description, read_only=True)

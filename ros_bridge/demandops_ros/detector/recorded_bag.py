@@ -20,8 +20,6 @@ REST_OF_BAG = "the rest of the bag"
 
 
 class RecordedBag:
-    """The messages that rules read from a bag."""
-
     def __init__(self, path: Path, file: RuleFile) -> None:
         """Open a bag, which must have a topic that the rules read: its folder or an MCAP file."""
         try:
@@ -64,10 +62,6 @@ class RecordedBag:
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
-        """Yield an observation for each readable message and each source that reads it.
-
-        They have the order of recording.
-        """
         connections = [each for each in self._reader.connections if each.id in self._sources]
         messages = self._reader.messages(connections=connections)
         while True:

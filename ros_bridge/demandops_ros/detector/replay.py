@@ -26,8 +26,6 @@ _TRACK_M = 0.5
 
 @dataclass
 class Replay:
-    """The events and demands that rules make from a bag."""
-
     bag: str
     file: RuleFile
     span: tuple[float, float]  # from the first message to the last
@@ -67,7 +65,6 @@ def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
 
 
 def show(replay: Replay, output: str) -> None:
-    """Print the events, as a table with a summary or as JSON, and warn of what was left out."""
     columns = [
         Column("Second"),
         Column("Change"),

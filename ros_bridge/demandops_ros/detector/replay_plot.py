@@ -24,9 +24,14 @@ Span = tuple[float, float]
 
 
 def svg(replay: Replay) -> str:
-    """Return the picture as the text of an SVG file."""
     colors = _Colors()
-    rows = [*_spans(replay).items()][:_MOST_ROWS]
+    spans: dict[Key, list[Span]] = {}  # of each event; the end of one that lasts is inf
+    for event, _ in replay.events:
+        if event.starts:
+            spans.setdefault(event.key, []).append((event.at, inf))
+        else:
+            spans[event.key][-1] = spans[event.key][-1][0], event.at
+    rows = [*spans.items()][:_MOST_ROWS]
     height = _MAP + _ROW * (len(rows) + 3)
     parts = [*_map(replay, colors), *_times(replay, rows, colors)]
     return (
@@ -136,17 +141,6 @@ def _times(replay: Replay, rows: list[tuple[Key, list[Span]]], colors: _Colors) 
                 f'<rect x="{x:.1f}" y="{y - 11}" width="{max(width, 1):.1f}" height="14" '
                 f'fill="{color}"/>\n'
             )
-
-
-def _spans(replay: Replay) -> dict[Key, list[Span]]:
-    """Return each event's spans of time; the end of a span that has not ended is ``inf``."""
-    spans: dict[Key, list[Span]] = {}
-    for event, _ in replay.events:
-        if event.starts:
-            spans.setdefault(event.key, []).append((event.at, inf))
-        else:
-            spans[event.key][-1] = spans[event.key][-1][0], event.at
-    return spans
 
 
 def _text(x: float, y: float, text: str, color: str) -> str:

@@ -25,7 +25,6 @@ _QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
 
 
 def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class
-    """Return the class of a message type; ``None`` if the type is not installed."""
     package, _, name = type_name.split("/")
     try:
         return getattr(import_module(f"{package}.msg"), name, None)
@@ -47,8 +46,6 @@ def faults_of_types(file: RuleFile) -> list[Fault]:
 
 
 class SourceSubscriptions:
-    """The subscriptions that one file of rules needs."""
-
     def __init__(
         self,
         node: Node,

@@ -13,10 +13,7 @@ _SECTION = "ros__parameters"
 
 
 def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
-    """Return a node's parameters by dotted name; ``file`` is the file's name for messages.
-
-    The node's own section in the file overrides the section for all nodes.
-    """
+    """Return a node's parameters by dotted name; its own section overrides that for all nodes."""
     data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
         raise InvalidInput([fault("", "must map nodes to their parameters").within(file)])

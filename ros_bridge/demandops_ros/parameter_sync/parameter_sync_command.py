@@ -56,31 +56,31 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     ):
         node = Node("parameter_sync")
         ros_process.log_to(get_logger("demandops"), "info")
-        watch = _watch(node, kubeconfig)
+        given: dict[str, str] = {
+            name: node.declare_parameter(name, default).value
+            for name, default in _PARAMETERS.items()
+        }
+        for name, value in given.items():
+            if not value:
+                raise click.UsageError(
+                    f"parameter {name} is not set; use --ros-args -p {name}:=VALUE"
+                )
+        target, key = given["target_ros_node"], given["ros_params_file_name"]
+        file = f"ConfigMap {given['namespace']}/{given['configmap_name']} {key}"
+        setter = ParameterSetter(node, target)
+
+        def take(data: Mapping[str, str]) -> None:
+            try:
+                if key not in data:
+                    raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
+                setter.want(parameters_of(target, data[key], file))
+            except (DemandOpsError, TypeError, ValueError) as error:
+                node.get_logger().error(one_line(f"{error}; {target} keeps its parameters"))
+
+        watch = ConfigMapWatch(given["namespace"], given["configmap_name"], take, kubeconfig)
         thread = ros_process.ExecutorThread(node)
         wait_for_signal()
+        # the watch first, because it calls the node
         watch.close()
         thread.close()
         node.destroy_node()
-
-
-def _watch(node: Node, kubeconfig: Path | None) -> ConfigMapWatch:
-    given: dict[str, str] = {
-        name: node.declare_parameter(name, default).value for name, default in _PARAMETERS.items()
-    }
-    for name, value in given.items():
-        if not value:
-            raise click.UsageError(f"parameter {name} is not set; use --ros-args -p {name}:=VALUE")
-    target, key = given["target_ros_node"], given["ros_params_file_name"]
-    file = f"ConfigMap {given['namespace']}/{given['configmap_name']} {key}"
-    setter = ParameterSetter(node, target)
-
-    def take(data: Mapping[str, str]) -> None:
-        try:
-            if key not in data:
-                raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
-            setter.want(parameters_of(target, data[key], file))
-        except (DemandOpsError, TypeError, ValueError) as error:
-            node.get_logger().error(one_line(f"{error}; {target} keeps its parameters"))
-
-    return ConfigMapWatch(given["namespace"], given["configmap_name"], take, kubeconfig)

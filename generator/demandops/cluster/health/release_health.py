@@ -36,8 +36,6 @@ class ClusterDomain:
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A release, and whether it should run."""
-
     domain: ClusterDomain
     name: str
     is_service: bool  # else it is the Deployment of a communication client
@@ -46,8 +44,6 @@ class Target:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """The health of a domain or a release."""
-
     state: State
     reason: str = ""  # why the next state is not reached, if possible in the controller's words
     object: str = ""  # from which the reason comes
@@ -84,8 +80,6 @@ def worst(healths: list[Health]) -> Health:
 
 
 class HealthReader(ABC):
-    """Reads the health of releases from the objects of a GitOps controller."""
-
     service_kind: str  # of the object that represents a service
 
     @abstractmethod
@@ -114,7 +108,6 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a release whose domain has applied ``commit``."""
         key = self.key(target)
         item = objects.get(key)
         if not target.wanted:  # then it is healthy if it is gone
@@ -138,7 +131,6 @@ class HealthReader(ABC):
         """Return the commit up to which a domain's folder is applied; empty if it is not known."""
 
     def key(self, target: Target) -> Key:
-        """Return the key of the object that represents a release."""
         kind = self.service_kind if target.is_service else "Deployment"
         return kind, target.domain.namespace, target.name
 

@@ -70,8 +70,6 @@ Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Decision]
 
 
 class Approvals:
-    """Keeps, updates and ends the proposals that await approval."""
-
     def __init__(
         self,
         repository: StateRepository,
@@ -213,7 +211,6 @@ class Approvals:
         return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
-        """Return the newest commits of main and of the proposals' branches, as they are now."""
         self._timer.began()  # this plans the next check, in case the fetch fails
         return self._branches.heads()
 

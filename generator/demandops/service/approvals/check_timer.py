@@ -22,14 +22,12 @@ class CheckTimer:
         self._began = self._rest_until = self._next = 0.0
 
     def is_due(self, tip: str, *, has_news: bool) -> bool:
-        """Return whether to check now; ``has_news`` says whether a proposal has changed."""
         # after a failed check, news wait for the interval: the remote is likely away
         if has_news and self._checked_at is not None:
             return True
         return self.seconds_until_due(tip) <= 0
 
     def seconds_until_due(self, tip: str) -> float:
-        """Return the seconds until the next check; zero or less if it is due."""
         has_moved = self._checked_at not in (tip, None)
         due = min(self._next, self._rest_until) if has_moved else self._next
         return due - self._runtime.monotonic()

@@ -67,7 +67,6 @@ class ForgeWorker:
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:
-        """Return the pull request of a branch as of the last query, if one is known."""
         return self._pull_requests.get(branch)
 
     def forget(self, branch: str, closed_as: str) -> None:

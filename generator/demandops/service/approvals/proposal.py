@@ -33,8 +33,6 @@ _PREFIX = "awaiting approval: "
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The demands of a proposal, grouped by what happens to them."""
-
     # Main has the claims of these, with the decision that each would get on the current main.
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
     # These were withdrawn or turned down, or can no longer be booked.
@@ -62,7 +60,6 @@ class Proposal:
 
     @property
     def waits(self) -> bool:
-        """Whether a demand waits that was not withdrawn."""
         return any(ticket.state == "proposed" for ticket in self.tickets)
 
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
@@ -126,7 +123,6 @@ class Proposal:
         self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
 
     def wait_for(self, left: Decided) -> None:
-        """Keep only these demands, which still need approval."""
         self.tickets = [ticket for ticket, _ in left]
         self.requests = [decision.request for _, decision in left]
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
@@ -194,7 +190,6 @@ def admit_or_none(state: State, goal: object) -> DemandRequest | None:
 
 
 def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
-    """Return the text that a requester gets while the demand awaits approval."""
     branch_and_link = f"{branch} {link}" if link else branch
     why = ", ".join(reasons)
     return one_line(f"{_PREFIX}{branch_and_link}" + (f" (required by {why})" if why else ""))
@@ -208,7 +203,6 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 
 
 def pull_request_texts(message: str) -> tuple[str, str]:
-    """Return the title and the text of a pull request for a commit with this message."""
     # Requesters choose the ids in the message. Outside of a code block, an id could become a link.
     title, fence = message.partition("\n")[0], _fence(message, 3)
     return title, (

@@ -26,8 +26,6 @@ LONGEST_EVALUATION_S = 0.25
 
 
 class Backoff:
-    """The delays of one batch of demands."""
-
     def __init__(self, limit: int, runtime: Runtime) -> None:
         self._limit, self._runtime = limit, runtime
         self.published()

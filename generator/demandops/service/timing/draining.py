@@ -24,8 +24,6 @@ _RETRY = timedelta(seconds=60)
 
 
 class Draining:
-    """Moves placed applications off drained nodes, in one commit for each node."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._tried: dict[str, tuple[Config, datetime]] = {}
@@ -56,11 +54,11 @@ class Draining:
 
     @property
     def has_more(self) -> bool:
-        """Whether the last call left applications for later, which are to be moved soon."""
+        """Whether the last call left applications for later."""
         return bool(self._after)
 
     def postpone(self) -> None:
-        """Begin again with all applications later, because a fetch or a publication failed."""
+        """Begin again with all applications later."""
         self._after.clear()
 
     def _warn(self, node: str, stays: Iterable[str], *, continued: bool = False) -> None:
@@ -74,7 +72,6 @@ class Draining:
         return bool(self._due(world, self._runtime.now()))
 
     def _due(self, world: World, now: datetime) -> list[str]:
-        """Return the drained nodes with applications."""
         nodes = []
         for node in world.config.drained_nodes:
             # not for a minute after a try, unless a person changed the configuration or the clock

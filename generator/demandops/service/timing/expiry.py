@@ -150,8 +150,6 @@ class OverrideExpiry:
 
 
 class ScaleDown:
-    """Removes the replicas that a service no longer keeps."""
-
     def __init__(self) -> None:
         self._retry_at: dict[Instance, datetime] = {}
         self._not_before = datetime.min.replace(tzinfo=timezone.utc)
@@ -172,7 +170,6 @@ class ScaleDown:
                     break
 
     def postpone(self, now: datetime) -> None:
-        """For a minute, count no scale-down as due, because a fetch or a publication failed."""
         self._not_before = now + _RETRY
 
     def is_due(self, ledger: Ledger, now: datetime) -> bool:

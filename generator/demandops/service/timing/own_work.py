@@ -11,8 +11,6 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 
 class OwnWork:
-    """Ends overrides, scales down, drains nodes, and books waiting demands that fit now."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._override_expiry = OverrideExpiry()

@@ -48,14 +48,12 @@ class PollTimer:
         self._requested.set()
 
     def seconds_until_due(self) -> float | None:
-        """Return the seconds until the next fetch, or None if none is planned."""
         times = [] if self._next is None else [self._next]
         if self._requested.is_set():
             times.append(self._last + _SHORTEST_GAP_S)
         return max(min(times) - self._runtime.monotonic(), 0.0) if times else None
 
     def start_if_due(self) -> bool:
-        """Return whether a fetch is due; if it is, the caller must fetch."""
         due = self.seconds_until_due() == 0.0
         if due:  # clear before the fetch: a later push needs another one
             self._requested.clear()

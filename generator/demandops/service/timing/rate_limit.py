@@ -18,8 +18,6 @@ _WINDOW = timedelta(minutes=1)
 
 
 class RateLimit:
-    """Counts the demands of the last minute, for each requester that has a limit."""
-
     def __init__(self) -> None:
         self._seen: dict[tuple[str, str], deque[tuple[datetime, str]]] = {}
 

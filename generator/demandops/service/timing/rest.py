@@ -19,11 +19,9 @@ class Rest:
 
     @property
     def follows_success(self) -> bool:
-        """Whether the next pause is the first one since a success or since the start."""
         return self._next == FIRST_S
 
     def seconds_left(self) -> float:
-        """Return the seconds until the end of the pause; negative after the end."""
         return self._until - self._runtime.monotonic()
 
     def begin(self) -> None:

@@ -24,8 +24,6 @@ _LONGEST_ROUND_S = 0.25
 
 
 class WaitingTurns:
-    """Books waiting demands once there is room for them, in one commit for each."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._tried: World | None = None
@@ -73,15 +71,14 @@ class WaitingTurns:
 
     @property
     def has_more(self) -> bool:
-        """Whether the last round left demands for later, which are to be tried soon."""
+        """Whether the last round left demands for later."""
         return bool(self._left)
 
     def postpone(self) -> None:
-        """Begin again with all waiting demands later, because a fetch or a publication failed."""
+        """Begin again with all waiting demands later."""
         self._left.clear()
 
     def is_due(self, state: State) -> bool:
-        """Return whether there are waiting demands that were not yet tried on this state."""
         return bool(state.ledger.waiting) and (bool(self._left) or not self._is_tried(state))
 
     def _is_tried(self, state: World) -> bool:
