@@ -57,9 +57,7 @@ _RANGES = {
 
 
 def read(given: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return each parameter's value; ``given`` replaces defaults, and the ROS arguments replace
-    both.
-    """
+    """Return all values; ``given`` replaces defaults, and the ROS arguments replace both."""
     # a temporary node reads them, because the generator starts before the node
     defaults = DEFAULTS | {name: value for name, value in given.items() if value}
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)

@@ -173,8 +173,9 @@ class ScaleDown:
         self._not_before = now + _RETRY
 
     def is_due(self, ledger: Ledger, now: datetime) -> bool:
-        due = ledger.kept.due(now)
-        return self._not_before <= now and any(self._retry_at.get(i, now) <= now for i in due)
+        if now < self._not_before:
+            return False
+        return any(self._retry_at.get(due, now) <= now for due in ledger.kept.due(now))
 
     def seconds_until_due(self, ledger: Ledger, now: datetime, longest: float) -> float:
         end = ledger.kept.next_end()
