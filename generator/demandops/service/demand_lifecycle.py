@@ -229,9 +229,9 @@ class Demands:
             ticket.refuse(error)
 
     def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
-        """``others`` counts the demands that were accepted just before, but are not queued yet."""
         if self._closed:
             return ShuttingDown("the generator is shutting down; send the demand again later")
+        # the others were accepted just before, and are not queued yet
         if others + len(self._queue) >= self._limit:
             why = f" and cannot be published ({self.blocked})" if self.blocked else ""
             return QueueFull(
