@@ -25,7 +25,6 @@ from demandops.cluster.health.release_health import ClusterDomain, ObjectSelecto
 from demandops.cluster.object_cache import ObjectCache
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
-from demandops.config.repo_settings import RepoSettings
 from demandops.errors import InvalidInput
 from demandops.http_call import NoAnswer
 from demandops.render.gitops.argocd import project_of
@@ -219,10 +218,24 @@ class ReconcileTrigger:
         elif access.kubeconfig:
             if name not in self._apis:
                 self._apis[name] = access.api()
-            now = self._runtime.now().isoformat()
+            settings, now = config.repo_settings, self._runtime.now().isoformat()
             for domain in wake.domains:
+                if argocd:
+                    group, version, plural = "argoproj.io", "v1alpha1", "applications"
+                    namespace, object_name = argocd.namespace, project_of(domain, settings)
+                    annotation = {_REFRESH: "normal"}
+                else:
+                    group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
+                    namespace, object_name = domain.namespace, settings.source
+                    annotation = {REQUESTED_AT: now}
                 self._apis[name].patch_namespaced_custom_object(
-                    **_refresh_patch(domain, config.repo_settings, now), _request_timeout=_TIMEOUT_S
+                    group=group,
+                    version=version,
+                    namespace=namespace,
+                    plural=plural,
+                    name=object_name,
+                    body={"metadata": {"annotations": annotation}},
+                    _request_timeout=_TIMEOUT_S,
                 )
         else:
             missing = "webhook" if argocd else "receiver"
@@ -243,23 +256,3 @@ def _concerns(path: str, cluster: str) -> bool:
     # files of the ledger and of other clusters do not
     first, _, rest = path.partition("/")
     return rest.startswith(f"{cluster}/") if first == "clusters" else first != "ledger"
-
-
-def _refresh_patch(domain: AccessDomain, repository: RepoSettings, now: str) -> dict[str, Any]:
-    """Return the arguments of an API call that makes the controller fetch a domain's folder."""
-    if repository.gitops == "argocd" and repository.argocd:
-        group, version, plural = "argoproj.io", "v1alpha1", "applications"
-        namespace, name = repository.argocd.namespace, project_of(domain, repository)
-        annotation = {_REFRESH: "normal"}
-    else:
-        group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
-        namespace, name = domain.namespace, repository.source
-        annotation = {REQUESTED_AT: now}
-    return {
-        "group": group,
-        "version": version,
-        "namespace": namespace,
-        "plural": plural,
-        "name": name,
-        "body": {"metadata": {"annotations": annotation}},
-    }

@@ -224,19 +224,20 @@ class Generator:
                 return self._finished
             self._finished = finished = Future[bool]()
         self._demands.close()
-        self._runtime.start_thread("stop", lambda: self._end(timeout, finished))
-        return finished
 
-    def _end(self, timeout: float, finished: Future[bool]) -> None:
-        if not self._have_ended(timeout):
-            self._worker.end_soon()
-        if not self._have_ended(_GRACE_S):  # a thread may still hold locks
-            log.error("the generator did not end; its demands stay in the journal")
-            finished.set_result(False)
-            return
-        unpublished = self._demands.unpublished
-        self._slot.close()
-        finished.set_result(not unpublished)
+        def end() -> None:
+            if not self._have_ended(timeout):
+                self._worker.end_soon()
+            if not self._have_ended(_GRACE_S):  # a thread may still hold locks
+                log.error("the generator did not end; its demands stay in the journal")
+                finished.set_result(False)
+                return
+            unpublished = self._demands.unpublished
+            self._slot.close()
+            finished.set_result(not unpublished)
+
+        self._runtime.start_thread("stop", end)
+        return finished
 
     def _have_ended(self, timeout: float) -> bool:
         end = self._runtime.monotonic() + timeout
