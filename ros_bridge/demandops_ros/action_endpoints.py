@@ -18,23 +18,22 @@ from unique_identifier_msgs.msg import UUID
 
 from demandops_ros.ros_process import ExecutorThread
 
+# The length of the queues for goals, results, cancels and feedback. ROS's default of 10 is too
+# small for a burst, because a client's queue also gets the answers to other clients.
 DEEP_QOS = QoSProfile(depth=2000)
-"""The length of the queues for goals, results, cancels and feedback. ROS's default of 10 is too
-small for a burst, because a client's queue also gets the answers to other clients."""
 
+# How long to wait for the node's response to a goal before the goal is sent again. A node normally
+# responds within milliseconds.
 _UNHEARD_S = 5.0
-"""How many seconds to wait for the node's response to a goal before the goal is sent again. A node
-normally responds within milliseconds."""
 
 _ASK_AGAIN_S = 0.2
 
+# How long ROS keeps a goal that has ended.
 _GOAL_KEPT_S = 10
-"""How many seconds ROS keeps a goal that has ended."""
+# How long LastingResults keeps a result that ROS has forgotten.
 _RESULT_S = 900
-"""How many seconds at least :class:`LastingResults` keeps a result that ROS has forgotten."""
+# How many results it keeps; if there are more, it forgets the oldest ones earlier.
 _MOST_RESULTS = 2_000
-"""How many results :class:`LastingResults` keeps; if there are more, it forgets the oldest ones,
-even within ``_RESULT_S``."""
 
 
 class DemandError(Exception):
@@ -52,12 +51,9 @@ class DemandError(Exception):
 def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rclpy
     """Send the node a harmless request, and return the future of the node's answer.
 
-    The request asks the node to cancel a goal that does not exist. The answer shows that the node
-    has discovered the client.
-
-    A client discovers the node before the node discovers the client. Until then, the node's answers
-    to the client are lost.
+    The answer shows that the node has discovered the client.
     """
+    # It asks to cancel a goal that does not exist.
     nobodys = UUID(uuid=list(bytes.fromhex(REAL.fresh_id().replace("-", ""))))
     return ClientGoalHandle(client, nobodys, None).cancel_goal_async()
 
@@ -65,7 +61,7 @@ def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rcl
 class GoalSender:
     """Sends goals of one action and waits for the answers; many threads may send at once.
 
-    The sender has its own ROS context and thread, separate from the caller's own use of rclpy.
+    A call of :meth:`send` may take ``timeout_s``.
     """
 
     def __init__(
@@ -76,15 +72,6 @@ class GoalSender:
         timeout_s: float,
         domain_id: int | None = None,
     ) -> None:
-        """Start the client.
-
-        Args:
-            action: the action's class.
-            action_name: the name under which a node serves the action.
-            node_name: the name of the client's own ROS node.
-            timeout_s: how many seconds one call of :meth:`send` may take.
-            domain_id: the ROS domain; by default that of the environment.
-        """
         self.timeout_s = timeout_s
         self._action_name = action_name
         self._context = rclpy.Context()
@@ -105,7 +92,6 @@ class GoalSender:
         self._is_discovered = False
 
     def close(self) -> None:
-        """Stop the thread and destroy the node."""
         self._thread.close()
         self._node.destroy_node()
         self._context.try_shutdown()
@@ -117,9 +103,8 @@ class GoalSender:
     ) -> tuple[bool, Any, bool]:
         """Send a goal and wait for its result.
 
-        Returns:
-            Whether the goal succeeded, its result, and whether an earlier attempt to send it got no
-            response. The node may have carried out that attempt too.
+        Return whether the goal succeeded, its result, and whether an earlier attempt to send it got
+        no response. The node may have carried out that attempt too.
 
         Raises:
             DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
@@ -133,43 +118,32 @@ class GoalSender:
                 f"no node in this ROS domain serves {self._action_name}; start one with demandops "
                 "serve, or correct the action's name or ROS_DOMAIN_ID",
             )
-        self._wait_until_discovered(deadline)
-        handle, lost = self._send_until_heard(goal, on_feedback, deadline)
-        if not handle.accepted:
-            message = "the node did not accept the demand (its log says why); send it again later"
-            raise DemandError("rejected", message)
-        answer = self._await(handle.get_result_async(), deadline)
-        return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
-
-    def _wait_until_discovered(self, deadline: float) -> None:
+        # A client discovers the node before the node discovers the client. Until then, the node's
+        # answers to the client are lost.
         while not self._is_discovered and REAL.monotonic() < deadline:
             try:
                 self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)
             except DemandError:
                 continue
             self._is_discovered = True
-
-    def _send_until_heard(
-        self,
-        goal: Any,  # noqa: ANN401
-        on_feedback: Callable[[Any], None],
-        deadline: float,
-    ) -> tuple[Any, bool]:
-        """Send a goal until a node responds; return its handle, and whether an attempt was lost.
-
-        A response is lost if a new node replaced the old one and has not yet discovered this
-        client. Sending the goal again is harmless: a demand that is put twice counts once, and a
-        second release finds nothing to release.
-        """
+        # A response is lost also if a new node replaced the old one and has not yet discovered this
+        # client. Sending the goal again is harmless: a demand that is put twice counts once, and a
+        # second release finds nothing to release.
         lost = False
         while True:
             try:
                 sent = self._start_sending(goal, on_feedback, deadline)
-                return self._await(sent, min(deadline, REAL.monotonic() + _UNHEARD_S)), lost
+                handle = self._await(sent, min(deadline, REAL.monotonic() + _UNHEARD_S))
+                break
             except DemandError:
                 if REAL.monotonic() >= deadline:
                     raise
                 lost = True
+        if not handle.accepted:
+            message = "the node did not accept the demand (its log says why); send it again later"
+            raise DemandError("rejected", message)
+        answer = self._await(handle.get_result_async(), deadline)
+        return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
 
     def _start_sending(
         self,
@@ -177,12 +151,10 @@ class GoalSender:
         on_feedback: Callable[[Any], None],
         deadline: float,
     ) -> Any:  # noqa: ANN401 - a future of rclpy
-        """Send a goal in the thread that also receives; return the future of the node's response.
-
-        rclpy 9.1 registers two futures for a goal, one after the other, and returns the second. If
-        another thread sent the goal, a response could arrive between the two registrations. The
-        response would then resolve only the first future, for which nobody waits.
-        """
+        """Send a goal in the thread that also receives; return the future of the response."""
+        # rclpy 9.1 registers two futures for a goal, one after the other, and returns the second.
+        # If another thread sent the goal, a response could arrive between the two registrations. It
+        # would then resolve only the first future, for which nobody waits.
         sent: Future[Any] = Future()
         done = REAL.event()
 
@@ -217,16 +189,15 @@ class GoalSender:
 class LastingResults(ActionServer):  # type: ignore[misc]
     """An action server that keeps results longer than goals, for clients that ask late.
 
-    Whenever a goal changes, ROS publishes the status of all goals that it keeps. So each kept goal
-    slows down every other goal, in the server and in every client. Therefore ROS keeps a goal for
-    only ten seconds, which is its default, and this class keeps the goal's result for longer.
-
-    The class overrides methods that rclpy calls internally. With a version of rclpy that does not
-    call them, results are kept for ten seconds.
+    With a version of rclpy that does not call the overridden methods, results are kept for ten
+    seconds.
     """
 
+    # Whenever a goal changes, ROS publishes the status of all goals that it keeps. So each kept
+    # goal slows down every other goal, in the server and in every client. Therefore ROS keeps a
+    # goal only for its default of ten seconds, and this class keeps the goal's result for longer.
+
     def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401
-        """Start the server; the arguments are those of :class:`ActionServer`."""
         self._lasting: OrderedDict[bytes, tuple[float, Any]] = OrderedDict()
         super().__init__(*args, result_timeout=_GOAL_KEPT_S, **options)
 
@@ -262,10 +233,13 @@ class OtherServers:
     def find(self) -> dict[str, list[str]]:
         """Return, for each action, the names of the other nodes that serve it; log changes.
 
-        A change is logged only here, so a node that comes and goes between two calls is not seen.
+        A node that comes and goes between two calls is not seen.
         """
         for action, others in self._found.items():
-            now = self._others(action)
+            publishers = self._node.get_publishers_info_by_topic(f"{action}/_action/status")
+            now = sorted(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
+            if self._own in now:
+                now.remove(self._own)  # one entry only: another node may have this name
             if now and now != others:
                 self._node.get_logger().warning(
                     f"{', '.join(now)} serves {action} too, so a client may get its answer "
@@ -275,11 +249,3 @@ class OtherServers:
                 self._node.get_logger().info(f"no other node serves {action} any more")
             self._found[action] = now
         return self._found
-
-    def _others(self, action: str) -> list[str]:
-        """Return the nodes that publish an action's status, except this node."""
-        publishers = self._node.get_publishers_info_by_topic(f"{action}/_action/status")
-        names = [f"{one.node_namespace.rstrip('/')}/{one.node_name}" for one in publishers]
-        if self._own in names:
-            names.remove(self._own)  # one entry only: another node may have this name
-        return sorted(names)

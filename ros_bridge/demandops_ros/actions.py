@@ -24,6 +24,7 @@ from demandops_interfaces.action import Demand
 
 from demandops_ros.messages import ANSWER_LEVELS, demand_goal_to_data, message_to_data
 
+# The first kind that fits counts.
 _CODES: tuple[tuple[type[BaseException], str], ...] = (
     (Withdrawn, "withdrawn"),
     (TurnedDown, "turned-down"),
@@ -34,15 +35,11 @@ _CODES: tuple[tuple[type[BaseException], str], ...] = (
 
 
 class DeploymentRequestAdapter:
-    """The adapter for the reference's action ``DeploymentRequest``.
-
-    The action's results and feedback are plain text.
-    """
+    """The adapter for the reference's action; its results and feedback are plain text."""
 
     action: Any = DeploymentRequest
 
     def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-        """Return a goal as plain data."""
         return message_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
@@ -50,11 +47,10 @@ class DeploymentRequestAdapter:
         return str(goal.id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return None, because a goal of this action names no level at which to answer it."""
+        """Return the level at which to answer a goal; None if it names none."""
         return None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
-        """Return the feedback for a stage."""
         return DeploymentRequest.Feedback(message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
@@ -62,43 +58,28 @@ class DeploymentRequestAdapter:
 
         After success, the first line is ``<outcome>: <commit>``. A line follows for each placed
         application, each warning and each listed item that was not held. After a refusal, each
-        fault has a line ``<code>: <field>: <remedy>``. After another error, the line is
-        ``<code>: <reason>``; for a canceled goal, only the reason.
-
-        Args:
-            outcome: the receipt, or the error.
-            reached: how far the demand's releases came: ``pushed``, ``reconciled`` or ``healthy``.
-                The results of ``DeploymentRequest`` do not contain it.
+        fault has a line ``<code>: <field>: <remedy>``. After another error, the line is ``<code>:
+        <reason>``; for a canceled goal, only the reason.
         """
         return DeploymentRequest.Result(message=_text(outcome))
 
 
 class DemandAdapter(DeploymentRequestAdapter):
-    """The adapter for DemandOps' own action ``Demand``."""
-
     action = Demand
 
     def to_data(self, goal: Any) -> Any:  # noqa: ANN401
-        """Return a goal as plain data."""
         return demand_goal_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
-        """Return the demand's id."""
         return str(goal.demand_id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return the level at which to answer the goal; None if the goal's number is no level."""
         return ANSWER_LEVELS[goal.answer] if goal.answer < len(ANSWER_LEVELS) else None
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
-        """Return feedback with the stage and the text."""
         return Demand.Feedback(stage=stage, message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return a result with a code, and with the message of ``DeploymentRequest``.
-
-        After success, the result also has ``reached`` and fields of the receipt.
-        """
         result = Demand.Result(code=_code(outcome), message=_text(outcome))
         if isinstance(outcome, Receipt):
             result.outcome, result.commit, result.reached = outcome.outcome, outcome.commit, reached

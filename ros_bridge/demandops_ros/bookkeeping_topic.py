@@ -22,10 +22,9 @@ from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 
 def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
-    """Fill the response with the bookkeeping at the revision ``request.at``, and return it.
+    """Fill the response with the bookkeeping at a revision or time, and return it.
 
-    ``request.at`` may also be a time. If it is empty, the revision is the newest commit. If the
-    bookkeeping cannot be computed, the response has the reason.
+    Without ``request.at``, that is the newest commit.
     """
     try:
         snapshot = generator.snapshot_at(request.at) if request.at else generator.snapshot
@@ -47,18 +46,16 @@ def _commit_and_json(snapshot: Snapshot) -> tuple[str, str]:
     return commit, json.dumps(as_data(bookkeeping(snapshot.state), commit), ensure_ascii=False)
 
 
+# A node that starts later gets the last message too.
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 _SHORTEST_PAUSE_S = 1.0
+# The larger the ledger, the longer it takes to compute the bookkeeping. So this takes at most a
+# 20th of the time, and changes during a pause share one message.
 _PAUSE_FACTOR = 20
 
 
 class BookkeepingTopic:
-    """Publishes the bookkeeping on the latched topic ``~/bookkeeping``: at the start and on change.
-
-    The larger the ledger, the longer it takes to compute the bookkeeping. So a separate thread
-    computes it, and then pauses for 20 times as long as the computation took, at least a second.
-    Changes during a pause share one message.
-    """
+    """Publishes the bookkeeping on the topic ``~/bookkeeping``: at the start and on change."""
 
     def __init__(
         self, node: Node, generator: Generator, in_executor: Callable[[Callable[[], None]], None]
@@ -72,7 +69,6 @@ class BookkeepingTopic:
         REAL.keep_running("bookkeeping-topic", self._run)
 
     def close(self) -> None:
-        """Stop publishing."""
         self._closed.set()
         self._changed.set()
 
@@ -87,5 +83,5 @@ class BookkeepingTopic:
             self._closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
 
     def _publish(self, message: Any) -> None:  # noqa: ANN401
-        if not self._closed.is_set():
+        if not self._closed.is_set():  # else the node may be destroyed already
             self._publisher.publish(message)

@@ -34,10 +34,10 @@ log = logging.getLogger("demandops.client")
 StageListener = Callable[[str, str], None]
 """Called with each stage and its text, in the client's thread."""
 
+# The fraction of a lease after which to renew it; a renewal that fails can be repeated in time.
 _RENEW_AFTER = 1 / 3
-"""The fraction of a lease after which to renew it."""
+# After so long, a failed renewal is tried again, or sooner if the lease is short.
 _RETRY_S = 5.0
-"""After this many seconds a failed renewal is tried again, or sooner if the lease is short."""
 _PROBABLY_RELEASED = (
     "the demand holds nothing; an earlier attempt to release it got no response, and has probably "
     "released it"
@@ -174,6 +174,7 @@ class DemandClient:
         succeeded, result, lost = self._sender.send(
             goal, lambda feedback: on_stage(feedback.stage, feedback.message)
         )
+        # an attempt that got no response may have released the demand all the same
         if lost and result.code == "not-held" and goal.operation == Demand.Goal.OPERATION_RELEASE:
             return Answer("released", "", 0.0, (_PROBABLY_RELEASED,), "pushed")
         if not succeeded:

@@ -55,10 +55,17 @@ def demand(
     """
     if hold + release + renew > 1:
         raise click.UsageError("--hold, --release and --renew cannot be combined")
-    data = _read_document(file)
+    name, text = read_input(file)
+    data = strict_yaml.load(text, name)
+    if not isinstance(data, dict) or data.get("kind") != "Demand":
+        message = (
+            "the file must be a mapping whose kind is Demand; "
+            "to book a DeploymentRequest, use demandops request, which needs no node"
+        )
+        raise InvalidInput([fault("kind", message).within(name)])
     if release or renew:
         names = ("demand", "requesters", "request")
-        data = {name: value for name, value in data.items() if name in names}
+        data = {field: value for field, value in data.items() if field in names}
         data["operation"] = "release" if release else "renew"
     with DemandClient(action_name=action, timeout_s=timeout) as client:
         try:
@@ -72,18 +79,6 @@ def demand(
             raise InvalidInput(faults) from None
         except (ValueError, TypeError, AssertionError, AttributeError, OverflowError) as error:
             raise InvalidInput([fault("", f"is not a demand: {error}").within(file)]) from None
-
-
-def _read_document(file: str) -> dict[str, Any]:
-    name, text = read_input(file)
-    data = strict_yaml.load(text, name)
-    if not isinstance(data, dict) or data.get("kind") != "Demand":
-        message = (
-            "the file must be a mapping whose kind is Demand; "
-            "to book a DeploymentRequest, use demandops request, which needs no node"
-        )
-        raise InvalidInput([fault("kind", message).within(name)])
-    return data
 
 
 def _print_stages(output: str) -> Any:  # noqa: ANN401

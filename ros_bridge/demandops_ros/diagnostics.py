@@ -21,8 +21,6 @@ _MOST_PROBLEMS = 20
 
 
 class Diagnostics:
-    """Publishes the status of a node and of its generator's state repo."""
-
     def __init__(self, node: Node, generator: Generator, others: OtherServers) -> None:
         self._node, self._generator, self._others = node, generator, others
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -31,58 +29,54 @@ class Diagnostics:
     def _publish(self) -> None:
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        of_each = (_of_state_repo, _of_configuration, _of_parts)
-        message.status = [of_one(self._generator) for of_one in of_each]
-        message.status.append(_of_actions(self._generator, self._others.find()))
+        generator, address, statuses = self._generator, self._generator.address, []
+
+        remote, unpublished = generator.remote_status, generator.unpublished
+        level, text = DiagnosticStatus.OK, "reachable"
+        if remote.push_denied:
+            level, text = DiagnosticStatus.ERROR, remote.push_denied
+        if remote.unreachable:
+            # while no demand waits, an unreachable repo delays only people's changes
+            level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
+            text = remote.unreachable
+        values = {
+            "reachable": str(not remote.unreachable).lower(),
+            "away since": _time(remote.unreachable_since),
+            "last reached": _time(remote.last_reached),
+            "last push": _time(remote.last_push),
+            "unpublished demands": str(unpublished),
+            "commit": str(generator.snapshot.commit),
+        }
+        statuses.append(status("demandops: state repo", address, level, text, values))
+
+        problems = generator.snapshot.problems
+        level, text = DiagnosticStatus.OK, "all files are valid"
+        if problems:
+            level = DiagnosticStatus.WARN
+            text = f"{len(problems)} problems; the last valid version is in effect"
+        values = {"problems": str(len(problems))}
+        for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
+            values[f"problem {number}"] = str(problem)
+        statuses.append(status("demandops: configuration", address, level, text, values))
+
+        failures = generator.failures
+        level, text = DiagnosticStatus.OK, "all parts work"
+        if failures:
+            level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
+        statuses.append(status("demandops: generator", address, level, text, failures))
+
+        others = self._others.find()
+        level, text = DiagnosticStatus.OK, "no other node serves these actions"
+        if any(others.values()):
+            level, text = (
+                DiagnosticStatus.WARN,
+                "another node serves these actions too; see the log",
+            )
+        values = {action: ", ".join(nodes) for action, nodes in others.items()}
+        statuses.append(status("demandops: actions", address, level, text, values))
+
+        message.status = statuses
         self._publisher.publish(message)
-
-
-def _of_state_repo(generator: Generator) -> DiagnosticStatus:
-    remote, unpublished = generator.remote_status, generator.unpublished
-    level, text = DiagnosticStatus.OK, "reachable"
-    if remote.push_denied:
-        level, text = DiagnosticStatus.ERROR, remote.push_denied
-    if remote.unreachable:
-        # while no demand waits, an unreachable repo delays only people's changes: just a warning
-        level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
-        text = remote.unreachable
-    values = {
-        "reachable": str(not remote.unreachable).lower(),
-        "away since": _time(remote.unreachable_since),
-        "last reached": _time(remote.last_reached),
-        "last push": _time(remote.last_push),
-        "unpublished demands": str(unpublished),
-        "commit": str(generator.snapshot.commit),
-    }
-    return status("demandops: state repo", generator.address, level, text, values)
-
-
-def _of_configuration(generator: Generator) -> DiagnosticStatus:
-    problems = generator.snapshot.problems
-    level, text = DiagnosticStatus.OK, "all files are valid"
-    if problems:
-        level = DiagnosticStatus.WARN
-        text = f"{len(problems)} problems; the last valid version is in effect"
-    values = {"problems": str(len(problems))}
-    for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
-        values[f"problem {number}"] = str(problem)
-    return status("demandops: configuration", generator.address, level, text, values)
-
-
-def _of_parts(generator: Generator) -> DiagnosticStatus:
-    failures = generator.failures
-    level, text = DiagnosticStatus.OK, "all parts work"
-    if failures:
-        level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
-    return status("demandops: generator", generator.address, level, text, failures)
-
-
-def _of_actions(generator: Generator, others: dict[str, list[str]]) -> DiagnosticStatus:
-    level, text = DiagnosticStatus.OK, "no other node serves these actions"
-    if any(others.values()):
-        level, text = DiagnosticStatus.WARN, "another node serves these actions too; see the log"
-    values = {action: ", ".join(nodes) for action, nodes in others.items()}
-    return status("demandops: actions", generator.address, level, text, values)
 
 
 def status(

@@ -20,9 +20,7 @@ from demandops_interfaces.action import Demand as DemandMessage
 def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
     """Return a message as mappings, lists and plain values, in the form that its YAML text has.
 
-    A ``DeploymentRequest.Goal`` becomes the data for
-    :func:`demandops.demand.deployment_request_goal.parse`, so that a goal over ROS 2 equals the
-    same goal in a file.
+    So a goal over ROS 2 equals the same goal in a file.
     """
     fields = getattr(message, "get_fields_and_field_types", None)
     if fields is not None:
@@ -59,22 +57,25 @@ _ROUTE |= {name: name for name in RouteOptions.model_fields}
 
 
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return a ``Demand.Goal`` as plain data for :func:`demandops.demand.demand_goal.parse`.
-
-    The message has numbers where a document has words. A number without a word becomes text, such
-    as ``"9"``. The parser refuses that text and names the field.
-    """
+    """Return a ``Demand.Goal`` as data for :func:`demandops.demand.demand_goal.parse`."""
     data = {
         "apiVersion": API_VERSION,
         "kind": "Demand",
         "operation": _word(_OPERATIONS, goal.operation),
         **_data(goal, _DEMAND),
         "applications": [_application(app) for app in goal.applications],
-        "connections": [_connection(connection) for connection in goal.connections],
+        "connections": [
+            {
+                **_data(connection, _CONNECTION),
+                "type": _word(_TYPES[:-1], connection.type),
+                "topics": [_data(route, _ROUTE) for route in connection.topics],
+            }
+            for connection in goal.connections
+        ],
         "positions": [_data(position, _POSITION) for position in goal.positions],
         "answer": _word(ANSWER_LEVELS, goal.answer),
     }
-    if goal.lease.sec or goal.lease.nanosec:  # rounded up to whole seconds
+    if goal.lease.sec or goal.lease.nanosec:  # rounded up, so that no lease ends too early
         data["lease"] = goal.lease.sec + bool(goal.lease.nanosec)
     return data
 
@@ -82,10 +83,8 @@ def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
 def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return the ``Demand.Goal`` for a document of the kind ``Demand``.
 
-    Raises:
-        ValueError: for an unknown field or word, or a lease that is no duration.
-        TypeError, AssertionError, AttributeError, OverflowError: for a value of the wrong type, or
-            a number that is too large.
+    ValueError is raised for an unknown field or word, or a lease that is no duration. A value that
+    the message cannot carry raises TypeError, AssertionError, AttributeError or OverflowError.
     """
     more = {"apiVersion", "kind", "lease", "operation", "answer"}
     more |= {"applications", "connections", "positions"}
@@ -110,7 +109,9 @@ def _application(app: Any) -> dict[str, Any]:  # noqa: ANN401
         inputs.setdefault(item.role, []).append(_data(item, _INPUT))
     return {
         **_data(app, _APPLICATION),
-        "services": dict(_pair(text) for text in app.services),
+        "services": {
+            service: node for service, _, node in (text.partition("=") for text in app.services)
+        },
         "inputs": inputs,
         "parameters_json": {parameter.name: parameter.value_json for parameter in app.parameters},
         "connect": _word(_TYPES, app.connect),
@@ -145,25 +146,11 @@ def _application_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     )
 
 
-def _pair(text: str) -> tuple[str, str]:
-    """Return the service and the node in ``service=node``; without ``=``, the node is empty."""
-    service, _, node = text.partition("=")
-    return service, node
-
-
-def _connection(connection: Any) -> dict[str, Any]:  # noqa: ANN401
-    return {
-        **_data(connection, _CONNECTION),
-        "type": _word(_TYPES[:-1], connection.type),
-        "topics": [_data(route, _ROUTE) for route in connection.topics],
-    }
-
-
 def _connection_message(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
     topics = []
     for route in data.get("topics", ()):
         fields = _fields(route, _ROUTE, set(), "a topic of a connection")
-        if "rate" in fields:
+        if "rate" in fields:  # a message refuses the integer that people write
             fields["rate"] = float(fields["rate"])
         topics.append(_message(messages.Route, **fields))
     return _message(
@@ -181,13 +168,7 @@ def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: AN
 def _fields(
     data: Mapping[str, Any], names: Mapping[str, str], others: set[str], what: str
 ) -> dict[str, Any]:
-    """Return the fields of ``data`` that ``names`` lists, under their names in the message.
-
-    ``others`` lists the fields that the caller converts.
-
-    Raises:
-        ValueError: for a field of ``data`` that is neither in ``names`` nor in ``others``.
-    """
+    """Return the fields that ``names`` lists, under their names in the message; refuse others."""
     known = {*others, *names}
     for name in data:
         if name not in known:
@@ -203,11 +184,8 @@ def _message(kind: Any, **values: Any) -> Any:  # noqa: ANN401 - a generated cla
 
 
 def _checking(message: Any) -> Any:  # noqa: ANN401
-    """Make a message check the values that are assigned to it, and return it.
-
-    Messages may not check them by default. A value of a wrong type then ends the process when the
-    message is sent.
-    """
+    # Messages may not check the values that are assigned to them. A value of a wrong type would
+    # then end the process when the message is sent.
     if hasattr(message, "_check_fields"):
         message._check_fields = True
     return message
@@ -220,30 +198,28 @@ def _number(words: tuple[str, ...], word: str, field: str) -> int:
 
 
 def _word(words: tuple[str, ...], number: int) -> str:
+    # of a number without a word, the parser refuses the text, and so names the field
     return words[number] if number < len(words) else str(number)
 
 
 def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
     """Fill a message from plain data and return it; missing fields keep ROS's defaults.
 
-    Raises:
-        AttributeError: for a field that the message does not have.
-        AssertionError, TypeError, AttributeError: for a value of the wrong type.
+    A field or value that the message cannot carry raises AttributeError, AssertionError or
+    TypeError.
     """
     _checking(message)
     types = message.get_fields_and_field_types()
     for name, value in data.items():
         if name not in types:
             raise AttributeError(f"{type(message).__name__} has no field '{name}'")
-        setattr(message, name, _converted(getattr(message, name), types[name], value))
+        converted = value
+        if isinstance(value, dict):
+            converted = fill_message(getattr(message, name), value)
+        elif isinstance(value, list) and "/" in types[name]:  # sequence<pkg/Name>
+            item_type = types[name].removeprefix("sequence<").split(">")[0].split(",")[0]
+            package, class_name = item_type.split("/")
+            new = getattr(import_module(f"{package}.msg"), class_name)
+            converted = [fill_message(new(), item) for item in value]
+        setattr(message, name, converted)
     return message
-
-
-def _converted(default: Any, type_name: str, value: Any) -> Any:  # noqa: ANN401
-    if isinstance(value, dict):
-        return fill_message(default, value)
-    if isinstance(value, list) and "/" in type_name:  # sequence<pkg/Name>
-        package, name = type_name.removeprefix("sequence<").split(">")[0].split(",")[0].split("/")
-        new = getattr(import_module(f"{package}.msg"), name)
-        return [fill_message(new(), item) for item in value]
-    return value

@@ -33,38 +33,30 @@ from demandops_ros.actions import DemandAdapter, DeploymentRequestAdapter
 from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
 from demandops_ros.diagnostics import Diagnostics
 
+# How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost.
 _DEFAULT_DEPTH = 10
-"""How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost."""
 _SHALLOW = (
     f"more than {_DEFAULT_DEPTH} goals of all clients are open: a client with ROS 2's default "
     f"queue of {_DEFAULT_DEPTH} may miss results; give the client a deeper queue (docs/demand.md)"
 )
+# How many calls of the bookkeeping service may wait for their answers. Each may read the whole
+# history. They are answered one after the other, because several computing threads would delay the
+# demands much longer.
 _MOST_READERS = 4
-"""How many calls of the bookkeeping service may wait for their answers.
-
-Each call may read the whole history. The calls are answered one after the other, because several
-computing threads would delay the demands much longer.
-"""
 
 
 @dataclass(eq=False)
 class _Goal:
-    """A goal, its demand and, after the acceptance, its handle.
-
-    ``feedback`` collects the feedback that is made before the handle exists.
-    """
-
     adapter: DeploymentRequestAdapter
     message: Any
     ticket: Ticket = field(init=False)
-    handle: Any = None
+    handle: Any = None  # after the acceptance
     outcome: Receipt | BaseException = field(init=False)
     reached: Level = "pushed"
-    feedback: list[Any] = field(default_factory=list)
+    feedback: list[Any] = field(default_factory=list)  # that was made before the handle exists
     is_refused: bool = False
 
     def __str__(self) -> str:
-        """Return the goal's name in the log."""
         return f"goal {quoted(self.adapter.name(self.message))}"
 
 
@@ -82,18 +74,14 @@ class DemandNode(Node):  # type: ignore[misc]
     ) -> None:
         """Start the servers.
 
-        Args:
-            generator: takes the demands.
-            action_name, demand_action_name: the names of the two actions.
-            level: the level at which to answer a goal that names no level.
-            timeout_s: how many seconds a rollout may take to reach its level before its goal fails.
-            status: watches rollouts; None without access to the clusters.
+        ``level`` is that at which to answer a goal that names none. ``timeout_s`` limits a rollout.
         """
         super().__init__("demandops")
         self._generator = generator
         self._level, self._timeout_s, self._status = level, timeout_s, status
+        # The goals without a result, by `id()` of their messages: rclpy has no other name for a
+        # goal that all its callbacks get.
         self._goals: dict[int, _Goal] = {}
-        """The goals without a result, by ``id()`` of their messages."""
         self._events: deque[Callable[[], None]] = deque()
         self._readers = 0
         self._last_reading: Future | None = None
@@ -132,22 +120,17 @@ class DemandNode(Node):  # type: ignore[misc]
         )
 
     def close(self) -> None:
-        """Stop the node's threads, except the executor's."""
         self._bookkeeping_topic.close()
 
     @property
     def open_goals(self) -> int:
-        """How many goals have no result yet."""
         return len(self._goals)
 
     async def _bookkeeping(self, request: Any, response: Any) -> Any:  # noqa: ANN401
-        """Answer a call of the bookkeeping service, in another thread.
-
-        A call that reads an old revision may take seconds, and must not block the executor.
-        """
         if self._readers >= _MOST_READERS:
             response.message = f"{_MOST_READERS} calls are being answered; try again later"
             return response
+        # in another thread, because a call that reads an old revision may take seconds
         before, done = self._last_reading, Future(executor=self.executor)
 
         def work() -> None:
@@ -172,11 +155,9 @@ class DemandNode(Node):  # type: ignore[misc]
         adapter: DeploymentRequestAdapter,
         message: Any,  # noqa: ANN401
     ) -> GoalResponse:
-        """Accept a goal once its demand is in the journal, so that no crash loses an accepted goal.
-
-        Goals that arrive while the journal syncs share the next sync. An invalid goal is accepted
-        too, because a result can contain the reason, but a rejection cannot.
-        """
+        """Accept a goal once its demand is in the journal, so that no crash loses it."""
+        # An invalid goal is accepted too, because a result can contain the reason, but a rejection
+        # cannot. Goals that arrive while the journal syncs share the next sync.
         goal = self._goals[id(message)] = _Goal(adapter, message)
         journaled = Future(executor=self.executor)
         try:
@@ -201,9 +182,8 @@ class DemandNode(Node):  # type: ignore[misc]
         return GoalResponse.REJECT
 
     def _accepted(self, handle: ServerGoalHandle) -> None:
-        """Store the handle, which rclpy makes now; publish the feedback that came before."""
         goal = self._goals[id(handle.request)]
-        goal.handle = handle
+        goal.handle = handle  # which rclpy makes only now
         for feedback in goal.feedback:
             handle.publish_feedback(feedback)
         goal_id = uuid.UUID(bytes=bytes(handle.goal_id.uuid))
@@ -211,11 +191,7 @@ class DemandNode(Node):  # type: ignore[misc]
         self._after(goal, goal.ticket.future, self._answer)
 
     def _forget_unless_accepted(self, goal: _Goal) -> None:
-        """Forget a goal if its acceptance did not reach the client.
-
-        The goal's demand is still carried out.
-        """
-        if goal.handle is None:
+        if goal.handle is None:  # the acceptance did not reach the client
             del self._goals[id(goal.message)]
             self.get_logger().warning(
                 f"{goal}: its client did not get the acceptance and will get no result; demand "
@@ -223,10 +199,6 @@ class DemandNode(Node):  # type: ignore[misc]
             )
 
     def _cancel(self, handle: ServerGoalHandle) -> CancelResponse:
-        """Withdraw the demand of a goal; reject the cancellation if it is too late.
-
-        It is too late once the demand is committed or answered.
-        """
         goal = self._goals.get(id(handle.request))
         if goal is not None and self._generator.withdraw(goal.ticket.operation):
             return CancelResponse.ACCEPT
@@ -252,12 +224,9 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- an accepted goal, in the executor's thread ----
 
     def _after(self, goal: _Goal, future: Any, step: Callable[[_Goal, Any], None]) -> None:  # noqa: ANN401
-        """Make the executor call ``step`` once a future is done.
+        """Make the executor call ``step`` with the goal and the future's result or error."""
 
-        ``step`` gets the goal, and the result or the error of the future. A coroutine would be
-        slower: rclpy's executor would resume all waiting coroutines at each event.
-        """
-
+        # a coroutine would be slower: rclpy's executor resumes all waiting ones at each event
         def take() -> None:
             try:
                 step(goal, future.exception() or future.result())
@@ -303,10 +272,7 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- events that other threads pass to the executor's thread ----
 
     def _tell(self, goal: _Goal, stage: str, text: str) -> None:
-        """Send a stage as feedback, or log it if it is ``refused``.
-
-        The result will report the refusal too, but a crash may come before the result.
-        """
+        # the result will report a refusal too, but a crash may come before the result
         if stage == "refused":
             goal.is_refused = True
             self.get_logger().error(f"{goal}: {_one_line(text)}")

@@ -57,17 +57,8 @@ _RANGES = {
 
 
 def read(given: Mapping[str, str | None]) -> dict[str, Any]:
-    """Return the value of each parameter.
-
-    A temporary node reads them, because the generator starts before the node.
-
-    Args:
-        given: values that replace defaults; None and "" keep the default. A value in the ROS
-            arguments replaces both.
-
-    Raises:
-        click.UsageError: if a value is not valid.
-    """
+    """Return all values; ``given`` replaces defaults, and the ROS arguments replace both."""
+    # a temporary node reads them, because the generator starts before the node
     defaults = DEFAULTS | {name: value for name, value in given.items() if value}
     probe = Node("demandops", start_parameter_services=False, enable_rosout=False)
     try:

@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from demandops.config.config import BROKERS_FILE, DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
-from demandops.config.inventory import Broker
 from demandops.quoting import quoted
 from rclpy.node import Node
 
@@ -34,6 +33,7 @@ _REPLACED = {
 
 def read(ros_args: Sequence[str]) -> dict[str, Any]:
     """Return the reference node's parameters, from ROS arguments and their parameter files."""
+    # a rule that renames our node would rename the temporary one, and hide the file's section
     renames = {
         at
         for at, word in enumerate(ros_args)
@@ -49,19 +49,15 @@ def read(ros_args: Sequence[str]) -> dict[str, Any]:
         automatically_declare_parameters_from_overrides=True,
     )
     try:
-        found = probe.get_parameters_by_prefix("")
-        return {name: parameter.value for name, parameter in found.items()}
+        parameters = probe.get_parameters_by_prefix("")
+        return {name: parameter.value for name, parameter in parameters.items()}
     finally:
         probe.destroy_node()
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
-    """Yield a warning for each parameter in ``values`` that our node replaces by other means.
-
-    The parameters of namespace, image registry, brokers and topics get a warning only if the state
-    repo lacks their value. The warning says what replaces the parameter, or what to add.
-    """
-    for name in dict.fromkeys(each.partition(".")[0] for each in values):
+    """Yield a warning for each parameter in ``values`` that our node replaces by other means."""
+    for name in dict.fromkeys(dotted.partition(".")[0] for dotted in values):
         if name in _REPLACED:
             yield f"parameter {name} of the reference is not used: {_REPLACED[name]}"
     namespaces = {domain.namespace for domain in config.domains.values()}
@@ -81,10 +77,10 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
         )
     yield from _brokers(values, config)
     topics = values.get("connections.init_comm_topics") or ()
-    known = {
+    bridged = {
         topic for node in config.nodes.values() for to in node.bridged.values() for topic in to
     }
-    if missing := [topic for topic in topics if topic not in known]:
+    if missing := [topic for topic in topics if topic not in bridged]:
         yield (
             "parameter connections.init_comm_topics of the reference is not used: add "
             f"{', '.join(missing)} to the field 'bridged' of the source node in "
@@ -98,20 +94,16 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
         if match is None:
             continue
         port, node = values.get(f"{name.removesuffix('host')}port"), match["node"]
-        brokers = [broker for one, broker in config.brokers.items() if node in (None, one)]
-        if not any(_is_at(one, host, one.port if port is None else port) for one in brokers):
+        # the host in the inventory may end in the namespace, as in broker.c-its
+        is_there = any(
+            port in (None, broker.port) and f"{broker.host}.".startswith(f"{host}.")
+            for broker_node, broker in config.brokers.items()
+            if node in (None, broker_node)
+        )
+        if not is_there:
             place = f"of node {quoted(node)} " if node else ""
             address = host if port is None else f"{host}:{port}"
             yield (
                 f"parameter {name} of the reference is not used: the broker {place}at "
                 f"{address} is not in {config.place_of(BROKERS_FILE)}; add it there"
             )
-
-
-def _is_at(broker: Broker, host: str, port: object) -> bool:
-    """Return whether a broker is at the address ``host`` and ``port``.
-
-    The host in the inventory may be longer than ``host``: it may end in the namespace, as in
-    ``broker.c-its``.
-    """
-    return port == broker.port and f"{broker.host}.".startswith(f"{host}.")

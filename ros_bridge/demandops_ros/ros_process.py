@@ -26,29 +26,22 @@ _LAST_CALLBACK_S = 20.0
 
 
 class ExecutorThread:
-    """Runs a node's callbacks in a thread; :meth:`close` ends the thread.
-
-    The thread must end before the node is destroyed. rclpy's ``shutdown`` is not enough, because it
-    does not wait for running callbacks. The thread must also end before Python exits. A thread that
-    waits for ROS while Python exits aborts the process.
-    """
+    """Runs a node's callbacks in a thread, which must end before the node is destroyed."""
 
     def __init__(self, node: Node, name: str = "executor") -> None:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._over = REAL.event()
         self._thread = REAL.keep_running(name, self._spin)
-        atexit.register(self.close)  # in case no caller closes it
+        # If no caller closes it: a thread that waits for ROS while Python exits aborts the process.
+        atexit.register(self.close)
 
     def call(self, callback: Callable[[], object]) -> None:
-        """Call ``callback`` in the executor's thread."""
         self._executor.create_task(callback)
 
     def close(self) -> None:
-        """End the thread, so that the node may be destroyed; wait up to 20 s for a callback.
-
-        A second call does nothing.
-        """
+        """End the thread, so that the node may be destroyed; wait up to 20 s for a callback."""
+        # rclpy's shutdown is not enough, because it does not wait for running callbacks
         atexit.unregister(self.close)
         if not self._over.is_set():
             self._over.set()
@@ -86,15 +79,12 @@ def stop_signals() -> Iterator[Callable[[], None]]:
 
 
 class RosLogHandler(logging.Handler):
-    """Passes the generator's log records to ROS's log."""
-
     def __init__(self, logger: RcutilsLogger) -> None:
         super().__init__()
         self._log = logger
         self.setFormatter(OneLineFormatter())
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Log a record at the matching ROS level."""
         text = self.format(record)  # in rclpy, a line of code can log at one level only
         if record.levelno >= logging.ERROR:
             self._log.error(text)
@@ -110,12 +100,7 @@ class RosLogHandler(logging.Handler):
 def started(
     arguments: Sequence[str], signals: SignalHandlerOptions = SignalHandlerOptions.ALL
 ) -> Iterator[list[str]]:
-    """Run the block with ROS initialized from ``arguments``, and yield the arguments as a list.
-
-    Raises:
-        click.UsageError: if ``arguments`` begin with anything but ``--ros-args``, or ROS refuses
-            them.
-    """
+    """Run the block with ROS initialized, and yield its arguments."""
     ros_args = list(arguments)
     if ros_args and ros_args[0] != "--ros-args":
         raise click.UsageError(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 from types import FrameType
@@ -147,7 +147,13 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
             parts.callback(push_webhook.close)
             get_logger("demandops").info(f"listening for pushes at {push_webhook.url}")
         if web:
-            parts.callback(_page(web, generator, settings, clusters).close)
+            # the page fetches the state repo on its own, and after each publication
+            interval = parse_interval(settings["fetch_interval"])
+            follower = Follower(Reader.of(settings["state_repo"]), clusters, interval)
+            generator.on_publish(lambda config: follower.wake())
+            page = WebServer(web, "--web", follower)
+            parts.callback(page.close)
+            get_logger("demandops").info(f"the page of the state repo is at {page.url}")
         status = RolloutWatcher(clusters, generator) if clusters else None
         if status is not None:
             parts.callback(status.close)
@@ -164,25 +170,6 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
             generator.close()
         else:
             _run(generator, settings, status, signals)
-
-
-def _page(
-    address: str,
-    generator: Generator,
-    settings: dict[str, Any],
-    clusters: Mapping[str, clusters_file.ClusterAccess],
-) -> WebServer:
-    """Start the server of the web page, and return it.
-
-    The page fetches the state repo on its own, as often as the node does, and after each
-    publication.
-    """
-    interval = parse_interval(settings["fetch_interval"])
-    follower = Follower(Reader.of(settings["state_repo"]), clusters, interval)
-    generator.on_publish(lambda config: follower.wake())
-    page = WebServer(address, "--web", follower)
-    get_logger("demandops").info(f"the page of the state repo is at {page.url}")
-    return page
 
 
 def _run(
@@ -209,23 +196,7 @@ def _run(
     names = f"{settings['action_name']} and {settings['demand_action_name']}"
     node.get_logger().info(f"taking demands on {names} for {generator.address}")
     signals.wait()
-    _drain(thread, node, generator, status)
-    thread.close()
-    node.close()
-    node.destroy_node()
-
-
-def _drain(
-    thread: ros_process.ExecutorThread,
-    node: DemandNode,
-    generator: Generator,
-    status: RolloutWatcher | None,
-) -> None:
-    """Finish the open goals before the node is destroyed.
-
-    The generator publishes queued demands for some seconds. Then the results of all open goals are
-    sent.
-    """
+    # the clients of open goals get their results before the node is destroyed
     node.get_logger().info(f"stopping: finishing {node.open_goals} open goals")
     published = generator.stop().result()
     if status is not None:
@@ -242,23 +213,22 @@ def _drain(
         node.get_logger().warning(
             "the journal is not empty; its demands are resumed at the next start"
         )
+    thread.close()
+    node.close()
+    node.destroy_node()
 
 
 class _Signals:
-    """Handles Ctrl-C and SIGTERM.
-
-    After the first signal, the program finishes its goals and stops. A second signal stops the
-    program at once. The kernel may deliver a signal to any thread, so Python writes each signal to
-    a wake-up pipe that the main thread reads.
-    """
+    """Handles Ctrl-C and SIGTERM: the first ends the program in order, the second at once."""
 
     def __init__(self) -> None:
         self.stopping = False
+        # The kernel may deliver a signal to any thread, so Python writes each signal to a pipe that
+        # the main thread reads.
         self._read, self._write = os.pipe()
         os.set_blocking(self._write, False)
 
     def __enter__(self) -> _Signals:
-        """Handle the signals from now on."""
         self._wakeup = signal.set_wakeup_fd(self._write)
         numbers = (signal.SIGINT, signal.SIGTERM)
         self._before = {number: signal.signal(number, self._handle) for number in numbers}
@@ -266,17 +236,12 @@ class _Signals:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Restore the earlier handlers of the signals."""
         for number, handler in self._before.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._wakeup)
 
     def wait(self, until: Callable[[], bool] = lambda: False) -> None:
-        """Wait until a signal comes or ``until()`` is true.
-
-        Each call of :meth:`wake` makes this method check ``until()`` again. If :class:`Unsound` was
-        raised in any thread, this method ends the process.
-        """
+        """Wait until a signal comes or ``until()`` is true, which each :meth:`wake` checks."""
         while not (self.stopping or until() or REAL.unsound):
             os.read(self._read, 1)
         if REAL.unsound is not None:

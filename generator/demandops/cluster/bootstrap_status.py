@@ -14,16 +14,12 @@ from demandops.render.gitops.paths import bootstrap_path
 
 @dataclass(frozen=True, slots=True)
 class OldBootstrap:
-    """A cluster without the current bootstrap file, and the command that applies the file."""
-
     cluster: str
     file: str
-    domains: tuple[str, ...]
-    """The access domains whose objects are old or missing."""
+    domains: tuple[str, ...]  # whose objects are old or missing
     command: str
 
     def __str__(self) -> str:
-        """Return a sentence about the cluster, with the remedy."""
         return (
             f"cluster '{self.cluster}' does not have the current {self.file} (access domains: "
             f"{', '.join(self.domains)}); an administrator of the cluster must apply it: "
@@ -36,14 +32,8 @@ def old_bootstraps(
     caches: Mapping[str, ObjectCache],
     read: Callable[[str], str | None],
 ) -> list[OldBootstrap]:
-    """Return the clusters without the current bootstrap file; skip domains that cannot be read.
-
-    Args:
-        domains: the access domains on each cluster.
-        caches: the objects that were read from each cluster.
-        read: returns the text of a file of the state repo, or None if the file is missing.
-    """
-    found = []
+    """Return the clusters without the current bootstrap file; skip domains that cannot be read."""
+    clusters = []
     for cluster in sorted({domain.cluster for domain in domains} & caches.keys()):
         path = bootstrap_path(cluster)
         digest = digest_in(read(path) or "")
@@ -57,5 +47,5 @@ def old_bootstraps(
         )
         if digest and old:
             command = f"git show main:{path} | kubectl apply -f -"
-            found.append(OldBootstrap(cluster, path, old, command))
-    return found
+            clusters.append(OldBootstrap(cluster, path, old, command))
+    return clusters

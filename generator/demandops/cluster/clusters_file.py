@@ -19,10 +19,7 @@ from demandops.input_file import read_input, read_secret
 
 
 class NoAccess(ValueError):
-    """Raised if a controller cannot be woken, because an address or a kubeconfig is missing.
-
-    The message contains no secret.
-    """
+    """Raised, without a secret in the text, if a controller has no address or kubeconfig."""
 
 
 class ClusterAccess(FrozenModel):
@@ -50,22 +47,12 @@ class ClusterAccess(FrozenModel):
         return self
 
     def secret(self) -> bytes | None:
-        """Return the secret that signs webhook calls, or None if no ``secret_file`` is given.
-
-        Each call reads the file again, so that the secret can be replaced.
-
-        Raises:
-            InvalidInput: if the file is empty, cannot be read, or can be read by everybody on this
-                machine.
-        """
+        """Return the secret that signs webhook calls; a file that others may read is a fault."""
+        # read in each call, so that a secret can be replaced while this process runs
         return read_secret(self.secret_file, private=True) if self.secret_file else None
 
     def api(self) -> Any:  # noqa: ANN401 - the library has no types
-        """Return the cluster's API for objects of any kind. The access must have a kubeconfig.
-
-        Raises:
-            Exception: of any kind, from the library, if the kubeconfig cannot be used.
-        """
+        """Return the cluster's API for objects of any kind. The access must have a kubeconfig."""
         from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
 
         return client.CustomObjectsApi(
@@ -76,17 +63,13 @@ class ClusterAccess(FrozenModel):
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
     """Return the API of the cluster in which this process runs as a pod.
 
-    The API does not retry a failed call. Its calls have the rights of the pod's service account.
-
-    Args:
-        wanted_by: the option or command that needs the API, for the message.
-
-    Raises:
-        InvalidInput: if this process is not a pod, or its pod has no token.
+    Its calls have the rights of the pod's service account. ``wanted_by`` is the option or command
+    that needs the API: InvalidInput names it if this process is no pod with a token.
     """
     from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
 
     settings = client.Configuration()
+    # the callers retry on their own, and a renewal of a Lease has no time for more attempts
     settings.retries = False
     try:
         config.load_incluster_config(settings)
@@ -105,12 +88,7 @@ class AccessFile(FileModel):
 
 
 def read(path: Path) -> AccessFile:
-    """Return the content of the operator's file.
-
-    Raises:
-        InvalidInput: with all faults of the file. If it has none, with those of the secrets that it
-            names.
-    """
+    """Return the content of the operator's file, if also the secrets that it names can be read."""
     name, text = read_input(path)
     with located_in(text):
         content = parse_file(AccessFile, text, name)

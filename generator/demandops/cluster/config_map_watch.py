@@ -18,6 +18,8 @@ _WATCH_S = 240
 _CONNECT_S = 5
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
+_GONE = "is gone; its last data stay valid"
+
 OnData = Callable[[Mapping[str, str]], object]
 
 
@@ -32,23 +34,21 @@ class ConfigMapWatch:
         kubeconfig: Path | None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Start to watch.
+        """Start to watch; ``on_data`` is called from the thread of the watch.
 
-        Args:
-            namespace: the ConfigMap's namespace.
-            name: the ConfigMap's name. The ConfigMap need not exist yet. If it is deleted, the last
-                data stay valid.
-            on_data: called with the data, from the thread of the watch.
-            kubeconfig: the file with the access to the cluster; if None, this process must be a
-                pod in the cluster.
-            runtime: provides the threads.
-
-        Raises:
-            InvalidInput: if the kubeconfig cannot be used, or this process is not a pod.
+        The ConfigMap need not exist yet. Without a kubeconfig, this process must be a pod in the
+        cluster.
         """
         self._name, self._on_data = f"ConfigMap {namespace}/{name}", on_data
         self._request = {"namespace": namespace, "field_selector": f"metadata.name={name}"}
-        self._client = _client(kubeconfig)
+        if kubeconfig is None:
+            self._client = own_cluster_api("without --kubeconfig").api_client
+        else:
+            try:
+                self._client = ClusterAccess(kubeconfig=kubeconfig).api().api_client
+            except Exception as error:  # the library raises errors of many kinds
+                reason = f"cannot be used: {one_line(str(error))}"
+                raise InvalidInput.at("--kubeconfig", reason, file=str(kubeconfig)) from None
         self._data: dict[str, str] | None = None
         self._told = ""
         self._closed = runtime.event()
@@ -66,7 +66,28 @@ class ConfigMapWatch:
         pause = _FIRST_PAUSE_S
         while not self._closed.is_set():
             try:
-                self._read_and_watch()
+                from kubernetes import client, watch  # noqa: PLC0415 - slow (half a second)
+
+                read = client.CoreV1Api(self._client).list_namespaced_config_map
+                listed = read(**self._request, _request_timeout=(_CONNECT_S, _WATCH_S))
+                for item in listed.items:
+                    self._take(item)
+                if not listed.items:
+                    is_new = self._data is None
+                    self._tell("does not exist yet" if is_new else _GONE)
+                for event in watch.Watch().stream(
+                    read,
+                    **self._request,
+                    resource_version=listed.metadata.resource_version,
+                    timeout_seconds=_WATCH_S,
+                    _request_timeout=(_CONNECT_S, _WATCH_S + 30),
+                ):
+                    if self._closed.is_set():
+                        return
+                    if event["type"] in ("ADDED", "MODIFIED"):
+                        self._take(event["object"])
+                    elif event["type"] == "DELETED":
+                        self._tell(_GONE)
                 pause = _FIRST_PAUSE_S
             except Exception as error:  # the library raises errors of many kinds
                 reason = getattr(error, "reason", None) or error or type(error).__name__
@@ -74,32 +95,8 @@ class ConfigMapWatch:
                 self._closed.wait(pause)
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
 
-    def _read_and_watch(self) -> None:
-        from kubernetes import client, watch  # noqa: PLC0415 - slow (half a second), so only on use
-
-        read = client.CoreV1Api(self._client).list_namespaced_config_map
-        listed = read(**self._request, _request_timeout=(_CONNECT_S, _WATCH_S))
-        for item in listed.items:
-            self._take(item)
-        if not listed.items:
-            is_new = self._data is None
-            self._tell("does not exist yet" if is_new else "is gone; its last data stay valid")
-        for event in watch.Watch().stream(
-            read,
-            **self._request,
-            resource_version=listed.metadata.resource_version,
-            timeout_seconds=_WATCH_S,
-            _request_timeout=(_CONNECT_S, _WATCH_S + 30),
-        ):
-            if self._closed.is_set():
-                return
-            if event["type"] in ("ADDED", "MODIFIED"):
-                self._take(event["object"])
-            elif event["type"] == "DELETED":
-                self._tell("is gone; its last data stay valid")
-
     def _take(self, item: Any) -> None:  # noqa: ANN401 - the library has no types
-        self._told = ""
+        self._told = ""  # so that the next failure is logged again
         data = dict(item.data or {})
         with self._calling:
             if data != self._data and not self._closed.is_set():
@@ -111,13 +108,3 @@ class ConfigMapWatch:
             if text != self._told and not self._closed.is_set():
                 self._told = text
                 log.warning("%s %s", self._name, text)
-
-
-def _client(kubeconfig: Path | None) -> Any:  # noqa: ANN401 - the library has no types
-    if kubeconfig is None:
-        return own_cluster_api("without --kubeconfig").api_client
-    try:
-        return ClusterAccess(kubeconfig=kubeconfig).api().api_client
-    except Exception as error:  # the library raises errors of many kinds
-        reason = f"cannot be used: {one_line(str(error))}"
-        raise InvalidInput.at("--kubeconfig", reason, file=str(kubeconfig)) from None

@@ -25,30 +25,17 @@ _NO_COMMIT = "0" * 40
 
 
 def call_flux(url: str, secret: bytes | None) -> None:
-    """Call a Receiver of Flux. The Receiver ignores the body of the call.
-
-    Raises:
-        NoAnswer: if the controller does not answer, rejects the call or redirects it.
-    """
+    # a Receiver ignores the body
     _send(url, b"{}", secret, "X-Signature", {})
 
 
 def call_argocd(
     url: str, secret: bytes | None, repo: str, before: str, after: str, paths: Iterable[str] | None
 ) -> None:
-    """Report to Argo CD that a repository's main branch moved.
+    """Report to Argo CD that a repository's main branch moved, or raise NoAnswer.
 
-    Args:
-        url: the webhook of Argo CD.
-        secret: the key that signs the call, if any.
-        repo: the URL from which Argo CD fetches the state repo.
-        before: the commit of the last call; empty if there was none.
-        after: the commit that was pushed.
-        paths: the changed files; with None, Argo CD refreshes all Applications of the repo.
-
-    Raises:
-        NoAccess: if the repo's URL names no host; Argo CD needs the host to identify the repo.
-        NoAnswer: if the controller does not answer, rejects the call or redirects it.
+    Argo CD fetches the state repo from ``repo``. ``before`` is the commit of the last call, if
+    there was one. With None as ``paths``, Argo CD refreshes all Applications of the repo.
     """
     event = {
         "ref": f"refs/heads/{MAIN_BRANCH}",
@@ -62,13 +49,9 @@ def call_argocd(
 
 
 def web_address(repo: str) -> str:
-    """Return the address of a repository's web page, without user and password.
-
-    Argo CD compares this address with each source's URL by host and path, not by scheme and port.
-
-    Raises:
-        NoAccess: if the URL names no host.
-    """
+    """Return the address of a repository's web page; NoAccess is raised if it names no host."""
+    # Without user and password. Argo CD compares this address with each source's URL by host and
+    # path, not by scheme and port.
     short = None if "://" in repo else _SCP.fullmatch(repo)
     if short:
         host, path = short["host"], quote(short["path"])

@@ -21,21 +21,20 @@ from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 
+# How long a Lease is valid if nobody renews it.
 _LEASE_S = 15
-"""How many seconds a Lease is valid if nobody renews it."""
+# A leader that has not renewed its Lease for so long ends its process.
 _RENEW_WITHIN_S = 10
-"""A leader that has not renewed its Lease for this many seconds ends its process."""
+# How long a call of the API may take. A renewal has two calls, and must end before the Lease does:
+# _RENEW_WITHIN_S + 2 * _CALL_S < _LEASE_S.
 _CALL_S = 2
-"""How many seconds a call of the API may take. A renewal has two calls, and must end before the
-Lease does: ``_RENEW_WITHIN_S + 2 * _CALL_S < _LEASE_S``."""
 _PAUSE_S = 2.0
+# The API server takes no Lease with a duration of 0, so a released one is valid for a second.
 _RELEASED_S = 1
 _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-9])?)")
 
 
 class Leadership:
-    """Makes this process compete for the Lease and, as the leader, renew it."""
-
     def __init__(
         self,
         lease: str,
@@ -44,23 +43,13 @@ class Leadership:
         api: Any = None,  # noqa: ANN401 - the library has no types
         runtime: Runtime = REAL,
     ) -> None:
-        """Start to compete for the Lease.
+        """Start to compete for the Lease ``NAMESPACE/NAME``, which must exist.
 
-        A leader that cannot renew the Lease, or has lost it, raises :class:`Unsound` in its thread,
-        because another process is the leader soon or already.
-
-        Args:
-            lease: the Lease's namespace and name, with a slash between. The Lease must exist.
-            may_lead: returns whether this process may become the leader now.
-            on_leader: called when this process becomes the leader.
-            api: the cluster's API; by default that of the cluster in which this process is a pod.
-            runtime: provides the time and the threads.
-
-        Raises:
-            InvalidInput: if the name is not valid, or this process is not a pod.
+        A leader that cannot renew the Lease, or has lost it, raises :class:`Unsound` in its thread.
+        Without ``api``, this process must be a pod.
         """
-        found = _NAME.fullmatch(lease)
-        if found is None:
+        name = _NAME.fullmatch(lease)
+        if name is None:
             raise InvalidInput.at(
                 "--leader-lease", f"{quoted(lease)} names no Lease; write NAMESPACE/NAME"
             )
@@ -68,8 +57,8 @@ class Leadership:
             "group": "coordination.k8s.io",
             "version": "v1",
             "plural": "leases",
-            "namespace": found[1],
-            "name": found[3],
+            "namespace": name[1],
+            "name": name[3],
         }
         self._lease, self._may_lead, self._on_leader = lease, may_lead, on_leader
         self._api = own_cluster_api("--leader-lease") if api is None else api
@@ -107,16 +96,15 @@ class Leadership:
             self._require_renewed()  # a renewal that begins now could end too late
 
     def _compete(self) -> None:
-        """Renew the Lease as the leader, or become the leader if that is possible now.
-
-        This process becomes the leader if the Lease is free and the process may lead.
-        """
+        """Renew the Lease, or become the leader if it is free and this process may lead."""
         lease = self._read()
         spec = lease.get("spec") or {}
         holder = spec.get("holderIdentity") or ""
         if self.is_leader and holder != self._identity:
             self._end(f"is held by {quoted(holder)}")
         if not self.is_leader:
+            # Time counts from when this process saw the Lease change: the clock of the leader, of
+            # which the Lease has a time, may be wrong.
             if spec != self._seen:
                 self._seen, self._seen_at = spec, self._runtime.monotonic()
             ends = self._seen_at + (spec.get("leaseDurationSeconds") or _LEASE_S)
@@ -126,6 +114,7 @@ class Leadership:
             if not is_free:
                 self._tell(logging.INFO, f"standing by: the leader is {quoted(holder)}")
                 return
+        # the time before the call, because others count from when the call takes effect
         began = self._runtime.monotonic()
         self._write(lease, self._identity)
         self._renewed, self._told = began, ""
@@ -135,6 +124,7 @@ class Leadership:
             self._on_leader()
 
     def _require_renewed(self) -> None:
+        # a process that was suspended, or whose calls hang, must not go on serving beside another
         if self.is_leader and self._runtime.monotonic() - self._renewed >= _RENEW_WITHIN_S:
             why = f" ({self._told})" if self._told else ""  # empty if this process was suspended
             self._end(f"was not renewed for {_RENEW_WITHIN_S} s{why}")
@@ -146,10 +136,7 @@ class Leadership:
         return lease
 
     def _write(self, lease: dict[str, Any], holder: str) -> None:
-        """Write a holder into the Lease that was read; an empty ``holder`` releases the Lease.
-
-        The server refuses the call if the Lease has changed since it was read.
-        """
+        """Write a holder into the Lease that was read; an empty ``holder`` releases the Lease."""
         old, now = lease.get("spec") or {}, f"{self._runtime.now():%Y-%m-%dT%H:%M:%S.%fZ}"
         spec = old | {
             "holderIdentity": holder,
@@ -159,13 +146,14 @@ class Leadership:
         if holder and not self.is_leader:
             spec["acquireTime"] = now
             spec["leaseTransitions"] = (old.get("leaseTransitions") or 0) + 1
+        # The body has the resourceVersion that was read. So the server refuses it if another
+        # process has changed the Lease since.
         self._api.replace_namespaced_custom_object(
             **self._request, body=lease | {"spec": spec}, _request_timeout=_CALL_S
         )
 
     def _tell(self, level: int, text: str) -> None:
-        """Log a text, unless the last logged text was the same."""
-        if text != self._told:
+        if text != self._told:  # each pause ends with the same text, as long as nothing changes
             log.log(level, "%s", text)
         self._told = text
 

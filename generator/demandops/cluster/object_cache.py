@@ -21,17 +21,13 @@ _KINDS = {
     "Application": ("argoproj.io", "v1alpha1", "applications"),
     "Deployment": ("apps", "v1", "deployments"),
 }
+# A watch ends by itself and begins again: one whose connection died without a sign would never end.
 _WATCH_S = 240
 _CONNECT_S = 5
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 
 class ObjectCache:
-    """Caches objects of one cluster.
-
-    These are the objects that :meth:`watch`, :meth:`read_once` or :meth:`refresh` was called for.
-    """
-
     def __init__(
         self,
         name: str,
@@ -52,7 +48,6 @@ class ObjectCache:
         self._client: Any = None
 
     def watch(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Start to watch objects that are not watched yet."""
         for selector in wanted:
             with self._lock:
                 if selector in self._watched or self._closed.is_set():
@@ -62,7 +57,6 @@ class ObjectCache:
             self._runtime.keep_running(name, partial(self._keep_watching, selector))
 
     def objects(self) -> dict[Key, dict[str, Any]]:
-        """Return the objects that have been read so far, by kind, namespace and name."""
         with self._lock:
             return dict(self._objects)
 
@@ -77,7 +71,7 @@ class ObjectCache:
         return ""
 
     def unknown_health(self, domain: ClusterDomain) -> Health | None:
-        """Return a health that says why a domain's objects are unknown; None if they are known."""
+        """Return a health that says why a domain's objects are unknown, if they are."""
         reason = self.why_unknown(health_reader(domain).objects_to_watch(domain))
         if not reason:
             return None
@@ -101,25 +95,14 @@ class ObjectCache:
             self._unread = reason
 
     def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read the ``wanted`` objects now, one after the other.
-
-        Without this call, objects in the cache may be of different times, because watches may lag
-        behind each other.
-
-        Raises:
-            Exception: from the library, if the cluster does not answer or refuses.
-        """
+        """Read the ``wanted`` objects now; the errors of the library are raised."""
+        # one after the other, because watches lag behind each other: the objects that the caller
+        # names last are then the newest
         for selector in wanted:
             self._read(selector)
 
     def pods(self, namespace: str, deployment: str) -> list[Any]:
-        """Read and return the pods of a Deployment.
-
-        The list is empty if the Deployment is not in the cache, or has no ``matchLabels``.
-
-        Raises:
-            Exception: from the library, if the cluster does not answer or refuses.
-        """
+        """Read the pods of a Deployment in the cache; the errors of the library are raised."""
         from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
 
         item = self.objects().get(("Deployment", namespace, deployment)) or {}
@@ -134,35 +117,31 @@ class ObjectCache:
         return list(listed.items)
 
     def close(self) -> None:
-        """Stop all watches."""
         self._closed.set()
 
     def _keep_watching(self, selector: ObjectSelector) -> None:
         pause = _FIRST_PAUSE_S
         while not self._closed.is_set():
             try:
-                self._read_and_watch(selector)
+                from kubernetes import watch  # noqa: PLC0415 - slow (half a second), so only on use
+
+                version = self._read(selector)
+                self._set_error(selector, "")
+                for event in watch.Watch().stream(
+                    self._api().list_namespaced_custom_object,
+                    **_request(selector),
+                    resource_version=version,
+                    timeout_seconds=_WATCH_S,
+                    _request_timeout=(_CONNECT_S, _WATCH_S + 30),
+                ):
+                    if self._closed.is_set():
+                        return
+                    self._apply(selector, event)
                 pause = _FIRST_PAUSE_S
             except Exception as error:  # the library raises errors of many kinds
                 self._set_error(selector, _reason(selector, error))
                 self._closed.wait(pause)
                 pause = min(pause * 2, _LONGEST_PAUSE_S)
-
-    def _read_and_watch(self, selector: ObjectSelector) -> None:
-        from kubernetes import watch  # noqa: PLC0415 - slow (half a second), so only on use
-
-        version = self._read(selector)
-        self._set_error(selector, "")
-        for event in watch.Watch().stream(
-            self._api().list_namespaced_custom_object,
-            **_request(selector),
-            resource_version=version,
-            timeout_seconds=_WATCH_S,
-            _request_timeout=(_CONNECT_S, _WATCH_S + 30),
-        ):
-            if self._closed.is_set():
-                return
-            self._apply(selector, event)
 
     def _api(self) -> Any:  # noqa: ANN401 - the library has no types
         with self._lock:
@@ -177,6 +156,7 @@ class ObjectCache:
         )
         kind, namespace, name = selector
         with self._lock:
+            # what is gone since the last list, or was deleted between two watches, goes here too
             for key in list(self._objects):
                 if key[:2] == (kind, namespace) and name in ("", key[2]):
                     del self._objects[key]
@@ -191,9 +171,9 @@ class ObjectCache:
             return
         key = (selector.kind, selector.namespace, item["metadata"]["name"])
         with self._lock:
-            known = self._objects.get(key)
-            if known is not None and _version(item) < _version(known):
-                return  # :meth:`refresh` has read a newer version
+            cached = self._objects.get(key)
+            if cached is not None and _version(item) < _version(cached):
+                return  # `refresh` has read a newer version
             if event["type"] == "DELETED":
                 self._objects.pop(key, None)
             else:
@@ -213,20 +193,17 @@ class ObjectCache:
 
 
 def _request(selector: ObjectSelector) -> dict[str, str]:
-    """Return the arguments of an API call that lists or watches the selected objects.
-
-    A call for a single object needs fewer rights than a call for all objects of a namespace.
-    """
     names = ("group", "version", "plural")
     request = {
         **dict(zip(names, _KINDS[selector.kind], strict=True)),
         "namespace": selector.namespace,
     }
+    # a call for one object needs fewer rights than a call for all objects of a namespace
     return request | ({"field_selector": f"metadata.name={selector.name}"} if selector.name else {})
 
 
 def _is_answer(error: Exception) -> bool:
-    """Return whether the cluster answered with this error; if so, the cluster is reachable."""
+    """Return whether the cluster answered with this error, so that it is reachable."""
     return bool(getattr(error, "status", None))
 
 
@@ -240,5 +217,5 @@ def _reason(selector: ObjectSelector, error: Exception) -> str:
 
 
 def _version(item: dict[str, Any]) -> int:
-    """Return an object's resource version; compare it only within one kind of object."""
+    # Kubernetes calls it opaque, but all API servers count, within one kind of object at least.
     return int(item["metadata"]["resourceVersion"])

@@ -12,8 +12,6 @@ from demandops.cluster.object_cache import ObjectCache
 
 @dataclass(frozen=True, slots=True)
 class Orphan:
-    """An object that is left on a cluster, although its release is gone."""
-
     cluster: str
     kind: str
     namespace: str
@@ -21,7 +19,6 @@ class Orphan:
 
     @property
     def object(self) -> str:
-        """The object's name for people: ``Deployment perception/mqtt-edge``."""
         return name_of((self.kind, self.namespace, self.name))
 
     @property
@@ -32,7 +29,6 @@ class Orphan:
         return f"kubectl -n {self.namespace} delete --ignore-not-found {' '.join(names)}"
 
     def __str__(self) -> str:
-        """Return a sentence about the object, with the remedy."""
         return (
             f"{self.object} on cluster '{self.cluster}' belongs to no release any more; an "
             f"administrator of the cluster must delete it: {self.command}"
@@ -46,35 +42,23 @@ def orphans(
     caches: Mapping[str, ObjectCache],
     history: History,
 ) -> Iterator[Orphan]:
-    """Yield the objects that are left on clusters, although their releases are gone.
-
-    The objects are sorted by cluster, domain and key.
-
-    Domains that cannot be read are skipped. Domains that have not applied ``commit`` are skipped
-    too, because their controllers may still remove objects.
-
-    Args:
-        domains: the access domains on each cluster.
-        targets: all releases at ``commit``.
-        commit: the newest commit.
-        caches: the objects that were read from each cluster.
-        history: the commits of the state repo.
-    """
+    """Yield the objects that are left on clusters, sorted by cluster, domain and key."""
     needed = {(target.domain, health_reader(target.domain).key(target)) for target in targets}
-    for domain in sorted(domains, key=lambda one: (one.cluster, one.name)):
+    for domain in sorted(domains, key=lambda domain: (domain.cluster, domain.name)):
         store = caches.get(domain.cluster)
         if store is None or store.unknown_health(domain):
             continue
-        read, objects = health_reader(domain), store.objects()
-        if not read.domain_health(domain, commit, objects, history).reaches("reconciled"):
+        reader, objects = health_reader(domain), store.objects()
+        # a controller that has not applied the newest commit may still remove objects
+        if not reader.domain_health(domain, commit, objects, history).reaches("reconciled"):
             continue
         for key, item in sorted(objects.items()):
             kind, namespace, name = key
             if (
                 namespace == domain.namespace
-                and kind in (read.service_kind, "Deployment")
+                and kind in (reader.service_kind, "Deployment")
                 and (domain, key) not in needed
                 and not item["metadata"].get("deletionTimestamp")
-                and read.applied_by(domain, item)
+                and reader.applied_by(domain, item)
             ):
                 yield Orphan(domain.cluster, kind, namespace, name)

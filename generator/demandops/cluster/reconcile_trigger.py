@@ -25,7 +25,6 @@ from demandops.cluster.health.release_health import ClusterDomain, ObjectSelecto
 from demandops.cluster.object_cache import ObjectCache
 from demandops.config.config import Config
 from demandops.config.policy import AccessDomain
-from demandops.config.repo_settings import RepoSettings
 from demandops.errors import InvalidInput
 from demandops.http_call import NoAnswer
 from demandops.render.gitops.argocd import project_of
@@ -36,47 +35,33 @@ log = logging.getLogger("demandops")
 
 _TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
+# The next fetch begins at least so long after Flux has applied what the last fetch brought. Two
+# fetches within a second can make source-controller corrupt an artifact.
 _SPACING_S = 1.0
-"""The next fetch begins at least this many seconds after Flux has applied what the last fetch
-brought. Two fetches within a second can make source-controller corrupt an artifact."""
+# So long after a push, Flux is woken even if it is not idle.
 _LONGEST_WAIT_S = 60.0
-"""Flux is woken this many seconds after a push at the latest, even if it is not idle."""
 _REFRESH = "argocd.argoproj.io/refresh"
 
 
+# Returns the newest published commit, and the paths that changed since a commit, if that is known.
 ChangesSince = Callable[[str], tuple[str, list[str] | None]]
-"""Returns the newest published commit, and the paths that changed since a given commit.
-
-The paths are None if they are not known.
-"""
 
 
 @dataclass(eq=False)
 class _Wake:
-    """A planned call that makes the controller of one or more access domains fetch.
-
-    Times are seconds of the monotonic clock.
-    """
+    """A planned call that makes the controller of access domains fetch; in monotonic seconds."""
 
     cluster: str
     domains: tuple[AccessDomain, ...]
-    pushed: float | None = None
-    """The time of the oldest push that still needs a call; None if no push needs one."""
+    pushed: float | None = None  # the oldest push that still needs a call
     next_try: float = -inf
     pause: float = _FIRST_RETRY_S
-    idle_from: float = -inf
-    """Since when the controller is known to be idle; infinity while it is busy."""
+    idle_from: float = -inf  # since when the controller is known to be idle; inf while it is busy
+    # For each domain, what `Flux.handled_request` returned just before the last call.
     handled: dict[str, str] = field(default_factory=dict)
-    """For each domain, what :meth:`Flux.handled_request` returned just before the last call."""
-
-    @property
-    def is_untried(self) -> bool:
-        """Whether a push needs a call, and no call has been tried for it yet."""
-        return self.pushed is not None and self.pause == _FIRST_RETRY_S
 
     @property
     def due(self) -> float:
-        """When to make the call; infinity if no push needs one."""
         if self.pushed is None:
             return inf
         free = min(self.idle_from + _SPACING_S, self.pushed + _LONGEST_WAIT_S)
@@ -84,10 +69,7 @@ class _Wake:
 
 
 class ReconcileTrigger:
-    """Wakes clusters from its own thread.
-
-    Pushes that come before a call is due share this call.
-    """
+    """Wakes clusters from its own thread; pushes that come before a call is due share it."""
 
     def __init__(
         self,
@@ -119,10 +101,8 @@ class ReconcileTrigger:
         self._changed.set()
 
     def close(self) -> None:
-        """Make the calls for the last push that have not been tried yet, and stop.
-
-        If Flux stays busy for five seconds, it is not woken, and fetches at its next interval.
-        """
+        """Make the calls for the last push that have not been tried yet, and stop."""
+        # if Flux is busy for longer, it is not woken, and fetches at its next interval
         self._ends = self._runtime.monotonic() + _TIMEOUT_S
         self._changed.set()
         self._thread.join(2 * _TIMEOUT_S)
@@ -131,7 +111,8 @@ class ReconcileTrigger:
 
     def _run(self) -> None:
         while True:
-            self._changed.wait(self._seconds_until_due())
+            due = min([self._ends, *(wake.due for wake in self._wakes.values())])
+            self._changed.wait(None if due == inf else max(0.0, due - self._runtime.monotonic()))
             self._changed.clear()
             if self._pushed and self._config is not None:
                 self._pushed = False
@@ -140,72 +121,53 @@ class ReconcileTrigger:
                 self._note_idle(wake)
                 if wake.due <= self._runtime.monotonic():
                     self._try(wake)
-            if self._ends < inf and not self._is_call_left:
+            # a push that came during the last call is not noted yet
+            is_call_left = self._pushed or any(
+                wake.pushed is not None and wake.pause == _FIRST_RETRY_S
+                for wake in self._wakes.values()
+            )
+            if self._ends < inf and not is_call_left:
                 return
             if self._ends <= self._runtime.monotonic():
                 return
-
-    @property
-    def _is_call_left(self) -> bool:
-        # A push that came during the last call is not noted yet.
-        return self._pushed or any(wake.is_untried for wake in self._wakes.values())
-
-    def _seconds_until_due(self) -> float | None:
-        """Return the seconds until the next call or the thread's end; None if neither is due."""
-        due = min((wake.due for wake in self._wakes.values()), default=inf)
-        due = min(due, self._ends)
-        return None if due == inf else max(0.0, due - self._runtime.monotonic())
 
     def _note_push(self, config: Config) -> None:
         now, before = self._runtime.monotonic(), self._wakes
         self._wakes = {}
         for cluster in sorted(self._clusters):
-            for domains in self._woken_together(cluster, config):
-                key = (cluster, *(domain.name for domain in domains))
-                wake = self._wakes[key] = before.get(key) or _Wake(cluster, domains)
-                wake.domains = domains
+            access = self._clusters[cluster]
+            domains = tuple(domain for name, domain in domains_in_use(config) if name == cluster)
+            argocd = config.repo_settings.gitops == "argocd"
+            # one call of a webhook wakes all domains, but the API needs a call for each
+            together = bool(access.webhook if argocd else access.receiver) or not access.kubeconfig
+            for woken in [domains] if together else [(domain,) for domain in domains]:
+                key = (cluster, *(domain.name for domain in woken))
+                wake = self._wakes[key] = before.get(key) or _Wake(cluster, woken)
+                wake.domains = woken
                 wake.pushed = now if wake.pushed is None else wake.pushed
                 wake.next_try, wake.pause = now, _FIRST_RETRY_S
-            if cluster in self._caches and config.repo_settings.gitops == "flux":
-                self._caches[cluster].watch(_followed(_domains(cluster, config)))
-
-    def _woken_together(self, cluster: str, config: Config) -> list[tuple[AccessDomain, ...]]:
-        """Return the domains of a cluster, grouped by the call that wakes them.
-
-        One call of a webhook wakes all domains. The API needs a call for each domain.
-        """
-        access, domains = self._clusters[cluster], _domains(cluster, config)
-        argocd = config.repo_settings.gitops == "argocd"
-        if (access.webhook if argocd else access.receiver) or not access.kubeconfig:
-            return [tuple(domains)]
-        return [(domain,) for domain in domains]
+            if cluster in self._caches and not argocd:
+                self._caches[cluster].watch(_followed(domains))
 
     def _note_idle(self, wake: _Wake) -> None:
-        if self._is_busy(wake):
+        cache, is_idle = self._caches.get(wake.cluster), True  # also if its state is not known
+        if cache is not None and not cache.why_unknown(_followed(wake.domains)):
+            objects, flux = cache.objects(), Flux()
+            try:
+                is_idle = all(
+                    flux.is_idle(_on_cluster(wake, domain), objects, wake.handled.get(domain.name))
+                    for domain in wake.domains
+                )
+            except (
+                Exception
+            ) as error:  # an odd object must not keep other clusters from being woken
+                log.debug("the objects of cluster '%s' cannot be read: %r", wake.cluster, error)
+        if not is_idle:
             wake.idle_from = inf
         elif wake.idle_from == inf:
             wake.idle_from = self._runtime.monotonic()
 
-    def _is_busy(self, wake: _Wake) -> bool:
-        """Return whether Flux is busy with an earlier fetch; False if its state is not known."""
-        cache = self._caches.get(wake.cluster)
-        if cache is None or cache.why_unknown(_followed(wake.domains)):
-            return False
-        objects = cache.objects()
-        try:
-            return not all(
-                Flux().is_idle(_on_cluster(wake, domain), objects, wake.handled.get(domain.name))
-                for domain in wake.domains
-            )
-        except Exception as error:  # an odd object must not keep other clusters from being woken
-            log.debug("the objects of cluster '%s' cannot be read: %r", wake.cluster, error)
-            return False
-
     def _try(self, wake: _Wake) -> None:
-        """Make the call. If it fails, plan another attempt; give up after about a minute.
-
-        Only the first failure after a push is logged.
-        """
         assert self._config is not None  # noqa: S101 - without a push there is no wake
         objects = self._caches[wake.cluster].objects() if wake.cluster in self._caches else {}
         wake.idle_from, wake.handled = inf, {}
@@ -218,17 +180,19 @@ class ReconcileTrigger:
             self._call(wake, self._clusters[wake.cluster], self._config)
             wake.pushed = None
         except Exception as error:
-            self._apis.pop(wake.cluster, None)
+            self._apis.pop(wake.cluster, None)  # the kubeconfig may have a new token
             wake.handled = {}
             if wake.pause == _FIRST_RETRY_S:
+                # the texts of other errors may have URLs and secrets
+                is_ours = isinstance(error, NoAccess | NoAnswer | InvalidInput)
                 log.warning(
                     "cluster '%s' was not woken (%s); retrying for a minute; if no retry succeeds, "
                     "the cluster's controller fetches at its next interval",
                     wake.cluster,
-                    _reason(error),
+                    str(error) if is_ours else type(error).__name__,
                 )
             if wake.pause > _LONGEST_RETRY_S:
-                wake.pushed = None
+                wake.pushed = None  # give up
             wake.next_try = self._runtime.monotonic() + wake.pause
             wake.pause *= 2
         self._note_idle(wake)
@@ -254,10 +218,24 @@ class ReconcileTrigger:
         elif access.kubeconfig:
             if name not in self._apis:
                 self._apis[name] = access.api()
-            now = self._runtime.now().isoformat()
+            settings, now = config.repo_settings, self._runtime.now().isoformat()
             for domain in wake.domains:
+                if argocd:
+                    group, version, plural = "argoproj.io", "v1alpha1", "applications"
+                    namespace, object_name = argocd.namespace, project_of(domain, settings)
+                    annotation = {_REFRESH: "normal"}
+                else:
+                    group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
+                    namespace, object_name = domain.namespace, settings.source
+                    annotation = {REQUESTED_AT: now}
                 self._apis[name].patch_namespaced_custom_object(
-                    **_refresh_patch(domain, config.repo_settings, now), _request_timeout=_TIMEOUT_S
+                    group=group,
+                    version=version,
+                    namespace=namespace,
+                    plural=plural,
+                    name=object_name,
+                    body={"metadata": {"annotations": annotation}},
+                    _request_timeout=_TIMEOUT_S,
                 )
         else:
             missing = "webhook" if argocd else "receiver"
@@ -274,40 +252,7 @@ def _on_cluster(wake: _Wake, domain: AccessDomain) -> ClusterDomain:
     return ClusterDomain(wake.cluster, domain.name, domain.namespace)
 
 
-def _reason(error: Exception) -> str:
-    """Return why a cluster was not woken, in a text without URLs and secrets."""
-    told = isinstance(error, NoAccess | NoAnswer | InvalidInput)
-    return str(error) if told else type(error).__name__
-
-
-def _domains(cluster: str, config: Config) -> tuple[AccessDomain, ...]:
-    return tuple(domain for name, domain in domains_in_use(config) if name == cluster)
-
-
 def _concerns(path: str, cluster: str) -> bool:
-    """Return whether a changed file may affect a cluster.
-
-    Files of the ledger and of other clusters cannot.
-    """
+    # files of the ledger and of other clusters do not
     first, _, rest = path.partition("/")
     return rest.startswith(f"{cluster}/") if first == "clusters" else first != "ledger"
-
-
-def _refresh_patch(domain: AccessDomain, repository: RepoSettings, now: str) -> dict[str, Any]:
-    """Return the arguments of an API call that makes the controller fetch a domain's folder now."""
-    if repository.gitops == "argocd" and repository.argocd:
-        group, version, plural = "argoproj.io", "v1alpha1", "applications"
-        namespace, name = repository.argocd.namespace, project_of(domain, repository)
-        annotation = {_REFRESH: "normal"}
-    else:
-        group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
-        namespace, name = domain.namespace, repository.source
-        annotation = {REQUESTED_AT: now}
-    return {
-        "group": group,
-        "version": version,
-        "namespace": namespace,
-        "plural": plural,
-        "name": name,
-        "body": {"metadata": {"annotations": annotation}},
-    }

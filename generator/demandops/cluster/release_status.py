@@ -20,30 +20,21 @@ from demandops.cluster.object_cache import ObjectCache
 
 @dataclass(frozen=True, slots=True)
 class ReleaseStatus:
-    """The health of a release, as its cluster reports it.
-
-    ``seen`` is the commit that the release's access domain has applied. ``since`` is the time when
-    the state last changed. Both are empty if the cluster does not report them.
-    """
-
     health: Health
-    seen: str = ""
-    since: str = ""
+    seen: str = ""  # the commit that the release's access domain has applied, if that is known
+    since: str = ""  # when the state last changed, if that is known
 
     @property
     def state(self) -> State | Literal["unknown"]:
-        """The state of the release; ``unknown`` without access to the cluster.
-
-        If the cluster cannot be read, the state is ``waiting``, and the reason says so.
-        """
+        # of a cluster that cannot be read, the state is `waiting`, and the reason says so
         return self.health.state if self.seen or self.health.object else "unknown"
 
 
 _NO_ACCESS = ReleaseStatus(Health("waiting", "no access to this cluster"))
 
 
+# Returns the paths in which two commits differ, if that is known.
 ChangedPaths = Callable[[str, str], "Collection[str] | None"]
-"""A function of two commits that returns the paths in which they differ; None if unknown."""
 
 
 def statuses(
@@ -53,46 +44,37 @@ def statuses(
     history: History,
     changed: ChangedPaths = lambda seen, commit: None,
 ) -> list[ReleaseStatus]:
-    """Return the status of each release at a commit, from the caches of the clusters.
-
-    ``changed`` returns the paths in which two commits differ. If a cluster has applied only an
-    earlier commit and reports no failure to apply the new one, each release whose file is not among
-    these paths counts as applied. So a new commit does not hide the health of unchanged releases.
-    """
     changed = cache(changed)
-    known = _CachedHistory(history)
+    history = _CachedHistory(history)
     objects = {name: store.objects() for name, store in caches.items()}
     unread: dict[ClusterDomain, Health | None] = {}
-    found = []
+    results = []
     for target in targets:
         domain = target.domain
         store = caches.get(domain.cluster)
         if store is None:
-            found.append(_NO_ACCESS)
+            results.append(_NO_ACCESS)
             continue
         if domain not in unread:
             unread[domain] = store.unknown_health(domain)
         if reason := unread[domain]:
-            found.append(ReleaseStatus(reason))
+            results.append(ReleaseStatus(reason))
             continue
-        read, there = health_reader(domain), objects[domain.cluster]
-        health, seen = read.health(target, commit, there, known), read.applied_commit(domain, there)
+        reader, there = health_reader(domain), objects[domain.cluster]
+        health = reader.health(target, commit, there, history)
+        seen = reader.applied_commit(domain, there)
+        # A new commit must not hide the health of the releases that it does not change. So they
+        # count as applied while the controller still works on the commit.
         if health.state == "waiting" and not health.failing and seen:
-            paths = changed(seen, commit)
-            if paths is not None and not _is_among(paths, target):
-                health = read.release_health(target, seen, there, known)
-        found.append(ReleaseStatus(health, seen, read.last_transition(target, there)))
-    return found
-
-
-def _is_among(paths: Collection[str], target: Target) -> bool:
-    end = f"/{target.name}.yaml"
-    return any(path.endswith(end) for path in paths)
+            paths, end = changed(seen, commit), f"/{target.name}.yaml"
+            if paths is not None and not any(path.endswith(end) for path in paths):
+                health = reader.release_health(target, seen, there, history)
+        results.append(ReleaseStatus(health, seen, reader.last_transition(target, there)))
+    return results
 
 
 class _CachedHistory:
-    """Caches the answers of a history, because all releases of a domain ask the same questions."""
-
+    # all releases of a domain ask the same questions, and each answer reads commits
     def __init__(self, history: History) -> None:
         self.includes = cache(history.includes)
         self.unchanged = cache(history.unchanged)

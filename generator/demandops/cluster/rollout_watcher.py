@@ -30,8 +30,8 @@ from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 
+# Called with a state (reconciled, healthy, failing) and a text, once for each text.
 OnProgress = Callable[[str, str], None]
-"""Called with a state (``reconciled``, ``healthy``, ``failing``) and a text, once for each text."""
 
 _PAUSE_S = 0.05
 _LONGEST_WAIT_S = 1.0
@@ -53,21 +53,13 @@ class _Rollout:
 
 
 class RolloutWatcher:
-    """Follows releases on the clusters that the operator's file names."""
-
     def __init__(
         self,
         clusters: Mapping[str, ClusterAccess],
         history: History,
         runtime: Runtime = REAL,
     ) -> None:
-        """Make a watcher. It starts to watch an access domain with the first rollout there.
-
-        Args:
-            clusters: the access to each cluster; clusters without a kubeconfig are ignored.
-            history: answers questions about the state repo's commits, in the status thread.
-            runtime: provides the time and the threads.
-        """
+        """Start; a domain is watched from its first rollout on, if its cluster has a kubeconfig."""
         self._history, self._runtime = history, runtime
         self._changed = runtime.event()
         self._closed = False
@@ -95,16 +87,9 @@ class RolloutWatcher:
     ) -> Future[Health]:
         """Follow releases of a published commit; return at once.
 
-        Args:
-            commit: the published commit.
-            targets: the releases; :meth:`why_unreachable` must be empty for their domains.
-            level: what the releases have to reach, such as ``healthy``.
-            timeout: seconds after which the future is resolved, whatever the health is then.
-            on_progress: called with each new state or failure, from the status thread.
-
-        Returns:
-            A future of the health. It is resolved when the health reaches ``level``, after the
-            timeout, or by :meth:`close`. If the health is not at ``level`` then, it says why.
+        :meth:`why_unreachable` must be empty for their domains. The future has the health when it
+        reaches ``level``, after the timeout in seconds, or at :meth:`close`. If the health is not
+        at ``level`` then, it says why. ``on_progress`` is called from the status thread.
         """
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))
@@ -143,10 +128,14 @@ class RolloutWatcher:
             if rollout.busy and not last:
                 continue
             try:
-                health = self._health(rollout, objects)
+                health = worst(
+                    [self._health(rollout, target, objects) for target in rollout.targets]
+                )
             except Exception as error:  # an odd object must not keep other rollouts from an answer
                 log.debug("a status cannot be read: %r", error)
                 health = Health("waiting", "the status on the cluster cannot be read", failing=True)
+            # The watches lag behind each other: a Deployment may look healthy only because its
+            # change has not come yet. So read all once more.
             if health.reaches("healthy") and not (rollout.confirmed or last):
                 self._in_background(rollout, self._confirm)
                 continue
@@ -158,7 +147,7 @@ class RolloutWatcher:
                 self._in_background(rollout, partial(self._time_out, health=health))
 
     def _in_background(self, rollout: _Rollout, work: Callable[[_Rollout], None]) -> None:
-        """Run ``work`` in a separate thread, because it calls a cluster, which may not answer."""
+        # a thread of its own, because it calls a cluster, which may not answer
         rollout.busy = True
 
         def run() -> None:
@@ -177,11 +166,8 @@ class RolloutWatcher:
         rollout.confirmed = True
 
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
-        """Resolve a rollout that has timed out, with a reason that is as exact as possible.
-
-        If a Deployment is not available, the reason also says why its pods do not run. If the
-        controller is retrying, the reason also says why an earlier attempt failed.
-        """
+        # The reason is to be as exact as possible: while a controller retries, its object no longer
+        # says why the last attempt failed, and a Deployment never says why its pods do not run.
         failed = rollout.failed
         if failed and not health.failing and failed.object == health.object:
             health = replace(health, reason=f"{health.reason}; before: {failed.reason}")
@@ -200,19 +186,16 @@ class RolloutWatcher:
 
     def _resolve(self, rollout: _Rollout, health: Health) -> None:
         with self._lock:
-            if rollout not in self._open:
+            if rollout not in self._open:  # a timeout and the end of this watcher may meet here
                 return
             self._open.remove(rollout)
         rollout.future.set_result(health)
 
-    def _health(self, rollout: _Rollout, objects: Mapping[str, Objects]) -> Health:
-        def of(target: Target) -> Health:
-            cluster = target.domain.cluster
-            return self._caches[cluster].unknown_health(target.domain) or health_reader(
-                target.domain
-            ).health(target, rollout.commit, objects[cluster], self._history)
-
-        return worst([of(target) for target in rollout.targets])
+    def _health(self, rollout: _Rollout, target: Target, objects: Mapping[str, Objects]) -> Health:
+        domain = target.domain
+        return self._caches[domain.cluster].unknown_health(domain) or health_reader(domain).health(
+            target, rollout.commit, objects[domain.cluster], self._history
+        )
 
     @staticmethod
     def _report(rollout: _Rollout, health: Health) -> None:

@@ -55,25 +55,11 @@ _NEXT: dict[State, tuple[State, ...]] = {
 
 
 class Demands:
-    """The demands that have no answer yet, and the journal.
-
-    ``blocked`` is the reason why no demand can be published now; it is empty if demands can be
-    published. The text of a :class:`QueueFull` quotes this reason.
-    """
-
     def __init__(
         self, journal: Journal, limit: int, requester_limit: int | None, runtime: Runtime
     ) -> None:
-        """Queue the journal's demands.
-
-        Args:
-            journal: the journal, with the demands that an earlier process left.
-            limit: how many demands may be queued.
-            requester_limit: how many demands of one requester may have no answer, apart from those
-                that await approval; None is no limit.
-            runtime: provides the time and the threads.
-        """
         self._journal = journal
+        # The limit of a requester does not count demands that await approval: a person takes days.
         self._limit, self._requester_limit = limit, requester_limit
         self._of_requester = Counter[str]()
         self._changed = runtime.condition()
@@ -88,22 +74,20 @@ class Demands:
                 self._enqueue(ticket)
         self._taken_back: list[Ticket] = []
         self._closed = self._woken = False
+        # Why no demand can be published now, or empty. QueueFull quotes it: a queue that is full
+        # behind a remote that is away needs another remedy than a client that sends too much.
         self.blocked = ""
 
     # ---- queries ----
 
     @property
     def operations(self) -> tuple[str, ...]:
-        """The operation ids of the demands that have no answer yet."""
         with self._changed:
             return tuple(self._tickets)
 
     @property
     def proposed(self) -> list[Ticket]:
-        """The demands of all proposals, including withdrawn ones.
-
-        A new demand may not be on the proposal's branch yet.
-        """
+        """The demands of all proposals; a new one may not be on its branch yet."""
         with self._changed:
             return [ticket for ticket in self._tickets.values() if ticket.proposal is not None]
 
@@ -115,23 +99,22 @@ class Demands:
 
     @property
     def has_queued(self) -> bool:
-        """Whether the worker has a demand to publish."""
         return bool(self._arrived or self._queue)
 
     @property
     def must_not_wait(self) -> bool:
-        """Whether a demand is queued or the generator stops, so that no wait or fetch may go on."""
+        """Whether no wait or fetch may go on, as a demand is queued or the generator stops."""
         return self.has_queued or self._closed
 
     # ---- waiting for demands ----
 
     def close(self) -> None:
         """Accept no further demands; the demands that have arrived are still carried out."""
-        self._take_in()
+        self._take_in()  # what came before is accepted
         with self._changed:
             self._closed = True
             self._changed.notify()
-        self._take_in()
+        self._take_in()  # what came between the two is refused; no thread would look at it again
         self._arrival.set()
 
     def wake(self) -> None:
@@ -143,25 +126,20 @@ class Demands:
     def wait(self, timeout: float | None) -> bool:
         """Wait until a demand is queued, :meth:`wake` or :meth:`close` is called, or time runs out.
 
-        Returns:
-            False if no demand is queued and no further demand is accepted; otherwise True.
+        Return false if no demand is queued and none will be.
         """
         with self._changed:
             self._wait(timeout, self.must_not_wait)
             return self.has_queued or not self._closed
 
     def new_demands(self, timeout: float) -> list[Ticket]:
-        """Return the demands that arrived since the last call of this method or of :meth:`take`.
+        """Return the demands accepted since the last call of this method or of :meth:`take`.
 
-        Demands that were refused are left out. If there are none, wait for one. The list is empty
-        if the wait ended after ``timeout`` seconds, by a withdrawal, by :meth:`wake` or by
-        :meth:`close`.
-
-        Raises:
-            Unsound: if a failed write left the journal in an unknown state.
+        If there are none, wait for one, up to ``timeout`` seconds.
         """
         with self._changed:
             self._wait(timeout, bool(self._new))
+            # after a failed write the state of the journal is unknown, so the process must end
             self._journal.require_sound()
             new, self._new = self._new, []
             return new
@@ -172,11 +150,7 @@ class Demands:
         self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
-        """Journal the demands that arrived, and fill ``batch`` up to ``limit`` demands.
-
-        Raises:
-            Unsound: if a failed write left the journal in an unknown state.
-        """
+        """Journal the demands that arrived, and fill ``batch`` up to ``limit`` demands."""
         self._take_in()
         with self._changed:
             self._journal.require_sound()
@@ -187,33 +161,28 @@ class Demands:
     def put_back(self, batch: list[Ticket], served: Collection[Ticket]) -> None:
         """Move the demands of a batch back to the front of the queue, and empty the batch.
 
-        A withdrawn demand does not go back; :meth:`answer_withdrawn` answers it.
         The next batch then takes turns between these demands and the demands that other requesters
         sent meanwhile. The requesters of ``served``, the demands that were evaluated, come last.
         """
         with self._changed:
-            left = [each for each in batch if each not in self._taken_back]
+            # `answer_withdrawn` answers the withdrawn ones
+            left = [ticket for ticket in batch if ticket not in self._taken_back]
             self._queue.put_back(left, served)
             batch.clear()
 
     # ---- changes of state ----
 
     def arrive(self, ticket: Ticket) -> None:
-        """Add a demand; the thread of :meth:`journal_arrivals` journals it.
-
-        This blocks only if no more demands are accepted. The demand is then refused.
-        """
+        # No lock and no journal here: the caller answers ROS clients and must not wait for an
+        # fsync. The thread of `journal_arrivals` takes the demand in.
         ticket.state = "arrived"
         self._arrived.append(ticket)
         self._arrival.set()
-        if self._closed:
+        if self._closed:  # that thread may have ended, so refuse the demand here
             self._take_in()
 
     def journal_arrivals(self) -> None:
-        """Journal demands as they arrive, until no more are accepted.
-
-        Demands that arrive during an fsync of the journal share the next fsync.
-        """
+        # demands that arrive during an fsync of the journal share the next fsync
         while not self._closed:
             self._arrival.wait()
             self._arrival.clear()
@@ -260,12 +229,9 @@ class Demands:
             ticket.refuse(error)
 
     def _why_refused(self, ticket: Ticket, others: int) -> DemandOpsError | None:
-        """Return the error for a demand that is not accepted, or None.
-
-        ``others`` is the number of demands that were accepted just before, but are not queued yet.
-        """
         if self._closed:
             return ShuttingDown("the generator is shutting down; send the demand again later")
+        # the others were accepted just before, and are not queued yet
         if others + len(self._queue) >= self._limit:
             why = f" and cannot be published ({self.blocked})" if self.blocked else ""
             return QueueFull(
@@ -285,19 +251,14 @@ class Demands:
         return None
 
     def commit(self, ticket: Ticket) -> bool:
-        """Mark a demand as committed; return False if it was withdrawn before.
-
-        A committed demand can no longer be withdrawn.
-        """
+        """Mark a demand as committed; return whether it is, as it may be withdrawn already."""
         with self._changed:
             return _change(ticket, "committed")
 
     def propose(self, ticket: Ticket, record: ProposalRecord) -> bool:
-        """Mark a demand as proposed and journal its proposal.
+        """Journal the proposal of a demand and mark the demand as proposed.
 
-        Return False if the demand was withdrawn or answered.
-
-        A proposed demand can still be withdrawn.
+        Return whether it is: it may be withdrawn or answered already.
         """
         with self._changed:
             if not _may_become(ticket, "proposed"):
@@ -308,13 +269,10 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Queue demands that were proposed but no longer need approval.
-
-        Each demand is marked as maybe published, because a person may have merged it meanwhile.
-        """
+        """Queue demands that were proposed but no longer need approval."""
         with self._changed:
             for ticket in tickets:
-                ticket.mark_maybe_published(ticket.base)
+                ticket.mark_maybe_published(ticket.base)  # a person may have merged it meanwhile
                 self._journal.append([ticket.journal_entry()])
                 ticket.proposal = None
                 _change(ticket, "queued")
@@ -322,11 +280,7 @@ class Demands:
             self._changed.notify()
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand; return whether the demand is withdrawn now.
-
-        A demand that is unknown, committed or answered cannot be withdrawn. Neither can a demand
-        while the journal cannot be written.
-        """
+        """Withdraw a demand that is not committed or answered; return whether it is withdrawn."""
         self._take_in()
         with self._changed:
             ticket = self._tickets.get(operation)
@@ -341,7 +295,6 @@ class Demands:
         return True
 
     def withdraw_proposed(self, tickets: Iterable[Ticket], reason: str) -> None:
-        """Withdraw those of the demands that await approval, and journal the withdrawal."""
         with self._changed:
             for ticket in tickets:
                 if ticket.state == "proposed":
@@ -362,8 +315,7 @@ class Demands:
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
         """Answer the demands that were withdrawn while queued, and remove them from the batch.
 
-        A demand that was withdrawn while it awaited approval is answered later, after its branch is
-        deleted.
+        Those that were withdrawn while proposed are answered after their branch is deleted.
         """
         with self._changed:
             withdrawn, self._taken_back = self._taken_back, []
@@ -376,16 +328,10 @@ class Demands:
     def answer(
         self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
     ) -> None:
-        """Answer each demand with its result; remove it from the journal unless ``keep`` is set.
-
-        A demand is answered only once, so a later result is dropped. The listener of a refused
-        demand is notified before the journal forgets the demand. In the reverse order, a crash
-        could lose the refusal, because a refused demand has no commit.
-
-        Raises:
-            Unsound: if a failed write left the journal in an unknown state; no demand is answered.
-        """
+        """Answer each demand that has no answer; the journal forgets it unless ``keep`` is set."""
         results = list(results)
+        # Notify before the journal forgets the demand. In the reverse order, a crash could lose
+        # the refusal, because a refused demand has no commit.
         for ticket, result in results if not keep else ():
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
@@ -394,7 +340,24 @@ class Demands:
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
             if not keep:
-                self._mark_done(results)
+                operations = [ticket.operation for ticket, _ in results]
+                # Where no commit has the outcome, such as a refusal, the removal is fsynced. Else
+                # a crash could bring a refused demand back, and it could then be booked.
+                durably = any(
+                    not isinstance(result, Receipt)
+                    or result.outcome in ("unchanged", "waiting")
+                    or ticket.has_released
+                    for ticket, result in results
+                )
+                try:
+                    self._journal.mark_done(operations, durably=durably)
+                except StateRepoError as error:  # the next write makes the removal durable
+                    log.error(
+                        "an answer cannot be journaled, so after a crash the demand may be carried "
+                        "out again: %s",
+                        error,
+                    )
+                    self._journal.mark_done(operations)
             for ticket, _ in results:
                 _change(ticket, "done")
                 if self._tickets.pop(ticket.operation, None):
@@ -405,29 +368,6 @@ class Demands:
                 ticket.future.set_result(result)
             else:
                 ticket.future.set_exception(result)
-
-    def _mark_done(self, results: list[tuple[Ticket, Receipt | DemandOpsError]]) -> None:
-        """Remove demands from the journal.
-
-        The removal is fsynced if the outcome of a demand is in no commit, for example a refusal.
-        Without the fsync, a crash could bring a refused demand back, and it could then be booked.
-        """
-        operations = [ticket.operation for ticket, _ in results]
-        durably = any(
-            not isinstance(result, Receipt)
-            or result.outcome in ("unchanged", "waiting")
-            or ticket.has_released
-            for ticket, result in results
-        )
-        try:
-            self._journal.mark_done(operations, durably=durably)
-        except StateRepoError as error:  # the next successful write makes the removal durable
-            log.error(
-                "an answer cannot be journaled, so after a crash the demand may be carried out "
-                "again: %s",
-                error,
-            )
-            self._journal.mark_done(operations)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
         """Answer every demand with ``error``; with ``keep``, the demands stay in the journal."""
@@ -445,8 +385,9 @@ class Demands:
         self._queue.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
-        """Stop counting a demand towards the limit of its requester."""
+        # a proposed demand left the count of its requester already
         if ticket.proposal is None:
+            # this difference drops a requester at 0, so that passing vehicles leave nothing behind
             self._of_requester -= Counter([requester_of(ticket.goal)])
 
 
@@ -455,7 +396,6 @@ def _may_become(ticket: Ticket, state: State) -> bool:
 
 
 def _change(ticket: Ticket, state: State) -> bool:
-    """Change a demand's state if ``state`` may follow; return whether it has this state now."""
     if _may_become(ticket, state):
         ticket.state = state
     return ticket.state == state

@@ -22,15 +22,13 @@ from demandops.service.timing.budget import within
 from demandops.service.timing.rate_limit import RateLimit
 from demandops.staterepo.git.repository import StateRepository, disk_error
 from demandops.staterepo.git.signing import SigningFailed
-from demandops.staterepo.history.commit_log import RecordedOutcome, operations_since
+from demandops.staterepo.history.commit_log import operations_since
 from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
 
 class Evaluator:
-    """Evaluates demands in the worker thread."""
-
     def __init__(
         self,
         repository: StateRepository,
@@ -45,12 +43,9 @@ class Evaluator:
     def evaluate(self, commits: CommitBatch, ticket: Ticket) -> Receipt | DemandOpsError | Decision:
         """Decide a demand, commit it on the commit batch and return its result.
 
-        Returns:
-            The demand's receipt or its error. If the demand needs approval, its decision, without
-            a commit. A receipt is true only once the commit batch is published.
-
-        Raises:
-            Unavailable, PushDenied, Unsound: if the state repo cannot be written now.
+        A demand that needs approval gets no commit; its result is the decision. A receipt is true
+        only once the commit batch is published. Unavailable, PushDenied and Unsound are raised:
+        they concern all demands.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
@@ -62,11 +57,11 @@ class Evaluator:
             # of all services, once for each configuration; that is not this demand's work
             state.usage()
             state.names()
-            # what was booked must be released or restored, however long all of it takes
-            adds = (
+            adds_claims = (
                 isinstance(goal, dict) and not is_release(goal) and not Decommission.is_goal(goal)
             )
-            with processor_time(each=DEMAND_S, together=DEMAND_S if adds else inf):
+            # what was booked must be released or restored, however long all of it takes
+            with processor_time(each=DEMAND_S, together=DEMAND_S if adds_claims else inf):
                 decision = decide(
                     state,
                     goal,
@@ -80,6 +75,7 @@ class Evaluator:
                 )
             if decision.approval:
                 return decision
+            # from here on the demand can no longer be taken back
             if not self._demands.commit(ticket):
                 return Withdrawn(TAKEN_BACK)
             self._approvals.withdraw_replaced(decision.request)
@@ -113,47 +109,38 @@ class Evaluator:
             return internal(error)
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results of demands that are recorded on main but have no answer yet.
+        """Return the results, oldest first, of the unanswered demands that main records already.
 
-        The demands got no answer because the connection or the process ended after the remote
-        accepted the push, or because an fsync failed. In a repository on this disk, this method
-        writes and fsyncs the commits of the demands and all later commits once more.
-
-        Args:
-            tip: the commit whose history records demands.
-            batch: demands, of which some may be recorded already.
-
-        Returns:
-            The recorded demands of ``batch``, oldest first, each with its result.
-
-        Raises:
-            Unavailable, Unsound: if their commits cannot be written once more.
+        They have no answer because the process or the connection ended after the remote accepted
+        the push, or because an fsync failed.
         """
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())
-        found = [(base, operations_since(self._repository.objects, tip, base)) for base in bases]
+        histories = [
+            (base, operations_since(self._repository.objects, tip, base)) for base in bases
+        ]
         # all bases are ancestors of the tip, so the most outcomes are those since the oldest base
-        since, recorded = max(found, key=lambda each: len(each[1]), default=("", {}))
+        since, recorded = max(histories, key=lambda history: len(history[1]), default=("", {}))
         published = [operation for operation in reversed(recorded) if operation in sought]
         if published:
+            # after a failed fsync only files that are written anew are sure to be on the disk
             self._repository.write_anew(since)
         for operation in sought.keys() - published:
-            sought[operation].base = tip
-        return [
-            (sought[one], _receipt_of_published(sought[one], recorded[one])) for one in published
-        ]
-
-
-def _receipt_of_published(ticket: Ticket, arrival: RecordedOutcome) -> Receipt | DemandOpsError:
-    if arrival.outcome == "refused":
-        message = "the demand was refused, but the reason was lost; send the demand again"
-        return Refused([fault("", message, code="refused")])
-    goal = ticket.goal
-    outcome: Outcome = "booked"
-    if arrival.outcome != "changed":
-        outcome = arrival.outcome
-    elif rollback_goal.is_rollback(goal):
-        outcome = "restored"
-    elif is_release(goal) or Decommission.is_goal(goal):
-        outcome = "released"
-    return Receipt(ticket.operation, ticket.name, outcome, arrival.commit)
+            sought[operation].base = tip  # the next search begins here
+        results = list[Result]()
+        for ticket in (sought[operation] for operation in published):
+            record = recorded[ticket.operation]
+            if record.outcome == "refused":
+                message = "the demand was refused, but the reason was lost; send the demand again"
+                results.append((ticket, Refused([fault("", message, code="refused")])))
+                continue
+            outcome: Outcome = "booked"
+            if record.outcome != "changed":
+                outcome = record.outcome
+            elif rollback_goal.is_rollback(ticket.goal):
+                outcome = "restored"
+            elif is_release(ticket.goal) or Decommission.is_goal(ticket.goal):
+                outcome = "released"
+            receipt = Receipt(ticket.operation, ticket.name, outcome, record.commit)
+            results.append((ticket, receipt))
+        return results

@@ -19,30 +19,25 @@ from typing import Any
 
 from demandops.service.ticket import Ticket
 
+# A goal with one of these fields touches only the subjects that it lists; one without any of them,
+# such as a rollback, may touch any subject.
 _ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
-"""A goal with one of these fields touches only the subjects that it lists.
-
-A goal without any of these fields may touch any subject.
-"""
 
 
 @dataclass(eq=False)
 class _Queued:
-    """A demand in the queue.
-
-    ``number`` gives the order of arrival. ``subjects`` is None if the demand may touch any subject.
-    """
-
-    number: int
+    number: int  # the order of arrival
     ticket: Ticket
-    subjects: frozenset[tuple[str, str]] | None
+    subjects: frozenset[tuple[str, str]] | None  # None: any
+    # A removal only marks the demand, because a search in each deque would be slow; `_next_in`
+    # drops those that have left.
     has_left: bool = False
 
 
 class FairQueue:
     """A queue of demands; not thread-safe.
 
-    Requesters take turns. With ``in_order``, demands leave in the order of their arrival instead.
+    With ``in_order``, demands leave in the order of their arrival, and requesters take no turns.
     """
 
     def __init__(self, *, in_order: bool = False) -> None:
@@ -54,11 +49,9 @@ class FairQueue:
         self._arrived = 0
 
     def __len__(self) -> int:
-        """Return how many demands are queued."""
         return len(self._queued)
 
     def append(self, ticket: Ticket) -> None:
-        """Add a demand at the end of the queue."""
         self._arrived += 1
         queued = _Queued(self._arrived, ticket, subjects_of(ticket.goal))
         self._queued[ticket] = queued
@@ -69,16 +62,12 @@ class FairQueue:
             self._barriers.append(queued)
 
     def put_back(self, tickets: Sequence[Ticket], served: Iterable[Ticket] = ()) -> None:
-        """Put demands back, each before the other demands of its requester.
+        """Put demands back, in the order in which they left, each before others of its requester.
 
-        The requesters of these demands get the next turns, one demand per turn. But a requester
-        who had a turn since, with one of the demands in ``served``, comes after all others.
-
-        Args:
-            tickets: in the order in which they left the queue.
-            served: the demands that left the queue with ``tickets`` and do not come back.
+        The requesters of these demands get the next turns. But a requester of ``served``, demands
+        that left with them and do not come back, had its turn and comes after all others.
         """
-        first = min((one.number for one in self._queued.values()), default=1) - len(tickets)
+        first = min((queued.number for queued in self._queued.values()), default=1) - len(tickets)
         again = {
             ticket: _Queued(number, ticket, subjects_of(ticket.goal))
             for number, ticket in enumerate(tickets, start=first)
@@ -97,7 +86,7 @@ class FairQueue:
         self._queued = again | self._queued
 
     def remove(self, tickets: Collection[Ticket]) -> None:
-        """Remove demands; ignore those that are not in the queue."""
+        """Remove those of the demands that are in the queue."""
         for ticket in tickets:
             queued = self._queued.pop(ticket, None)
             if queued is not None:
@@ -112,19 +101,19 @@ class FairQueue:
             if first is not None:
                 self._lanes[requester] = lane  # at the end, so that the other requesters come first
                 break
-        while True:
-            before = self._before(first)
-            if before is None:
-                self.remove([first.ticket])
-                self._forget(first)
-                return first.ticket
-            first = before
+        # whoever has the turn, related demands leave in the order in which they came
+        while (predecessor := self._predecessor(first)) is not None:
+            first = predecessor
+        self.remove([first.ticket])
+        for subject in first.subjects or ():  # many ids come only once; keep none of them
+            if _next_in(self._subjects[subject]) is None:
+                del self._subjects[subject]
+        return first.ticket
 
     def _lane(self, ticket: Ticket) -> str:
         return "" if self._in_order else requester_of(ticket.goal)
 
-    def _before(self, queued: _Queued) -> _Queued | None:
-        """Return a demand that must leave the queue before ``queued``, or None."""
+    def _predecessor(self, queued: _Queued) -> _Queued | None:
         barrier = _next_in(self._barriers)
         if barrier is not None and barrier.number < queued.number:
             return barrier
@@ -136,12 +125,6 @@ class FairQueue:
             if first is not None and first is not queued:
                 return first
         return None
-
-    def _forget(self, queued: _Queued) -> None:
-        """Forget the subjects of a removed demand, except those that a queued demand touches."""
-        for subject in queued.subjects or ():
-            if _next_in(self._subjects[subject]) is None:
-                del self._subjects[subject]
 
 
 def _next_in(lane: deque[_Queued]) -> _Queued | None:
@@ -171,12 +154,12 @@ def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401
     if not isinstance(goal, dict) or _ORDINARY.isdisjoint(goal):
         return None
     headers = (app.get("header") for app in _items(goal, "apps"))
-    found = [("demand", goal.get("demand"))]
-    found += [("application", each.get("id")) for each in headers if isinstance(each, dict)]
+    subjects = [("demand", goal.get("demand"))]
+    subjects += [("application", each.get("id")) for each in headers if isinstance(each, dict)]
     for kind in ("application", "connection"):
-        found += [(kind, each.get("id")) for each in _items(goal, f"{kind}s")]
-    found += [("requester", name) for name in _requesters(goal)]
-    return frozenset((kind, id) for kind, id in found if isinstance(id, str))
+        subjects += [(kind, item.get("id")) for item in _items(goal, f"{kind}s")]
+    subjects += [("requester", name) for name in _requesters(goal)]
+    return frozenset((kind, id) for kind, id in subjects if isinstance(id, str))
 
 
 def _items(fields: dict[str, Any], name: str) -> Iterator[dict[str, Any]]:

@@ -14,15 +14,12 @@ log = logging.getLogger("demandops")
 
 
 class FaultLog:
-    """Logs faults of the state repo's files, and warns if this generator lacks a signing key."""
-
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
         self._logged: frozenset[Fault] = frozenset()
         self._warned_of_signers = False
 
     def log_changes(self, problems: Iterable[Fault]) -> None:
-        """Log each fault of ``problems`` that is new, and each file that is valid again."""
         current = list(dict.fromkeys(problems))
         for problem in current:
             if problem not in self._logged:
@@ -32,7 +29,7 @@ class FaultLog:
         self._logged = frozenset(current)
 
     def warn_if_unsigned(self, snapshot: Snapshot) -> None:
-        """Warn once if the state repo lists allowed signing keys and this generator has no key."""
+        """Warn once if the state repo lists who may sign and this generator has no key."""
         if self._repository.signer is not None or self._warned_of_signers:
             return
         if allowed_signers.are_listed(self._repository.objects, snapshot.commit):

@@ -31,16 +31,13 @@ from demandops.staterepo.write.slot import Slot
 log = logging.getLogger("demandops")
 
 _STOP_TIMEOUT_S = 5.0
+# How much longer a stop waits for the threads; a running call of git or ssh-keygen ends in it.
 _GRACE_S = 5.0
-"""How many more seconds a stop waits for the threads after its timeout.
-
-A running call of git or ssh-keygen ends within this time.
-"""
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
 
 
 class Generator:
-    """Turns demands from any thread into commits of one state repo."""
+    """Turns demands into commits of one state repo; any thread may call all its methods."""
 
     def __init__(  # noqa: PLR0913 - each is a setting of its own
         self,
@@ -48,9 +45,13 @@ class Generator:
         *,
         data: Path | None = None,
         queue_limit: int = settings.QUEUE_LIMIT,
+        # None is for a single client: without a limit, and all demands keep their order.
         requester_limit: int | None = settings.REQUESTER_QUEUE_LIMIT,
         start_offline: bool = True,
+        # Whether receipts list the releases that a demand needs or removes.
         with_targets: bool = False,
+        # Seconds between two fetches while no demand arrives; 0 means none at an interval. A
+        # repository on this disk is checked each second, with 0 each minute.
         fetch_interval: float = 0.0,
         signing_key: Path | None = None,
         progress: Progress = lambda done, total: None,
@@ -58,25 +59,8 @@ class Generator:
     ) -> None:
         """Open the state repo, start the worker and resume the demands in the journal.
 
-        Args:
-            state_repo: a folder with a bare repository, or a URL that git clones.
-            data: the folder for journal and clone; by default :func:`settings.data_home`.
-            queue_limit: how many demands may be queued.
-            requester_limit: how many demands of one requester may have no answer, apart from those
-                that await approval. With None there is no limit, and all demands keep their order;
-                this is for a single client.
-            start_offline: whether to start from the last fetch if the remote cannot be reached.
-            with_targets: whether receipts list the releases that a demand needs or removes.
-            fetch_interval: seconds between two fetches while no demand arrives; a repository on
-                this disk is checked at least every second. 0 means no fetches at an interval; a
-                repository on this disk is then checked every minute.
-            signing_key: an SSH key that signs the commits (:mod:`demandops.staterepo.git.signing`).
-            progress: called with (files read, files in all) while the ledger is loaded.
-            runtime: provides the time and the threads.
-
-        Raises:
-            StateRepoError, InvalidInput: if the state repo, the key or the journal cannot be used.
-            Unsound: if a disk failed.
+        StateRepoError or InvalidInput is raised if the state repo, the key or the journal cannot be
+        used, and Unsound if a disk failed.
         """
         heartbeat = Heartbeat(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
@@ -91,7 +75,7 @@ class Generator:
             repository.signer, repository.runtime = signer, runtime
             try:
                 snapshot = state_in_effect.first_snapshot(repository, progress)
-            except Exception:
+            except Exception:  # a power cut may have damaged the clone, which is only a copy
                 if not repository.renew_if_damaged():
                     raise
                 snapshot = state_in_effect.first_snapshot(repository, progress)
@@ -124,19 +108,16 @@ class Generator:
 
     @property
     def snapshot(self) -> Snapshot:
-        """The newest published state; any thread may read it."""
         return self._worker.snapshot
 
     def snapshot_at(self, revision: str) -> Snapshot:
-        """Return the state in effect at a commit or a time, without a fetch.
-
-        Any thread may call this method, which may take seconds.
+        """Return the state in effect at a commit or a time, without a fetch; this may take seconds.
 
         Raises:
             InvalidInput, StateRepoError: if there is no such commit, or it has files that are not
                 valid and that no generator has quarantined.
         """
-        objects = self._repository.reopened()
+        objects = self._repository.reopened()  # as libgit2's objects belong to one thread
         tip, now = self.snapshot.commit, self._runtime.now()
         with reading(self.address, objects):
             commit = revisions.resolve(objects, tip, revision, now)
@@ -144,32 +125,21 @@ class Generator:
 
     @property
     def remote_status(self) -> RemoteStatus:
-        """Whether the remote can be reached, and why not; any thread may read it."""
         return self._worker.remote.status
 
     @property
     def unpublished(self) -> int:
-        """The number of demands still to publish: those in the journal that await no approval.
-
-        Any thread may read this.
-        """
         return self._demands.unpublished
 
     @property
     def operations(self) -> tuple[str, ...]:
-        """The operation ids of the demands that have no answer yet; any thread may read them."""
         return self._demands.operations
 
     @property
     def failures(self) -> dict[str, str]:
-        """The errors of the threads and tasks that failed and have not recovered, by name.
-
-        Any thread may read this.
-        """
         return self._runtime.failures
 
     def fetch_now(self) -> None:
-        """Make a fetch due now, because a Git server reported a push; any thread may call this."""
         self._worker.fetch_now()
 
     def submit(
@@ -180,23 +150,14 @@ class Generator:
     ) -> Ticket:
         """Queue a demand and return its ticket at once.
 
-        Args:
-            goal: the goal as plain data (:mod:`demandops.demand.deployment_request_goal`,
-                :mod:`demandops.demand.demand_goal`).
-            operation: an id that no other demand ever had; generated if left out.
-            listener: called with each stage and its text, in the worker thread.
+        Every error of the demand is in the ticket's future. One that was not accepted has
+        ``ShuttingDown``, ``QueueFull``, ``Refused`` or ``StateRepoError``, and its listener is not
+        called. If the generator ends before the demand is published or approved, the error is
+        ``ShuttingDown`` or ``Unsound``, and the next start resumes the demand.
 
-        Returns:
-            A ticket whose future returns the :class:`Receipt` or raises the demand's error:
-            ``Refused`` with every fault, ``Withdrawn``, ``TurnedDown``, ``InvalidInput`` or
-            ``StateRepoError``. If the demand is not accepted at all, the future raises
-            ``ShuttingDown``, ``QueueFull``, ``Refused`` or ``StateRepoError``, and the listener is
-            not called. If the generator ends before the demand is published or approved, the future
-            raises ``ShuttingDown`` or ``Unsound``, and the next start resumes the demand.
-
-        Raises:
-            ValueError: for an operation id with other characters than letters, digits, ``-``, ``_``
-                and ``.``, or with more than 100.
+        ``operation`` is an id that no other demand ever had; without one, an id is generated.
+        ValueError is raised if its characters are not allowed. ``listener`` is called in the worker
+        thread.
         """
         operation = operation or self._runtime.fresh_id()
         if not _OPERATION.fullmatch(operation):
@@ -205,6 +166,7 @@ class Generator:
             raise ValueError(message)
         ticket = Ticket(operation, goal, self._runtime.now(), listener)
         try:
+            # exactly what a restart would read from the journal, so that it decides the same
             ticket.goal = json.loads(json.dumps(goal))
             is_deep = _is_deeper(ticket.goal, strict_yaml.MAX_DEPTH)
         except (TypeError, ValueError, RecursionError):
@@ -214,6 +176,7 @@ class Generator:
             message += "deep; give only text, numbers, true, false, null, lists and mappings"
             ticket.refuse(Refused([fault("", message)]))
             return ticket
+        # here, so that a huge goal is not journaled, and does not wait in the queue
         limits = self.snapshot.state.config.repo_settings.limits
         if large := list(admission.length_faults(ticket.goal, limits)):
             ticket.refuse(Refused(large))
@@ -223,74 +186,58 @@ class Generator:
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``other`` is ``commit`` or one of its ancestors.
-
-        Return False if two different commits are given and either is unknown here. Any thread may
-        call this.
-        """
+        """Return whether ``other`` is ``commit`` or an ancestor; false if either is unknown."""
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` exists in two commits with equal content.
-
-        Return False if either commit is unknown here. Any thread may call this.
-        """
+        """Return whether ``path`` exists in two known commits with equal content."""
         return self._repository.unchanged(commit, other, path)
 
     def changes_since(self, since: str) -> tuple[str, list[str] | None]:
         """Return the newest published commit, and the paths that changed from ``since`` to it.
 
-        The paths are None if the commit ``since`` is unknown. Any thread may call this.
+        The paths are None if the commit ``since`` is unknown.
         """
         commit = str(self.snapshot.commit)
         return commit, self._repository.changed_paths(since, commit)
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand; return whether the demand is withdrawn now.
-
-        A demand that is unknown, committed or answered cannot be withdrawn. Neither can a demand
-        while the journal cannot be written.
-        """
+        """Withdraw a demand that is not committed or answered; return whether it is withdrawn."""
         return self._demands.withdraw(operation)
 
     def on_publish(self, listener: Callable[[Config], None]) -> None:
-        """Register a listener that the worker thread calls whenever the published state changes.
-
-        The listener gets the configuration in effect, and must return at once.
-        """
+        """Have the worker call a listener, which must return at once, after each publication."""
         self._worker.listeners.append(listener)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
         """Refuse further demands, finish the queued ones and stop; return at once.
 
-        Args:
-            timeout: seconds for the queued demands. Demands that are then unpublished or
-                await approval stay in the journal for the next start, and their futures raise
-                ``ShuttingDown``. Only the timeout of the first call counts.
+        After ``timeout`` seconds, demands that are unpublished or await approval stay in the
+        journal for the next start, and their futures raise ``ShuttingDown``. Only the timeout of
+        the first call counts.
 
-        Returns:
-            A future that returns whether everything was published, apart from demands that await
-            approval. The future is done once the threads have ended, at the latest
-            :data:`_GRACE_S` after the timeout; if they have not ended by then, it returns False.
+        The future returns whether everything was published, apart from demands that await approval.
+        It returns false if the threads have not ended :data:`_GRACE_S` after the timeout.
         """
         with self._stop_lock:
             if self._finished is not None:
                 return self._finished
             self._finished = finished = Future[bool]()
         self._demands.close()
-        self._runtime.start_thread("stop", lambda: self._end(timeout, finished))
-        return finished
 
-    def _end(self, timeout: float, finished: Future[bool]) -> None:
-        if not self._have_ended(timeout):
-            self._worker.end_soon()
-        if not self._have_ended(_GRACE_S):  # a thread may still hold locks
-            log.error("the generator did not end; its demands stay in the journal")
-            finished.set_result(False)
-            return
-        unpublished = self._demands.unpublished
-        self._slot.close()
-        finished.set_result(not unpublished)
+        def end() -> None:
+            if not self._have_ended(timeout):
+                self._worker.end_soon()
+            if not self._have_ended(_GRACE_S):  # a thread may still hold locks
+                log.error("the generator did not end; its demands stay in the journal")
+                finished.set_result(False)
+                return
+            unpublished = self._demands.unpublished
+            self._slot.close()
+            finished.set_result(not unpublished)
+
+        self._runtime.start_thread("stop", end)
+        return finished
 
     def _have_ended(self, timeout: float) -> bool:
         end = self._runtime.monotonic() + timeout
@@ -299,7 +246,6 @@ class Generator:
         return not any(thread.is_alive() for thread in self._threads)
 
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
-        """Stop, wait for the threads to end, and return the result of :meth:`stop`."""
         return self.stop(timeout).result()
 
 

@@ -34,8 +34,6 @@ _BYTES_IN_A_PIECE = 256
 
 
 class HttpServer:
-    """A running HTTP server, in a thread of its own."""
-
     def __init__(
         self,
         listening: socket.socket,
@@ -44,15 +42,7 @@ class HttpServer:
         at_once: int,
         headers: list[tuple[str, str]] | None = None,
     ) -> None:
-        """Start the server.
-
-        Args:
-            listening: the socket.
-            application: answers the requests.
-            name: the name of the thread.
-            at_once: how many connections may be open.
-            headers: headers of all answers.
-        """
+        """Start the server, with at most ``at_once`` connections; all answers have the headers."""
 
         class Connection(_BoundedConnection):
             most = at_once
@@ -76,7 +66,6 @@ class HttpServer:
         self._thread = REAL.keep_running(name, lambda: self._server.run([listening]))
 
     def close(self) -> None:
-        """Stop the server and wait for its end."""
         self._server.should_exit = True
         self._thread.join()
 
@@ -84,22 +73,22 @@ class HttpServer:
 class _BoundedConnection(H11Protocol):
     """A connection that is closed if its client takes too long or sends in too small pieces.
 
-    The client must complete a request within 10 to 20 seconds. It has the same time to read each
-    part of an answer. The time in which the server computes an answer does not count, so a stream
-    of events stays open while the client reads the events.
+    The client must complete a request within 10 to 20 seconds, and has as long to read each part of
+    an answer. While the server computes an answer, no time counts. So a stream of events stays open
+    while the client reads the events.
     """
 
-    most: int
-    """How many connections may be open."""
+    most: int  # of the connections that may be open
 
     def connection_made(self, transport: Any) -> None:  # noqa: ANN401 - a type of asyncio
         super().connection_made(transport)
         self._since, self._bytes, self._pieces = self.loop.time(), 0, 0
         self._before: tuple[object, int] | None = None
-        self._look_later()
+        self._timer = self.loop.call_later(_STUCK_S, self._look)
         opened = [each for each in self.connections if isinstance(each, _BoundedConnection)]
         opened = [each for each in opened if not each.transport.is_closing()]
         if len(opened) > self.most:
+            # not the new one, so that a health check gets in while others hold all connections
             waiting = [each for each in opened if each.waits_for_client()]  # this one too
             min(waiting, key=lambda each: each._since).transport.abort()
 
@@ -110,7 +99,7 @@ class _BoundedConnection(H11Protocol):
         return not is_asked or self.flow.write_paused
 
     def data_received(self, data: bytes) -> None:
-        """Parse data, unless the request comes in too many packets, lines or chunks."""
+        # the parser takes as long for a packet, line or chunk of one byte as for a large one
         self._bytes += len(data)
         self._pieces += 1 + data.count(b"\r\n")
         if self._pieces > _PIECES + self._bytes // _BYTES_IN_A_PIECE:
@@ -122,17 +111,15 @@ class _BoundedConnection(H11Protocol):
         self._bytes = self._pieces = 0
         super().on_response_complete()
 
-    def _look_later(self) -> None:
-        self._timer = self.loop.call_later(_STUCK_S, self._look)
-
     def _look(self) -> None:
+        # stuck is who has neither sent a request nor read a byte since the last look
         unread = self.transport.get_write_buffer_size()
         now = (self.cycle, unread) if self.waits_for_client() else None
         if now is not None and now == self._before:
             self.transport.abort()
             return
         self._before = now
-        self._look_later()
+        self._timer = self.loop.call_later(_STUCK_S, self._look)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._timer.cancel()
@@ -140,52 +127,43 @@ class _BoundedConnection(H11Protocol):
 
 
 def bound(address: str, option: str) -> socket.socket:
-    """Return a socket that listens on ``host:port``; port 0 picks a free port.
-
-    Raises:
-        InvalidInput: the socket cannot listen on the address; the error names the option.
-    """
+    """Return a socket that listens on ``host:port``; a fault of the address names the option."""
     host, colon, port = address.rpartition(":")
     if not colon or not host or not _PORT.fullmatch(port) or int(port) > 0xFFFF:
         raise InvalidInput.at(
             option,
             f"{quoted(address)} is not an address to listen on; write one like 127.0.0.1:8090",
         )
-    family, resolved = _resolved(
-        host.removeprefix("[").removesuffix("]"), int(port), address, option
-    )
-    made = socket.socket(family)
+    host = host.removeprefix("[").removesuffix("]")  # of an IPv6 address
     try:
-        made.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        made.bind(resolved)
-        made.listen()
-    except OSError as error:
-        made.close()
-        remedy = _REMEDIES.get(error.errno or 0, "choose another port")
-        raise InvalidInput.at(
-            option, f"cannot listen on '{address}': {error.strerror}; {remedy}"
-        ) from None
-    return made
-
-
-def is_local(listening: socket.socket) -> bool:
-    """Return whether only programs on this machine can connect."""
-    host = listening.getsockname()[0]
-    return ipaddress.ip_address(host.partition("%")[0]).is_loopback
-
-
-def url_of(listening: socket.socket) -> str:
-    """Return the URL of the server, without a path."""
-    host, port = listening.getsockname()[:2]
-    return f"http://{f'[{host}]' if ':' in host else host}:{port}"
-
-
-def _resolved(host: str, port: int, address: str, option: str) -> tuple[socket.AddressFamily, Any]:
-    try:
-        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, *_, resolved = socket.getaddrinfo(
+            host, int(port), type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+        )[0]
     except (OSError, UnicodeError):
         raise InvalidInput.at(
             option,
             f"'{address}': host '{host}' cannot be resolved; write an address of this machine",
         ) from None
-    return found[0][0], found[0][4]
+    listening = socket.socket(family)
+    try:
+        # a restart need not wait until the kernel has forgotten the last connections
+        listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listening.bind(resolved)
+        listening.listen()
+    except OSError as error:
+        listening.close()
+        remedy = _REMEDIES.get(error.errno or 0, "choose another port")
+        raise InvalidInput.at(
+            option, f"cannot listen on '{address}': {error.strerror}; {remedy}"
+        ) from None
+    return listening
+
+
+def is_local(listening: socket.socket) -> bool:
+    host = listening.getsockname()[0]
+    return ipaddress.ip_address(host.partition("%")[0]).is_loopback
+
+
+def url_of(listening: socket.socket) -> str:
+    host, port = listening.getsockname()[:2]
+    return f"http://{f'[{host}]' if ':' in host else host}:{port}"

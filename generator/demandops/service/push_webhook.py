@@ -24,8 +24,9 @@ log = logging.getLogger("demandops")
 
 _PATH = "/push"
 _AT_ONCE = 32
+# The largest body that GitHub sends, in bytes; a body is hashed and not stored.
 _MAX_BODY = 25 << 20
-"""The largest body that GitHub sends, in bytes; a body is hashed and not stored."""
+# Anyone may send requests, and a line for each could fill the log.
 _WARN_EVERY_S = 60.0
 
 _SIGNATURES = ("X-Hub-Signature-256", "X-Gitea-Signature", "X-Forgejo-Signature")
@@ -36,16 +37,10 @@ class PushWebhook:
     """The webhook's server, in a thread of its own; a request for ``/`` is a health check."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
-        """Start the server.
+        """Start the server; port 0 picks a free port, and ``on_push`` must return at once.
 
-        Args:
-            address: ``host:port``; port 0 picks a free port.
-            secret: the key that signs notifications. If it is empty, notifications need no
-                signature, and the address must be a loopback address.
-            on_push: called for each notification; must return at once.
-
-        Raises:
-            InvalidInput: the server cannot or must not listen on the address.
+        With an empty secret, notifications need no signature, and the address must be a loopback
+        address.
         """
         self._secret, self._on_push = secret, on_push
         self._warned = float("-inf")
@@ -64,11 +59,10 @@ class PushWebhook:
         self._server = HttpServer(listening, app, "webhook", _AT_ONCE, one_request)
 
     def close(self) -> None:
-        """Stop the server and wait for its end."""
         self._server.close()
 
     async def _handle(self, request: Request) -> PlainTextResponse:
-        """Answer a request; if it is a valid notification, report the push."""
+        # a page in a person's browser can send requests to 127.0.0.1 too
         if "origin" in request.headers or "sec-fetch-site" in request.headers:
             return PlainTextResponse("a browser asked for this, not a Git server\n", 403)
         digest, length = hmac.new(self._secret, digestmod=hashlib.sha256), 0
@@ -84,29 +78,23 @@ class PushWebhook:
         except ClientDisconnect:
             return PlainTextResponse("the body is not complete\n", 400)
         if self._secret and not self._is_signed(request, digest.hexdigest()):
-            self._warn(request.client.host if request.client else "")
+            if REAL.monotonic() - self._warned > _WARN_EVERY_S:
+                self._warned = REAL.monotonic()
+                log.warning(
+                    "a notification from %s was not signed with the webhook's secret; is the "
+                    "secret the same here and at the Git server?",
+                    request.client.host if request.client else "",
+                )
             return PlainTextResponse("not signed with the secret\n", 403)
         self._on_push()
         return PlainTextResponse("fetching\n", 202)
 
     def _is_signed(self, request: Request, digest: str) -> bool:
+        # GitHub, Gitea and Forgejo sign the body; GitLab sends the secret itself
         signatures = [request.headers.get(name, "").removeprefix("sha256=") for name in _SIGNATURES]
         signed = [hmac.compare_digest(_bytes(s), digest.encode()) for s in signatures]
         token = hmac.compare_digest(_bytes(request.headers.get(_TOKEN, "")), self._secret)
         return any(signed) or token
-
-    def _warn(self, sender: str) -> None:
-        """Log, at most once a minute, that a notification is not signed.
-
-        Anyone may send requests, and a line for each request could fill the log.
-        """
-        if REAL.monotonic() - self._warned > _WARN_EVERY_S:
-            self._warned = REAL.monotonic()
-            log.warning(
-                "a notification from %s was not signed with the webhook's secret; is the secret "
-                "the same here and at the Git server?",
-                sender,
-            )
 
 
 async def _health(request: Request) -> PlainTextResponse:

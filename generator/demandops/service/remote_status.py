@@ -13,15 +13,8 @@ log = logging.getLogger("demandops")
 
 @dataclass(frozen=True, slots=True)
 class RemoteStatus:
-    """Whether the remote can be reached.
-
-    ``unreachable`` is the reason why the remote cannot be read or written now; it is empty if the
-    remote can be reached. ``push_denied`` is the reason why the remote rejected the last push; it
-    is empty if the remote accepted that push, or if there was none.
-    """
-
-    unreachable: str = ""
-    push_denied: str = ""
+    unreachable: str = ""  # why the remote cannot be read or written now
+    push_denied: str = ""  # why the remote rejected the last push
     unreachable_since: datetime | None = None
     last_reached: datetime | None = None
     last_push: datetime | None = None
@@ -36,18 +29,16 @@ class RemoteMonitor:
         self._away_from = 0.0
 
     def record_unreachable(self, reason: str) -> None:
-        """Record that the remote cannot be reached; warn if it was reachable before."""
         since = self.status.unreachable_since
         if since is None:
             log.warning("%s; trying again until the state repo is back", reason)
-            self._away_from = self._runtime.monotonic()
+            self._away_from = self._runtime.monotonic()  # as a person may set the other clock
         else:
             log.debug("%s", reason)
         since = since or self._runtime.now()
         self.status = replace(self.status, unreachable=reason, unreachable_since=since)
 
     def record_reached(self, *, pushed: bool = False) -> None:
-        """Record that the remote was reached; log this if it was unreachable before."""
         now, before = self._runtime.now(), self.status
         if before.unreachable_since is not None:
             away = self._runtime.monotonic() - self._away_from
@@ -59,7 +50,6 @@ class RemoteMonitor:
         )
 
     def record_push_denied(self, reason: str) -> None:
-        """Record that the remote was reached and rejected a push."""
         if reason != self.status.push_denied:
             log.error("%s", reason)
         self.record_reached()

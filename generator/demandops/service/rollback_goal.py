@@ -20,38 +20,25 @@ _KIND = "Rollback"
 
 
 def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
-    """Return the goal to roll back to the commit ``to``.
-
-    Args:
-        to: the commit whose claims are booked again.
-        drop_newer: whether the rollback may undo newer claims. If not, newer claims make it fail.
-        reason: why the person rolls back.
-        who: the person's name and e-mail address.
-    """
+    """Return the goal to book the claims of the commit ``to`` again."""
     return {
         "apiVersion": API_VERSION,
         "kind": _KIND,
         "to": to,
-        "dropNewer": drop_newer,
+        "dropNewer": drop_newer,  # without it, newer claims make the rollback fail
         "reason": " ".join(reason.split()),
         "by": list(who),
     }
 
 
 def is_rollback(goal: object) -> bool:
-    """Return whether a goal is a rollback."""
     return isinstance(goal, dict) and goal.get("kind") == _KIND
 
 
 def to_restoration(
     goal: dict[str, Any], repository: StateRepository, head: Snapshot
 ) -> Restoration:
-    """Return the restoration that a rollback goal requests.
-
-    Raises:
-        Refused: if the commit to roll back to is not in the history of ``head``.
-        InvalidInput: if the ledger of that commit is not valid.
-    """
+    """Return the restoration that a goal requests; Refused if ``head`` lacks its commit."""
     to = str(goal["to"])
     if not repository.includes(str(head.commit), to):
         message = f"commit {to} is not in the history of the state repo; roll back to one that is"

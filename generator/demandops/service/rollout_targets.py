@@ -19,15 +19,15 @@ from demandops.render.gitops.paths import domains_in_use
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
     """Return the targets of the releases that a demand needs, changes or removes.
 
-    A release that only other demands need is left out, even if those demands share a subject with
-    this demand.
+    A release that only other demands need is left out, even if they share a subject with this one.
     """
     after, request = decision.state, decision.request
     active = without_suspended(after)
     claims = [*active.ledger.claims_of_demand(request.demand)]
-    for one in request.demanded if request.adds_claims else ():
-        for who in one.requesters:
-            claims += active.ledger.claims_held_by(who, one.held.subject)
+
+    for demanded in request.demanded if request.adds_claims else ():
+        for requester in demanded.requesters:
+            claims += active.ledger.claims_held_by(requester, demanded.held.subject)
     changed = affected_keys(before, after, decision.changes.claims)
     targets = []
     for key in dict.fromkeys((*keys_of_claims(active, claims), *changed)):
@@ -62,17 +62,12 @@ def domains_of_state(state: State) -> list[ClusterDomain]:
 
 
 def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
-    """Return an access domain on a cluster, in the form that :mod:`demandops.cluster` needs.
-
-    With Argo CD, the result names the Application that applies the folder of the domain.
-    """
-    application = None
+    application = None  # with Argo CD, the Application that applies the folder of the domain
     if repository.gitops == "argocd" and repository.argocd:
         application = ObjectName(repository.argocd.namespace, project_of(domain, repository))
     return ClusterDomain(cluster, domain.name, domain.namespace, application)
 
 
 def target_of(release: Release, repository: RepoSettings, *, wanted: bool = True) -> Target:
-    """Return the target of a release; ``wanted`` says whether the cluster should run it."""
     domain = cluster_domain(release.node.cluster, release.domain, repository)
     return Target(domain, release.name, isinstance(release, ServiceRelease), wanted)

@@ -18,79 +18,60 @@ from demandops.staterepo.write.journal import JournalEntry, ProposalRecord
 
 log = logging.getLogger("demandops")
 
+# What a demand's listener is told.
 Stage = Literal[
-    "away", "admitted", "booked", "waiting", "committed", "proposed", "pushed", "refused"
+    "away",  # the state repo cannot be reached or written now
+    "admitted",  # the demand is valid
+    "booked",  # its claims are computed, but not committed yet
+    "waiting",  # no node has room for it, so it will be booked later
+    "committed",  # it has a commit
+    "proposed",  # it awaits a person's approval
+    "pushed",  # the commit in its receipt is published
+    # Its answer is an error. Not told if the demand was not accepted, was taken back by its client,
+    # or stays in the journal.
+    "refused",
 ]
-"""A stage of a demand; the demand's listener is called with each stage.
-
-``away``: the state repo cannot be reached or written now.
-
-``admitted``: the demand is valid. ``booked``: its claims are computed, but not committed yet.
-
-``waiting``: no node has room for the demand, so it will be booked later.
-
-``committed``: the demand has a commit. ``pushed``: the commit in the receipt is published.
-
-``proposed``: the demand awaits a person's approval.
-
-``refused``: the answer to the demand is an error. Not reported if the demand was not accepted, was
-taken back by its client, or stays in the journal.
-"""
 Listener = Callable[[Stage, str], None]
 
+# Only demandops.service.demand_lifecycle changes the state of a demand.
 State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done"]
-"""The state of a demand; only :mod:`demandops.service.demand_lifecycle` changes it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
     """The outcome of a demand whose commit is published and durable.
 
-    If the demand changed nothing, ``commit`` is the newest commit on which it was decided.
-    ``lease_s`` is the lease in seconds, None without one. ``targets`` are the releases that the
-    demand needs or removes, if the generator was asked for them. ``changes`` are the changed
-    claims. ``placed`` says which nodes the generator chose, and why.
-
-    If an earlier attempt or run published the demand, only the first four fields are known, and the
-    others are empty.
+    If an earlier attempt or run published the demand, only the first four fields are known.
     """
 
     operation: str
     request_id: str
     outcome: Outcome
-    commit: str
+    commit: str  # of a demand that changed nothing, the newest one on which it was decided
     warnings: tuple[str, ...] = ()
     not_held: tuple[str, ...] = ()
-    placed: tuple[str, ...] = ()
+    placed: tuple[str, ...] = ()  # which nodes the generator chose, and why
     lease_s: int | None = None
-    targets: tuple[Target, ...] = ()
+    targets: tuple[Target, ...] = ()  # the releases to follow, if the generator was asked for them
     changes: tuple[ClaimChange, ...] = ()
 
 
 @dataclass(eq=False)
 class Ticket:
-    """A demand under way."""
-
     operation: str
     goal: Any
     received: datetime
     listener: Listener = lambda stage, text: None
     future: Future[Receipt] = field(default_factory=Future)
-    """Returns the demand's receipt or raises its error."""
+    # True once a crash cannot lose the demand; false if it was refused without being journaled.
     journaled: Future[bool] = field(default_factory=Future)
-    """Returns true once the demand is in the journal, so that a crash does not lose the demand.
-
-    Returns false if the demand is refused without being journaled.
-    """
+    # A tip that does not include the demand; only later commits may record the demand.
     base: str = ""
-    """A tip that does not include the demand; only later commits may record the demand."""
+    # Whether the remote may have accepted a push of the demand although no answer arrived.
     maybe_published: bool = False
-    """Whether the remote may have accepted a push of the demand although no answer arrived."""
+    # Whether this demand released one that awaited approval: then it succeeds even if it ends no
+    # claim.
     has_released: bool = False
-    """Whether this demand released a demand that awaited approval.
-
-    Such a release succeeds even if it ends no claim.
-    """
     state: State = "queued"
     notified: set[str] = field(default_factory=set)
     proposal: ProposalRecord | None = None
@@ -107,16 +88,15 @@ class Ticket:
         return str(next((fields[key] for key in keys if fields.get(key)), ""))
 
     def refuse(self, error: DemandOpsError) -> None:
-        """Answer the demand with an error; only for a demand that is not in the journal yet."""
+        """Answer a demand that is not in the journal yet with an error."""
         self.state = "done"
         self.future.set_exception(error)
         self.journaled.set_result(False)
 
     def notify(self, stage: Stage, text: str) -> None:
-        """Report a stage to the listener, but only once, even if the demand is evaluated again.
-
-        The stage ``proposed`` is reported once for each text.
-        """
+        """Report a stage to the listener once, or ``proposed`` once for each text."""
+        # a demand is evaluated again after each lost race, which must not repeat its stages; a
+        # proposal has another text once its pull request is known
         key = text if stage == "proposed" else stage
         if key in self.notified:
             return
@@ -128,11 +108,10 @@ class Ticket:
 
     def mark_maybe_published(self, base: str) -> None:
         """Record that a push on top of ``base`` may have succeeded although it seemed to fail."""
-        if not self.maybe_published:
+        if not self.maybe_published:  # the oldest base counts, because any try may have succeeded
             self.base, self.maybe_published = base, True
 
     def journal_entry(self, proposal: ProposalRecord | None = None) -> JournalEntry:
-        """Return the demand's entry for the journal."""
         received = self.received.isoformat()
         return JournalEntry(self.operation, self.goal, received, self.base, proposal)
 
@@ -140,7 +119,6 @@ class Ticket:
 def receipt_of(
     ticket: Ticket, decision: Decision, commit: str, targets: tuple[Target, ...]
 ) -> Receipt:
-    """Return the receipt of a demand, with the results of its decision."""
     return Receipt(
         operation=ticket.operation,
         request_id=decision.request.id,
@@ -156,15 +134,11 @@ def receipt_of(
 
 
 def reason_of(error: DemandOpsError) -> str:
-    """Return the error of a refused demand as text for people."""
     return error.text_with_codes() if isinstance(error, InvalidInput) else str(error)
 
 
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    """Return a ticket for a demand that an earlier run left in the journal.
-
-    The ticket's listener logs what becomes of the demand.
-    """
+    """Return a ticket whose listener logs what becomes of the demand."""
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"
 
@@ -176,7 +150,7 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
 
     ticket.listener = tell
     ticket.journaled.set_result(True)
-    ticket.mark_maybe_published(entry.base)
+    ticket.mark_maybe_published(entry.base)  # the earlier run may have ended after the push
     if entry.proposal is not None:
         ticket.proposal = entry.proposal
         ticket.state = "withdrawn" if ticket.proposal.withdrawn else "proposed"

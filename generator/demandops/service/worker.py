@@ -50,18 +50,19 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
+# How many new Git packs to collect before git joins them; each publication or fetch adds one.
 _TIDY_EVERY = 50
-"""How many new Git packs to collect before git joins them; each publication or fetch adds one."""
+# How often to carry out a change by a person while other generators, which do the same, are faster.
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
+# The thread's name, under which a health check reports its failure.
 _NAME = "writer"
 
 
 class Worker:
     """Follows the state repo and turns batches of demands into published commits.
 
-    Any thread may read ``remote`` and ``snapshot`` (the newest published state). The worker calls
-    the ``listeners`` with the configuration in effect whenever the published state changes.
+    Any thread may read ``remote`` and ``snapshot`` (the newest published state).
     """
 
     def __init__(
@@ -101,10 +102,7 @@ class Worker:
         self._demands.wake()
 
     def end_soon(self) -> None:
-        """End a running transfer, and begin no further attempt to publish.
-
-        Demands that are not published then stay in the journal.
-        """
+        """End a running transfer and begin no other; what is unpublished stays in the journal."""
         self._ends_soon.set()
         self._repository.abort()
         self._demands.wake()
@@ -112,9 +110,8 @@ class Worker:
     # ---- the loop ----
 
     def run(self) -> None:
-        """Publish demands, until no further demand is accepted and no demand is queued."""
-        # people may have decided about proposals before the start, so answer these demands first
         with processor_time(each=DEMAND_S, meanwhile=self._heartbeat):
+            # people may have decided about proposals before the start: answer these demands first
             if self._demands.proposed:
                 self._work()
             while self._demands.wait(self._seconds_until_due()):
@@ -123,12 +120,9 @@ class Worker:
         self._approvals.suspend()
 
     def _work(self) -> None:
-        """Publish the queued demands; if no demand is queued, follow the state repo.
-
-        Check the proposals afterwards.
-        """
         batch: list[Ticket] = []
         try:
+            # demands before fetches: the push of a demand finds new commits just as a fetch would
             self._demands.take(batch, self._batch_limit)
             if batch or self._ended_leases(self.snapshot):
                 self._publish(batch)
@@ -151,12 +145,7 @@ class Worker:
                 self._runtime.recovered(_NAME)
 
     def _fail(self, batch: list[Ticket], error: Exception) -> None:
-        """Answer a batch with an error; if the batch is empty, stop fetching for a while.
-
-        Raises:
-            Unsound: if ``error`` is an ``Unsound``. The process must end then; the journal is kept.
-        """
-        if isinstance(error, Unsound):
+        if isinstance(error, Unsound):  # the process must end; the next one reads the journal
             self._demands.end(error)
             raise error
         if isinstance(error, ShuttingDown):
@@ -166,28 +155,19 @@ class Worker:
         if not batch or not isinstance(error, DemandOpsError):
             self._runtime.failed(_NAME, error)
         if not batch:
-            self._begin_rest()
+            # not at each failure in a row, because git then reads all objects
+            if self._rest.follows_success:
+                try:
+                    self._repository.renew_if_damaged()
+                except StateRepoError as damage:
+                    log.warning("%s", damage)
+            self._rest.begin()
+            self._timer.finished(reached=False)
         if not isinstance(error, DemandOpsError):
             error = internal(error)
         self._demands.fail(batch, error)
 
-    def _begin_rest(self) -> None:
-        if self._rest.follows_success:
-            self._renew_clone_if_damaged()
-        self._rest.begin()
-        self._timer.finished(reached=False)
-
-    def _renew_clone_if_damaged(self) -> None:
-        try:
-            self._repository.renew_if_damaged()
-        except StateRepoError as error:
-            log.warning("%s", error)
-
     def _seconds_until_due(self) -> float:
-        """Return the seconds until a lease, override, scale-down, proposal or fetch is due.
-
-        During a rest, return the seconds until its end.
-        """
         if self._rest:
             return self._rest.seconds_left()
         state, tip = self.snapshot.state, str(self.snapshot.commit)
@@ -202,12 +182,8 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, the demands that arrive during retries, and the ends of leases.
 
-        The batch is empty afterwards. The demands that the worker had no time to evaluate are
-        in the queue again.
-
-        Raises:
-            ShuttingDown: after :meth:`end_soon`; the demands are still in the batch.
-            DemandOpsError: if the state repo cannot be used; the demands are still in the batch.
+        The batch is empty afterwards; demands that there was no time to evaluate are queued again.
+        If an error is raised, the demands are still in the batch.
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
@@ -216,12 +192,13 @@ class Worker:
             self._require_not_ending()
             try:
                 wait = self._attempt(batch, backoff)
-            except Exception as error:
-                reason = access_error(error, self._repository.address, self._repository.objects)
+            except Exception as failure:
+                reason = access_error(failure, self._repository.address, self._repository.objects)
                 if isinstance(reason, PushDenied):
                     self.remote.record_push_denied(str(reason))
                 if not isinstance(reason, Unavailable):
                     raise reason from None
+                # the connection may have ended after the remote accepted the push
                 for ticket in batch:
                     ticket.mark_maybe_published(str(self.snapshot.commit))
                 self._record_unreachable(reason)
@@ -244,8 +221,7 @@ class Worker:
     def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
         """Evaluate and publish a part of a batch.
 
-        Returns:
-            The seconds to wait before the next attempt, or None to continue at once.
+        Return the seconds to wait before the next attempt, or None to continue at once.
         """
         # fetch before a demand is committed, because after that it can no longer be withdrawn
         if self._must_fetch or self.remote.status.unreachable:
@@ -260,6 +236,8 @@ class Worker:
         part, left = left[: backoff.max_demands], left[backoff.max_demands :]
         self._approvals.remove_released(part, self.snapshot.state)
         commits = self._new_commit_batch()
+        # a person may have written to a repository on this disk since the tip was read, and the
+        # search for published demands and the deletion of released branches hold only for that tip
         if commits.start.commit != tip:
             return None
         began = self._runtime.monotonic()
@@ -273,6 +251,7 @@ class Worker:
             results.append(self._evaluated(commits, ticket))
             if commits.is_empty:
                 independent = len(results)
+        # leases end last, because a demand that is still left may renew one
         if not left:
             for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
                 results.append(self._evaluated(commits, ticket))
@@ -298,44 +277,32 @@ class Worker:
         )
 
     def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
-        """Evaluate a demand, and book waiting demands if the demand frees room.
-
-        Returns:
-            The demand with its result.
-        """
         self._heartbeat()
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
+        # those that wait get the room that this demand frees before the next demand can take it
         self._own_work.follow(commits, before)
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended, to release its claims.
-
-        Return no ticket during a rest, or while a demand is queued, which may renew a lease.
-        """
-        if self._rest or self._demands.has_queued:
+        """Return a ticket for each demand whose lease has ended, to release its claims."""
+        if self._rest or self._demands.has_queued:  # a queued demand may renew a lease
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
 
     def _publish_commits(
         self, commits: CommitBatch, results: list[Result], independent: int
     ) -> bool:
-        """Publish a commit batch and answer its demands, or return false and answer none.
+        """Publish a commit batch and answer its demands.
 
-        The result is false if another writer was first or locks main. If the remote denies the
-        push, each demand in ``results`` gets :class:`PushDenied` as its answer, except the first
-        ``independent`` demands and withdrawn demands.
-
-        Args:
-            commits: the commits of the demands.
-            results: the demands and their results, in the order of evaluation.
-            independent: how many demands were decided before the batch had a commit, so that their
-                results do not depend on the push.
+        Return false, without answers, if another writer was first or locks main. The first
+        ``independent`` results were decided before the batch had a commit, so they do not depend on
+        the push.
         """
         try:
             published = commits.publish()
         except PushDenied as error:
+            # a withdrawn demand gets its answer whatever the remote says
             results[independent:] = [
                 (ticket, result if isinstance(result, Withdrawn) else error)
                 for ticket, result in results[independent:]
@@ -354,10 +321,7 @@ class Worker:
         return True
 
     def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
-        """Wait for ``seconds``; meanwhile answer withdrawn demands.
-
-        If the remote cannot be reached, report the reason to the batch and to new demands.
-        """
+        """Wait; meanwhile answer withdrawn demands, and tell the others what they wait for."""
         end = self._runtime.monotonic() + seconds
         to_notify = list(batch)
         while not self._ends_soon.is_set():
@@ -373,14 +337,13 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if a fetch is due, carry out people's changes, and do the work of :class:`OwnWork`.
-
-        In a repository on this disk, the worker reads the tip in every call, because that is cheap.
-        """
+        """Fetch if a fetch is due, carry out people's changes, and do the work that is due."""
         is_due = self._own_work.is_due(self.snapshot.state)
         try:
             if self._timer.start_if_due():
+                # a demand that arrives ends the fetch, because its push finds new commits too
                 self._repository.refresh(lambda: self._demands.must_not_wait)
+            # in a repository on this disk, each turn reads the tip, because that is cheap
             elif not (self._repository.always_current or is_due):
                 return
             new = is_due or self._repository.tip() != self.snapshot.commit
@@ -412,17 +375,15 @@ class Worker:
             self._record_unreachable(error)
 
     def _carry_out_changes(self) -> bool:
-        """Publish the effects of people's changes; return whether this published a commit.
-
-        The caller has fetched the changes. This method fetches only after another writer published
-        first.
-        """
+        """Publish the effects of people's changes; return whether a commit was published."""
+        # the caller has fetched the changes
         for _ in range(_TRIES):
             commits = self._new_commit_batch()
             if commits.publish():
                 self._record_published(commits)
                 return not commits.is_empty
             self._repository.refresh()
+            # at random, so that generators which all saw the change do not collide again
             self._ends_soon.wait(self._runtime.uniform(0, _LONGEST_PAUSE_S))
         return False  # other generators are faster, and they carry out the same changes
 
@@ -446,16 +407,13 @@ class Worker:
     def _record_published(self, commits: CommitBatch) -> None:
         if commits.followed:
             log.info("%s", commits.followed)
-        self._set_snapshot(commits.head)
-
-    def _set_snapshot(self, snapshot: Snapshot) -> None:
-        before, self.snapshot = self.snapshot, snapshot
+        before, self.snapshot = self.snapshot, commits.head
         # also true after a person's merge that needs no commit of the generator
-        if snapshot.commit != before.commit:
+        if self.snapshot.commit != before.commit:
             self._packs_since_tidy += 1
-            self._log.warn_if_unsigned(snapshot)
+            self._log.warn_if_unsigned(self.snapshot)
             for listener in self.listeners:
-                listener(snapshot.state.config)
+                listener(self.snapshot.state.config)
 
     def _record_reached(self, *, pushed: bool) -> None:
         self._demands.blocked = ""

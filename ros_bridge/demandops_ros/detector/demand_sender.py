@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from math import inf
-from typing import Any
 
 from application_manager_interfaces.action import DeploymentRequest
 from demandops.detection.detector import Want
@@ -18,19 +17,15 @@ from demandops_ros.action_endpoints import DemandError, GoalSender
 from demandops_ros.client import DemandClient
 from demandops_ros.messages import fill_message
 
+# How many goals are sent at the same time; the node publishes such goals together.
 _THREADS = 8
-"""How many goals are sent at the same time; the node publishes such goals together."""
 _LONGEST_WAIT_S = 60.0
 
-Log = Callable[[str, str], None]
-"""Logs a text. The first argument is the level, ``info`` or ``warning``; the second, the text."""
+Log = Callable[[str, str], None]  # of a level, `info` or `warning`, and a text
 
 
 class DemandSender:
-    """Keeps the demands of the current events booked: sends, retries and renews them.
-
-    Of booked demands, only those of the detector itself are released.
-    """
+    """Keeps the demands of the current events booked: sends, retries and renews them."""
 
     def __init__(
         self, action_name: str, demand_action_name: str, timeout_s: float, log: Log
@@ -62,10 +57,8 @@ class DemandSender:
     def want(self, wants: Iterable[Want], booked: Mapping[Key, Goal] | None = None) -> None:
         """Record the demands that events need from now on, and send the goals for them.
 
-        Args:
-            wants: the wanted demand of each event that has changed.
-            booked: each event whose demand was booked before the detector started, with a goal
-                that can end the demand.
+        ``booked`` has the events whose demands were booked before the detector started, each with a
+        goal that can end the demand.
         """
         with self._changed:
             for key, goal in (booked or {}).items():
@@ -75,11 +68,9 @@ class DemandSender:
             self._changed.notify_all()
 
     def summary(self) -> tuple[int, int, list[tuple[Key, str]]]:
-        """Return the current counts and failures.
+        """Return how many events want or hold a demand, and how many of these have no answer yet.
 
-        Returns:
-            How many events want or hold a demand, how many of these demands are still to be booked
-            or released, and the events whose last goal failed, each with the reason.
+        The third value has the events whose last goal failed, each with the reason.
         """
         with self._changed:
             return len(self._wanted), self._wanted.unanswered(), list(self._wanted.refusals())
@@ -114,18 +105,16 @@ class DemandSender:
         try:
             if goal.action == "demand":
                 answer = self._demands.send(goal.data)
-                told = (f"{answer.outcome} in {answer.commit}", *answer.warnings)
-                return Outcome("", one_line("; warning: ".join(told)), answer.lease_s)
-            return self._send_request(goal.data)
+                texts = (f"{answer.outcome} in {answer.commit}", *answer.warnings)
+                return Outcome("", one_line("; warning: ".join(texts)), answer.lease_s)
+            succeeded, result, _ = self._requests.send(
+                fill_message(DeploymentRequest.Goal(), dict(goal.data))
+            )
+            lines = result.message.split("\n")
+            text = one_line("; ".join(lines if succeeded else lines[:1]))
+            # a failed request begins with the code, as this action has no field for it
+            return Outcome("" if succeeded else text.partition(":")[0] or "aborted", text)
         except DemandError as error:
             return Outcome(error.code, one_line(str(error)))
         except Exception as error:  # a value that the message cannot carry, or a closed client
             return Outcome("fault", one_line(repr(error)))
-
-    def _send_request(self, data: Any) -> Outcome:  # noqa: ANN401 - plain data
-        succeeded, result, _ = self._requests.send(
-            fill_message(DeploymentRequest.Goal(), dict(data))
-        )
-        lines = result.message.split("\n")
-        text = one_line("; ".join(lines if succeeded else lines[:1]))
-        return Outcome("" if succeeded else text.partition(":")[0] or "aborted", text)

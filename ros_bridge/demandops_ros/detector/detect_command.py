@@ -73,15 +73,15 @@ def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
         ) from None
     recorded = RecordedBag(bag, file)
     try:
-        found = replay.replayed(str(bag), recorded, file)
+        replayed = replay.replayed(str(bag), recorded, file)
     finally:
         recorded.close()
     for topic, type_name in recorded.unread.items():
         errors.print(f"warning: {topic} is not read, because its type is {type_name}")
-    replay.show(found, output)
+    replay.show(replayed, output)
     if plot is not None:
         try:
-            plot.write_text(replay_plot.svg(found))
+            plot.write_text(replay_plot.svg(replayed))
         except OSError as error:
             problem = f"cannot be written: {error.strerror or error}"
             raise InvalidInput.at("", problem, file=str(plot)) from None

@@ -16,8 +16,6 @@ _MOST_REFUSALS = 20
 
 
 class DetectorDiagnostics:
-    """Publishes three statuses: of the rules, of the data and of the demands."""
-
     def __init__(self, node: Node, rules: str) -> None:
         self._node, self._rules = node, rules
         self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -30,28 +28,18 @@ class DetectorDiagnostics:
         sender: DemandSender,
         is_started: bool,
     ) -> None:
-        """Publish the current statuses."""
         message = DiagnosticArray()
         message.header.stamp = self._node.get_clock().now().to_msg()
-        message.status = [
-            self._of_rules(problems, detector),
-            self._of_data(detector, topics, is_started),
-            self._of_demands(detector, sender),
-        ]
-        self._publisher.publish(message)
+        statuses = []
 
-    def _of_rules(self, problems: Sequence[str], detector: Detector) -> DiagnosticStatus:
         level, text = DiagnosticStatus.OK, "valid"
         if problems:
             level = DiagnosticStatus.WARN
             text = "the file cannot be read or is invalid; the last valid rules are in effect"
         values = {"rules": str(len(detector.file.rules))}
-        values |= {f"problem {at}": one for at, one in enumerate(problems, start=1)}
-        return status("demandops_detector: rules", self._rules, level, text, values)
+        values |= {f"problem {at}": problem for at, problem in enumerate(problems, start=1)}
+        statuses.append(status("demandops_detector: rules", self._rules, level, text, values))
 
-    def _of_data(
-        self, detector: Detector, topics: SourceSubscriptions, is_started: bool
-    ) -> DiagnosticStatus:
         level, text = DiagnosticStatus.OK, "detecting"
         if not is_started:
             level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping or /clock"
@@ -61,9 +49,8 @@ class DetectorDiagnostics:
             "messages": str(topics.messages),
             "messages left out": str(topics.unreadable),
         }
-        return status("demandops_detector: data", self._rules, level, text, values)
+        statuses.append(status("demandops_detector: data", self._rules, level, text, values))
 
-    def _of_demands(self, detector: Detector, sender: DemandSender) -> DiagnosticStatus:
         _, unanswered, refusals = sender.summary()
         level, text = DiagnosticStatus.OK, "every demand is answered"
         if unanswered:
@@ -74,4 +61,7 @@ class DetectorDiagnostics:
         values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
         for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
             values[" ".join((rule, *subjects))] = why
-        return status("demandops_detector: demands", self._rules, level, text, values)
+        statuses.append(status("demandops_detector: demands", self._rules, level, text, values))
+
+        message.status = statuses
+        self._publisher.publish(message)

@@ -36,27 +36,15 @@ _DISCOVERY_S = 0.5
 _RELOAD_S = 1.0
 _PATIENCE_S = 10.0
 _MOST_OBSERVATIONS = 100_000
+# The time that ROS reports until the first message of a simulated clock arrives.
 _UNHEARD_CLOCK = 0.0
-"""The time that ROS reports until the first message of a simulated clock arrives."""
+# If the clock jumps by more, someone has set the clock or restarted the simulation.
 _SET_CLOCK_S = 1.0
-"""If the clock jumps by more seconds than this, someone has set the clock or restarted the
-simulation."""
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class DetectorNode(Node):  # type: ignore[misc]
-    """Watches the topics of its rules and sends the demands of these rules."""
-
     def __init__(self, rules: str | None) -> None:
-        """Start to watch.
-
-        Args:
-            rules: the file of rules; the parameter ``rules``, if it is set, replaces it.
-
-        Raises:
-            click.UsageError: if a parameter is not valid.
-            InvalidInput: if the rules are not valid.
-        """
         super().__init__("demandops_detector")
         settings = detector_parameters.declare(self, rules)
         ros_process.log_to(self.get_logger(), settings["log_level"])
@@ -81,6 +69,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             )
         else:
             self._bookkeeping = {}
+        # by a steady clock, because a simulated one may be what is missing
         self._patience = self.create_timer(
             _PATIENCE_S, self._say_what_is_missing, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
@@ -92,10 +81,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self.create_timer(1.0, self._report)
 
     def close(self) -> None:
-        """Stop the node. Its demands stay booked; those with a lease, until their leases end.
-
-        If the node starts again in time, it continues with these demands.
-        """
+        """Stop the node; its demands stay booked, those with a lease until it ends."""
         self._topics.close()
         self._sender.close()
 
@@ -161,7 +147,7 @@ class DetectorNode(Node):  # type: ignore[misc]
     # ---- periodic work ----
 
     def _refresh(self) -> None:
-        self._topics.refresh()
+        self._topics.refresh()  # of the rules in effect: a reload replaces this object
 
     def _step(self) -> None:
         now = self._now()
@@ -170,21 +156,18 @@ class DetectorNode(Node):  # type: ignore[misc]
                 return
             self._start(self._bookkeeping, now)
         observations = [self._observations.popleft() for _ in range(len(self._observations))]
-        self._follow_clock(now)
-        for event, want in self._detector.step(observations, now):
-            self._log("info", f"rule {event.rule}: {event.why}")
-            self._sender.want([want])
-
-    def _follow_clock(self, now: float) -> None:
-        """Adjust the detector's times if the clock was set since the last call."""
-        look = REAL.monotonic()
-        passed = now - self._last_now
-        simulated = bool(self.get_parameter("use_sim_time").value)
-        jumped = min(passed, 0.0) if simulated else passed - (look - self._last_look)
+        # if the clock was set since the last step, the detector's times are moved with it
+        look, passed = REAL.monotonic(), now - self._last_now
+        # a simulated clock may run at any speed, so only one that goes back was set
+        is_simulated = bool(self.get_parameter("use_sim_time").value)
+        jumped = min(passed, 0.0) if is_simulated else passed - (look - self._last_look)
         self._last_now, self._last_look = now, look
         if abs(jumped) > _SET_CLOCK_S:
             self._log("warning", f"the clock has jumped by {jumped:.1f} s")
             self._detector.set_clock(jumped)
+        for event, want in self._detector.step(observations, now):
+            self._log("info", f"rule {event.rule}: {event.why}")
+            self._sender.want([want])
 
     def _reload_if_changed(self) -> None:
         """If the file is invalid, keep the last valid rules; log the problems if they changed."""
@@ -209,7 +192,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._log("info", f"the file has changed; rules: {len(file.rules)}")
 
     def _keep_rules(self, error: InvalidInput) -> None:
-        problems = tuple(str(each) for each in error.faults)
+        problems = tuple(map(str, error.faults))
         if problems != self._problems:
             for problem in problems:
                 self._log("warning", f"{problem}; the last valid rules stay in effect")
@@ -222,14 +205,9 @@ class DetectorNode(Node):  # type: ignore[misc]
 
 
 def _read_rules(path: Path) -> tuple[RuleFile, str]:
-    """Return the rules in a file, and the file's text.
-
-    Raises:
-        InvalidInput: with all faults of the file. If it has none, with all message types that are
-            not installed.
-    """
+    """Return the rules in a file, whose message types are installed, and the file's text."""
     name, text = read_input(path)
     file = read(text, name)
     if faults := faults_of_types(file):
-        raise InvalidInput(one.within(name) for one in faults)
+        raise InvalidInput(problem.within(name) for problem in faults)
     return file, text

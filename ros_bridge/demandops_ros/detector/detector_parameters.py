@@ -10,6 +10,7 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
+# Each parameter: its default, its description and, if it is a number, its range.
 PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     "rules": ("", "File of rules.", None),
     "action_name": (
@@ -43,22 +44,12 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
         None,
     ),
 }
-"""Each parameter: its default, its description and, if it is a number, its range."""
 
 LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
 def declare(node: Node, rules: str | None) -> dict[str, Any]:
-    """Declare all parameters of a node and return their values.
-
-    Args:
-        node: the node.
-        rules: the file of rules that the command line names; None if it names none. The parameter
-            ``rules``, if it is set, replaces it.
-
-    Raises:
-        click.UsageError: if a value is not valid.
-    """
+    """Declare all parameters of a node, where ``rules`` is a default, and return their values."""
     values = {}
     for name, (default, description, span) in PARAMETERS.items():
         described = ParameterDescriptor(description=description, read_only=True)

@@ -12,29 +12,16 @@ from demandops.detection.rules.topic_pattern import entity_in
 from demandops.errors import InvalidInput
 from demandops.quoting import one_line
 from rosbags.highlevel import AnyReader
-from rosbags.interfaces import Connection
 from rosbags.typesys import Stores, get_typestore
 
+# Stands in `left_out` for the damaged end of a bag, whose topics are unknown. Its count is 1, as
+# the lost messages cannot be counted.
 REST_OF_BAG = "the rest of the bag"
-"""Stands in ``left_out`` for the damaged end of a bag, whose topics are unknown."""
 
 
 class RecordedBag:
-    """The messages that rules read from a bag.
-
-    ``topics`` are the topics that the sources read. ``unread`` has the topics whose name matches a
-    source but whose message type does not, each with its message type. ``left_out`` counts
-    unreadable messages by topic and reason; a message counts once for each source that reads it.
-    If the end of the bag is damaged, ``left_out`` also has :data:`REST_OF_BAG`, with the count 1
-    because the lost messages cannot be counted.
-    """
-
     def __init__(self, path: Path, file: RuleFile) -> None:
-        """Open a bag; ``path`` is its folder or an MCAP file.
-
-        Raises:
-            InvalidInput: if the bag cannot be read, or the rules read none of its topics.
-        """
+        """Open a bag, which must have a topic that the rules read: its folder or an MCAP file."""
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
             self._reader.open()
@@ -44,7 +31,9 @@ class RecordedBag:
         self._readers = {name: MessageReader(file, name) for name in file.sources}
         self._sources: dict[int, list[tuple[str, str]]] = {}
         self.topics: set[str] = set()
+        # Topics that match a source by name, but not by their message type.
         self.unread: dict[str, str] = {}
+        # The number of unreadable messages by topic and reason, each once for a source.
         self.left_out: dict[tuple[str, str], int] = {}
         for connection in self._reader.connections:
             for name, source in file.sources.items():
@@ -57,15 +46,14 @@ class RecordedBag:
                 else:
                     self.unread[connection.topic] = connection.msgtype
         if not self.topics:
-            wanted = ", ".join(f"{one.topic} ({one.type})" for one in file.sources.values())
-            found = sorted({f"{one.topic} ({one.msgtype})" for one in self._reader.connections})
-            recorded = ", ".join(found) or "no topic"
+            wanted = ", ".join(f"{each.topic} ({each.type})" for each in file.sources.values())
+            topics = sorted({f"{each.topic} ({each.msgtype})" for each in self._reader.connections})
+            recorded = ", ".join(topics) or "no topic"
             self.close()
             message = f"has no topic that the rules read: {wanted}; it has {recorded}"
             raise InvalidInput.at("", message, file=str(path))
 
     def close(self) -> None:
-        """Close the bag."""
         self._reader.close()
 
     @property
@@ -74,12 +62,8 @@ class RecordedBag:
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
-        """Yield an observation for each readable message and each source that reads it.
-
-        The observations have the order of recording.
-        """
-        chosen = [one for one in self._reader.connections if one.id in self._sources]
-        messages = self._reader.messages(connections=chosen)
+        connections = [each for each in self._reader.connections if each.id in self._sources]
+        messages = self._reader.messages(connections=connections)
         while True:
             try:
                 connection, nanoseconds, data = next(messages)
@@ -88,19 +72,16 @@ class RecordedBag:
             except Exception as error:  # the rest of a damaged bag
                 self._leave_out(REST_OF_BAG, f"cannot be read: {error!r}")
                 return
-            yield from self._read(connection, nanoseconds / 1e9, data)
-
-    def _read(self, connection: Connection, at: float, data: bytes) -> Iterator[Observation]:
-        for source, entity in self._sources[connection.id]:
-            try:
-                message = self._reader.deserialize(data, connection.msgtype)
-            except Exception as error:  # rosbags raises errors of many kinds
-                self._leave_out(connection.topic, f"cannot be decoded: {error!r}")
-                continue
-            try:
-                yield self._readers[source].observation(message, entity, at)
-            except Unreadable as error:
-                self._leave_out(connection.topic, str(error))
+            for source, entity in self._sources[connection.id]:
+                try:
+                    message = self._reader.deserialize(data, connection.msgtype)
+                except Exception as error:  # rosbags raises errors of many kinds
+                    self._leave_out(connection.topic, f"cannot be decoded: {error!r}")
+                    continue
+                try:
+                    yield self._readers[source].observation(message, entity, nanoseconds / 1e9)
+                except Unreadable as error:
+                    self._leave_out(connection.topic, str(error))
 
     def _leave_out(self, topic: str, why: str) -> None:
         key = topic, one_line(why)

@@ -18,45 +18,28 @@ from demandops.detection.rules.rule_file import RuleFile
 
 from demandops_ros.detector.recorded_bag import REST_OF_BAG, RecordedBag
 
+# How many messages the detector gets at a time; the number does not change the events.
 _TOGETHER = 1_000
-"""How many messages the detector gets at a time; the number does not change the events."""
+# The least distance in metres between two points of an entity's track in the plot.
 _TRACK_M = 0.5
-"""The least distance in metres between two points of an entity's track in the plot."""
 
 
 @dataclass
 class Replay:
-    """The events and demands that rules make from a bag.
-
-    ``span`` has the times of the first and the last message. ``lasting`` has the events that have
-    not stopped at the end. ``tracks`` has each entity's path, for a plot. ``messages`` counts the
-    readable messages, each once for every source that reads it.
-    """
-
     bag: str
     file: RuleFile
-    span: tuple[float, float]
+    span: tuple[float, float]  # from the first message to the last
     topics: list[str]
-    messages: int = 0
+    messages: int = 0  # that are readable, each once for every source that reads it
     events: list[tuple[Event, Goal | None]] = field(default_factory=list)
-    lasting: list[Key] = field(default_factory=list)
+    lasting: list[Key] = field(default_factory=list)  # events that have not stopped at the end
     left_out: Mapping[tuple[str, str], int] = field(default_factory=dict)
+    # Each entity's path, for a plot.
     tracks: dict[tuple[str, str], list[tuple[float, float]]] = field(default_factory=dict)
-
-    def keep_track(self, one: Observation) -> None:
-        """Add an entity's position to its track, unless it is too near the last point."""
-        if one.position is not None:
-            track = self.tracks.setdefault(one.who, [])
-            if not track or dist(track[-1], one.position) >= _TRACK_M:
-                track.append(one.position)
 
 
 def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
-    """Return the events and demands that the rules in ``file`` make from a bag.
-
-    The time at which a message was recorded serves as the detector's clock. ``name`` is the bag's
-    name in the output.
-    """
+    """Return the events that rules make from a bag, at the times when messages were recorded."""
     start, end = bag.span
     detector = Detector(file, start)
     replay = Replay(name, file, (start, end), sorted(bag.topics))
@@ -67,19 +50,21 @@ def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
             replay.events.append((event, want.goal))
         waiting.clear()
 
-    for one in bag.observations():
-        waiting.append(one)
+    for observation in bag.observations():
+        waiting.append(observation)
         replay.messages += 1
-        replay.keep_track(one)
+        if observation.position is not None:
+            track = replay.tracks.setdefault(observation.who, [])
+            if not track or dist(track[-1], observation.position) >= _TRACK_M:
+                track.append(observation.position)
         if len(waiting) >= _TOGETHER:
-            step(one.at)
+            step(observation.at)
     step(end)
     replay.lasting, replay.left_out = sorted(detector.lasting), dict(bag.left_out)
     return replay
 
 
 def show(replay: Replay, output: str) -> None:
-    """Print the events, as a table with a summary or as JSON, and warn of what was left out."""
     columns = [
         Column("Second"),
         Column("Change"),
@@ -111,10 +96,7 @@ def show(replay: Replay, output: str) -> None:
 
 
 def as_data(replay: Replay) -> dict[str, Any]:
-    """Return a replay as plain data for ``--output json``.
-
-    Programs rely on the form of this data.
-    """
+    """Return a replay as plain data for ``--output json``, on whose form programs rely."""
     return {
         "bag": replay.bag,
         "from": _time(replay.span[0]),

@@ -24,9 +24,14 @@ Span = tuple[float, float]
 
 
 def svg(replay: Replay) -> str:
-    """Return the picture as the text of an SVG file."""
     colors = _Colors()
-    rows = [*_spans(replay).items()][:_MOST_ROWS]
+    spans: dict[Key, list[Span]] = {}  # of each event; the end of one that lasts is inf
+    for event, _ in replay.events:
+        if event.starts:
+            spans.setdefault(event.key, []).append((event.at, inf))
+        else:
+            spans[event.key][-1] = spans[event.key][-1][0], event.at
+    rows = [*spans.items()][:_MOST_ROWS]
     height = _MAP + _ROW * (len(rows) + 3)
     parts = [*_map(replay, colors), *_times(replay, rows, colors)]
     return (
@@ -37,10 +42,11 @@ def svg(replay: Replay) -> str:
 
 class _Colors:
     def __init__(self) -> None:
-        self._of: dict[str, str] = {}
+        self._by_entity: dict[str, str] = {}
 
-    def of(self, entity: str) -> str:
-        return self._of.setdefault(entity, _COLORS[len(self._of) % len(_COLORS)])
+    def color(self, entity: str) -> str:
+        next_color = _COLORS[len(self._by_entity) % len(_COLORS)]
+        return self._by_entity.setdefault(entity, next_color)
 
 
 class _Scale:
@@ -58,12 +64,9 @@ class _Scale:
 
 
 def _round(span: float) -> float:
-    """Return the largest of 0.1, 0.2, 0.5, 1, 2, 5, 10 … that is at most a quarter of ``span``.
-
-    For a small ``span``, return 0.1.
-    """
+    """Return the largest of 0.1, 0.2, 0.5, 1, 2 … up to a quarter of ``span``, or 0.1."""
     steps = [mantissa * 10.0**power for power in range(-1, 7) for mantissa in (1, 2, 5)]
-    return max((one for one in steps if one <= span / 4), default=steps[0])
+    return max((step for step in steps if step <= span / 4), default=steps[0])
 
 
 def _map(replay: Replay, colors: _Colors) -> Iterator[str]:
@@ -88,8 +91,8 @@ def _map(replay: Replay, colors: _Colors) -> Iterator[str]:
         for line, name in enumerate(names):
             yield _text(x + 4, y + 14 * line, name, "#444")
     for (_, entity), track in replay.tracks.items():
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in (scale.at(*one) for one in track))
-        color = colors.of(entity)
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in (scale.at(*point) for point in track))
+        color = colors.color(entity)
         yield f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2"/>\n'
         x, y = scale.at(*track[0])
         yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{color}"/>\n'
@@ -130,7 +133,7 @@ def _times(replay: Replay, rows: list[tuple[Key, list[Span]]], colors: _Colors) 
             yield _text(x, bottom + 14, f"{tick * step:g} s", "black")
     for number, ((rule, subjects), spans) in enumerate(rows, start=1):
         y = _MAP + _ROW * number
-        color = colors.of(subjects[0]) if subjects else "#444"
+        color = colors.color(subjects[0]) if subjects else "#444"
         yield _text(_EDGE, y, f"{rule} {' '.join(subjects)}", "black")
         for since, until in spans:
             x, width = _LEFT + (since - start) * factor, (min(until, end) - since) * factor
@@ -138,17 +141,6 @@ def _times(replay: Replay, rows: list[tuple[Key, list[Span]]], colors: _Colors) 
                 f'<rect x="{x:.1f}" y="{y - 11}" width="{max(width, 1):.1f}" height="14" '
                 f'fill="{color}"/>\n'
             )
-
-
-def _spans(replay: Replay) -> dict[Key, list[Span]]:
-    """Return each event's spans of time; the end of a span that has not ended is ``inf``."""
-    spans: dict[Key, list[Span]] = {}
-    for event, _ in replay.events:
-        if event.starts:
-            spans.setdefault(event.key, []).append((event.at, inf))
-        else:
-            spans[event.key][-1] = spans[event.key][-1][0], event.at
-    return spans
 
 
 def _text(x: float, y: float, text: str, color: str) -> str:

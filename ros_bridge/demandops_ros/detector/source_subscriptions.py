@@ -19,13 +19,12 @@ from demandops.quoting import one_line
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
+# A subscription is reliable if all publishers that it finds are. The queue is deep, because many
+# entities may share a topic.
 _QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
-"""A subscription is reliable if all publishers that it finds are. The queue is deep, because many
-entities may share a topic."""
 
 
 def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class
-    """Return the class of a message type; ``None`` if the type is not installed."""
     package, _, name = type_name.split("/")
     try:
         return getattr(import_module(f"{package}.msg"), name, None)
@@ -47,8 +46,6 @@ def faults_of_types(file: RuleFile) -> list[Fault]:
 
 
 class SourceSubscriptions:
-    """The subscriptions that one file of rules needs."""
-
     def __init__(
         self,
         node: Node,
@@ -64,11 +61,10 @@ class SourceSubscriptions:
 
     @property
     def topics(self) -> int:
-        """How many topics are read; a topic counts once for each source that reads it."""
-        return len(self._subscriptions)
+        return len(self._subscriptions)  # a topic counts once for each source that reads it
 
     def refresh(self) -> None:
-        """Subscribe to new topics, and unsubscribe from topics that nobody publishes any longer."""
+        """Subscribe to new topics, and leave those that nobody publishes any longer."""
         published: Mapping[str, list[str]] = dict(self._node.get_topic_names_and_types())
         for name, source in self._file.sources.items():
             for topic, types in published.items():
@@ -92,7 +88,6 @@ class SourceSubscriptions:
                 self._node.destroy_subscription(self._subscriptions.pop(key))
 
     def close(self) -> None:
-        """End all subscriptions."""
         while self._subscriptions:
             self._node.destroy_subscription(self._subscriptions.popitem()[1])
 
@@ -105,6 +100,6 @@ class SourceSubscriptions:
             self._tell_once(f"a message on {topic} is left out: {error}")
 
     def _tell_once(self, text: str) -> None:
-        if text not in self._told and len(self._told) < 1000:
+        if text not in self._told and len(self._told) < 1000:  # what is told is kept in memory
             self._told.add(text)
             self._node.get_logger().warning(one_line(text))

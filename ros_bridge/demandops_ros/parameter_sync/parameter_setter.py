@@ -17,8 +17,7 @@ from rclpy.parameter import Parameter
 _LOOK_S = 0.2
 _ANSWER_S = 2.0
 _EVENTS = "/parameter_events"
-_LARGEST = 2**63 - 1
-"""The largest integer that ROS can transport."""
+_LARGEST = 2**63 - 1  # the largest integer that ROS can transport
 
 
 class ParameterSetter:
@@ -41,9 +40,7 @@ class ParameterSetter:
     def want(self, parameters: Mapping[str, Any]) -> None:
         """Replace the parameters that the target must have; any thread may call this method.
 
-        Raises:
-            TypeError, ValueError: if ROS has no type for a value, or a number is out of ROS's
-                range; the message names the parameter.
+        A value that ROS cannot carry raises TypeError or ValueError, which names the parameter.
         """
         wanted = [_parameter(name, value).to_parameter_msg() for name, value in parameters.items()]
         with self._lock:
@@ -51,8 +48,13 @@ class ParameterSetter:
         self._changed.trigger()
 
     def _set_if_needed(self) -> None:
-        """Set the wanted parameters if the target does not have them yet."""
-        endpoints = self._endpoints()
+        # A restarted target has new endpoints. The ROS graph may still list the endpoint of one
+        # that was killed, so all of them are compared.
+        endpoints = frozenset(
+            tuple(info.endpoint_gid)
+            for info in self._node.get_publishers_info_by_topic(_EVENTS)
+            if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._target
+        )
         with self._lock:
             wanted, version = self._wanted, self._version
         if self._call is not None:
@@ -85,17 +87,6 @@ class ParameterSetter:
             f"set {len(names) - len(refused)} parameters of {self._target}"
         )
         self._changed.trigger()  # other parameters may be wanted by now
-
-    def _endpoints(self) -> frozenset[tuple[int, ...]]:
-        """Return the ids of the target's endpoints that publish parameter events.
-
-        The ROS graph may still list the endpoint of a target that was killed.
-        """
-        return frozenset(
-            tuple(info.endpoint_gid)
-            for info in self._node.get_publishers_info_by_topic(_EVENTS)
-            if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._target
-        )
 
 
 def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401

@@ -17,14 +17,14 @@ from demandops_ros import ros_process
 from demandops_ros.parameter_sync.parameter_file import parameters_of
 from demandops_ros.parameter_sync.parameter_setter import ParameterSetter
 
+# The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
+# without its `period`, because a watch does not poll.
 _PARAMETERS = {
     "configmap_name": "",
     "namespace": "",
     "ros_params_file_name": "params.yml",
     "target_ros_node": "",
 }
-"""The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
-without its ``period``, because a watch does not poll."""
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -56,31 +56,31 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     ):
         node = Node("parameter_sync")
         ros_process.log_to(get_logger("demandops"), "info")
-        watch = _watch(node, kubeconfig)
+        given: dict[str, str] = {
+            name: node.declare_parameter(name, default).value
+            for name, default in _PARAMETERS.items()
+        }
+        for name, value in given.items():
+            if not value:
+                raise click.UsageError(
+                    f"parameter {name} is not set; use --ros-args -p {name}:=VALUE"
+                )
+        target, key = given["target_ros_node"], given["ros_params_file_name"]
+        file = f"ConfigMap {given['namespace']}/{given['configmap_name']} {key}"
+        setter = ParameterSetter(node, target)
+
+        def take(data: Mapping[str, str]) -> None:
+            try:
+                if key not in data:
+                    raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
+                setter.want(parameters_of(target, data[key], file))
+            except (DemandOpsError, TypeError, ValueError) as error:
+                node.get_logger().error(one_line(f"{error}; {target} keeps its parameters"))
+
+        watch = ConfigMapWatch(given["namespace"], given["configmap_name"], take, kubeconfig)
         thread = ros_process.ExecutorThread(node)
         wait_for_signal()
+        # the watch first, because it calls the node
         watch.close()
         thread.close()
         node.destroy_node()
-
-
-def _watch(node: Node, kubeconfig: Path | None) -> ConfigMapWatch:
-    given: dict[str, str] = {
-        name: node.declare_parameter(name, default).value for name, default in _PARAMETERS.items()
-    }
-    for name, value in given.items():
-        if not value:
-            raise click.UsageError(f"parameter {name} is not set; use --ros-args -p {name}:=VALUE")
-    target, key = given["target_ros_node"], given["ros_params_file_name"]
-    file = f"ConfigMap {given['namespace']}/{given['configmap_name']} {key}"
-    setter = ParameterSetter(node, target)
-
-    def take(data: Mapping[str, str]) -> None:
-        try:
-            if key not in data:
-                raise InvalidInput.at("", "is missing; add it to the ConfigMap", file=file)
-            setter.want(parameters_of(target, data[key], file))
-        except (DemandOpsError, TypeError, ValueError) as error:
-            node.get_logger().error(one_line(f"{error}; {target} keeps its parameters"))
-
-    return ConfigMapWatch(given["namespace"], given["configmap_name"], take, kubeconfig)

@@ -14,5 +14,4 @@ _ARGOCD, _FLUX = ArgoCd(), Flux()
 
 
 def health_reader(domain: ClusterDomain) -> HealthReader:
-    """Return what reads health in an access domain: the reader for Flux or the one for Argo CD."""
     return _ARGOCD if domain.application else _FLUX

@@ -24,28 +24,20 @@ from demandops.cluster.health.release_health import (
 from demandops.render.gitops.paths import bootstrap_path
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
+# A reason lists at most this many objects on which a sync failed.
 _DETAILS = 3
-"""A reason lists at most this many objects on which a sync failed."""
 
 
 class ArgoCd(HealthReader):
-    """Computes health from Argo CD's Applications."""
-
     service_kind = "Application"
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects on which the health of a domain and of its releases depends.
-
-        These are the Application of the domain's folder, and all Applications and Deployments in
-        the domain's namespace.
-        """
         folder = ObjectSelector("Application", *_folder_application(domain))
         return folder, *self.objects_to_confirm(domain)
 
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a domain, from the Application of the domain's folder."""
         name = name_of(self.follower(domain))
         app = objects.get(self.follower(domain))
         if app is None:
@@ -57,22 +49,20 @@ class ArgoCd(HealthReader):
         message, revision = _failure(app)
         if not message:
             return Health("waiting", waiting, name)
+        # a failure at another commit may be over once Argo CD has tried this one
         if revision and not history.includes(revision, commit):
             reason = f"{waiting}; Argo CD reports for {revision[:10]}: {message}"
             return Health("waiting", reason, name)
         return Health("waiting", message, name, failing=True)
 
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the key of the Application that applies the domain's folder."""
         return "Application", *_folder_application(domain)
 
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the commit that a domain's Application has applied; empty if it is not known."""
         app = objects.get(self.follower(domain))
         return next(iter(_applied_commits(app)), "") if app else ""
 
     def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
-        """Return whether the Application of the domain's folder has created ``item``."""
         annotations = item["metadata"].get("annotations") or {}
         tracked = f"{_folder_application(domain).name}:"
         return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
@@ -110,17 +100,16 @@ def _folder_application(domain: ClusterDomain) -> ObjectName:
 
 
 def _applied_commits(app: Object) -> list[str]:
-    """Return the commits that an Application is known to have applied, the newest first.
-
-    A Synced Application has applied the commit that it was compared with. If commits come fast, an
-    Application may never be Synced, so the commit of its last successful full sync counts too.
-    """
+    """Return the commits that an Application is known to have applied, the newest first."""
     source = (app.get("spec") or {}).get("source")
     sync, operation = _status(app, "sync"), _status(app, "operationState")
     revisions = []
+    # a Synced Application has applied the commit that it was compared with
     compared = (sync.get("comparedTo") or {}).get("source")
     if sync.get("status") == "Synced" and _same(compared, source):
         revisions.append(str(sync.get("revision", "")))
+    # If commits come fast, an Application may never be Synced, so the commit of its last successful
+    # sync counts too, unless that was only for some resources.
     result = operation.get("syncResult") or {}
     whole = operation.get("phase") == "Succeeded" and not _requested_sync(operation).get(
         "resources"
@@ -168,10 +157,7 @@ def _synced_health(app: Object, name: str, objects: Objects) -> Health:
 
 
 def _failure(app: Object) -> tuple[str, str]:
-    """Return why an Application fails, and the commit for which it fails.
-
-    The reason is empty if the Application does not fail. The commit is empty if it is not known.
-    """
+    """Return why an Application fails, or an empty text, and for which commit, if it is known."""
     operation = _status(app, "operationState")
     result = operation.get("syncResult") or {}
     revision = str(result.get("revision") or _requested_sync(operation).get("revision") or "")
@@ -188,10 +174,7 @@ def _failure(app: Object) -> tuple[str, str]:
 
 
 def _sync_message(operation: Object) -> str:
-    """Return the message of a failed sync.
-
-    Messages of failed objects are added if the sync's message does not contain them.
-    """
+    """Return the message of a failed sync, with those of failed objects that it lacks."""
     message = str(operation.get("message", ""))
     failed = [
         item
@@ -207,11 +190,8 @@ def _sync_message(operation: Object) -> str:
 
 
 def _error(app: Object) -> str:
-    """Return the first error among the conditions of an Application, or an empty text.
-
-    The other conditions are warnings.
-    """
-    for item in (app.get("status") or {}).get("conditions") or ():
+    """Return the first error among the conditions of an Application, or an empty text."""
+    for item in (app.get("status") or {}).get("conditions") or ():  # the others are warnings
         if str(item.get("type", "")).endswith("Error"):
             return f"{item['type']}: {item.get('message', '')}"
     return ""
@@ -222,16 +202,12 @@ def _status(app: Object, part: str) -> Object:
 
 
 def _requested_sync(operation: Object) -> Object:
-    """Return the parameters of the requested sync; empty if no sync was requested."""
     return (operation.get("operation") or {}).get("sync") or {}
 
 
 def _same(source: object, other: object) -> bool:
-    """Return whether two sources are equal apart from empty fields.
-
-    Argo CD may omit an empty field or write it.
-    """
-    try:
+    """Return whether two sources are equal apart from empty fields."""
+    try:  # Argo CD may omit an empty field or write it
         return _without_empty(source) == _without_empty(other)
     except RecursionError:  # nothing that the generator renders is nested so deeply
         return False

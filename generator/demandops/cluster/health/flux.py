@@ -23,34 +23,25 @@ from demandops.cluster.health.release_health import (
 )
 from demandops.render.gitops.paths import bootstrap_path
 
+# The annotation that makes a controller reconcile an object now.
 REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
-"""The annotation that makes a controller reconcile an object now."""
-_APPLIED_BY, _APPLIED_IN = (
-    "kustomize.toolkit.fluxcd.io/name",
-    "kustomize.toolkit.fluxcd.io/namespace",
-)
-"""The labels that kustomize-controller sets on everything that it applies."""
+# The labels that kustomize-controller sets on everything that it applies.
+_APPLIED_BY = "kustomize.toolkit.fluxcd.io/name"
+_APPLIED_IN = "kustomize.toolkit.fluxcd.io/namespace"
+# The label that helm-controller sets on everything that it installs.
 _HELM_NAME = "helm.toolkit.fluxcd.io/name"
-"""The label that helm-controller sets on everything that it installs."""
 
 
 class Flux(HealthReader):
-    """Computes health from Flux's Kustomizations, GitRepositories and HelmReleases."""
-
     service_kind = "HelmRelease"
 
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return all Deployments and the objects of Flux that count, in the domain's namespace.
-
-        These are the Kustomizations, GitRepositories and HelmReleases.
-        """
         kinds = ("Kustomization", "GitRepository", "HelmRelease", "Deployment")
         return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a domain, from the domain's Kustomization."""
         kustomization = objects.get(self.follower(domain))
         name = name_of(self.follower(domain))
         if kustomization is None:
@@ -72,16 +63,13 @@ class Flux(HealthReader):
         return Health("waiting", "has not applied the commit yet", name)
 
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the key of the Kustomization that applies the domain's folder."""
         return "Kustomization", domain.namespace, domain.name
 
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the commit that a domain's Kustomization has applied; empty if it is not known."""
         kustomization = objects.get(self.follower(domain)) or {}
         return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
 
     def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
-        """Return whether the domain's Kustomization has created ``item``."""
         labels = item["metadata"].get("labels") or {}
         return (labels.get(_APPLIED_IN), labels.get(_APPLIED_BY)) == self.follower(domain)[1:]
 
@@ -92,15 +80,11 @@ class Flux(HealthReader):
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
         """Return whether Flux has finished all work of a domain's last fetch.
 
-        Flux counts as idle if the domain's objects do not exist or are suspended.
-
-        Args:
-            domain: the domain.
-            objects: the objects that are known.
-            before: what :meth:`handled_request` returned before the last fetch request was made;
-                None if there was no fetch request.
+        ``before`` is what :meth:`handled_request` returned before the last fetch request was made,
+        if one was.
         """
         kustomization, source = objects.get(self.follower(domain)), self._source(domain, objects)
+        # what does not exist or is suspended never fetches, and must not hold up the next request
         if kustomization is None or source is None:
             return True
         if any((each.get("spec") or {}).get("suspend") for each in (kustomization, source)):
@@ -125,6 +109,7 @@ class Flux(HealthReader):
         name = name_of(self.key(target))
         status = item.get("status") or {}
         ready = condition(status, "Ready")
+        # until then, the condition is that of the former spec
         current = status.get("observedGeneration") == item["metadata"].get("generation")
         if ready.get("status") == "False":
             return Health("reconciled", str(ready.get("message", "")), name, failing=True)

@@ -14,17 +14,12 @@ _ORDER: dict[str, int] = {"waiting": 0, "pushed": 0, "reconciled": 1, "healthy":
 
 
 class ObjectName(NamedTuple):
-    """The namespace and name of an object."""
-
     namespace: str
     name: str
 
 
 class ObjectSelector(NamedTuple):
-    """Selects objects of a kind in a namespace.
-
-    With a ``name``, it selects only the object of that name.
-    """
+    """Selects objects of a kind in a namespace, or only the one of a name."""
 
     kind: str
     namespace: str
@@ -33,52 +28,32 @@ class ObjectSelector(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class ClusterDomain:
-    """An access domain on a cluster.
-
-    ``application`` is the Argo CD Application of the domain's folder; with Flux it is ``None``.
-    """
-
     cluster: str
     name: str
     namespace: str
-    application: ObjectName | None = None
+    application: ObjectName | None = None  # of Argo CD, for the domain's folder; None with Flux
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """A release, and whether it should run (``wanted``).
-
-    With ``is_service``, the release is a service. Otherwise it is the Deployment of a communication
-    client.
-    """
-
     domain: ClusterDomain
     name: str
-    is_service: bool
+    is_service: bool  # else it is the Deployment of a communication client
     wanted: bool = True
 
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """The health of a domain or a release.
-
-    ``reason`` says why the next state is not reached, if possible in the controller's words.
-    ``object`` is the object that the reason comes from. ``failing`` says whether the reason is a
-    failure.
-    """
-
     state: State
-    reason: str = ""
-    object: str = ""
+    reason: str = ""  # why the next state is not reached, if possible in the controller's words
+    object: str = ""  # from which the reason comes
     failing: bool = False
 
     def reaches(self, level: Level) -> bool:
-        """Return whether the state is at least ``level``."""
         return _ORDER[self.state] >= _ORDER[level]
 
 
-Key = tuple[str, str, str]
-"""The kind, namespace and name of an object."""
+Key = tuple[str, str, str]  # kind, namespace and name of an object
 Object = Mapping[str, Any]
 Objects = Mapping[Key, Object]
 
@@ -96,10 +71,7 @@ class History(Protocol):
 
 
 def worst(healths: list[Health]) -> Health:
-    """Return the health with the lowest state; among equal states, a failing one.
-
-    The result for an empty list is healthy.
-    """
+    """Return the health with the lowest state, and among those a failing one; of none, healthy."""
     return min(
         healths,
         key=lambda health: (_ORDER[health.state], not health.failing),
@@ -108,20 +80,15 @@ def worst(healths: list[Health]) -> Health:
 
 
 class HealthReader(ABC):
-    """Reads the health of releases from the objects of a GitOps controller."""
-
-    service_kind: str
-    """The kind of the object that represents a service."""
+    service_kind: str  # of the object that represents a service
 
     @abstractmethod
     def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
         """Return the objects on which the health of a domain and of its releases depends."""
 
     def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects to read again before a release counts as healthy.
-
-        The objects that represent services come first, then all Deployments of the namespace.
-        """
+        """Return the objects to read again before a release counts as healthy."""
+        # in this order: a service object that is ready counts with Deployments read after it
         kinds = (self.service_kind, "Deployment")
         return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
@@ -129,16 +96,10 @@ class HealthReader(ABC):
     def domain_health(
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a domain: ``reconciled`` once it has applied ``commit``.
-
-        Before that, the state is ``waiting``.
-        """
+        """Return ``waiting`` until a domain has applied ``commit``, then ``reconciled``."""
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return the health of a release at ``commit``.
-
-        The state is ``waiting`` until the domain has applied the commit.
-        """
+        """Return the health of a release: ``waiting`` until its domain has applied ``commit``."""
         domain = self.domain_health(target.domain, commit, objects, history)
         if domain.state == "waiting":
             return domain
@@ -147,15 +108,14 @@ class HealthReader(ABC):
     def release_health(
         self, target: Target, commit: str, objects: Objects, history: History
     ) -> Health:
-        """Return the health of a release whose domain has applied ``commit``.
-
-        A wanted release is healthy if it runs. A release that is not wanted is healthy if it is
-        gone.
-        """
         key = self.key(target)
         item = objects.get(key)
-        if not target.wanted:
-            return self._removal_health(target, item, objects)
+        if not target.wanted:  # then it is healthy if it is gone
+            if item is None and not (target.is_service and self._deployments(target, objects)):
+                return Health("healthy")
+            message = self._why_not_removed(item or {}) if target.is_service else ""
+            reason = f"is still being removed; {message}" if message else "is still being removed"
+            return Health("reconciled", reason, name_of(key), failing=bool(message))
         if item is None:
             return Health("reconciled", "does not exist yet", name_of(key))
         if not target.is_service:
@@ -164,17 +124,13 @@ class HealthReader(ABC):
 
     @abstractmethod
     def follower(self, domain: ClusterDomain) -> Key:
-        """Return the key of the object that applies a domain's folder.
-
-        The cluster's bootstrap file contains this object.
-        """
+        """Return the key of the object, from the bootstrap file, that applies a domain's folder."""
 
     @abstractmethod
     def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
         """Return the commit up to which a domain's folder is applied; empty if it is not known."""
 
     def key(self, target: Target) -> Key:
-        """Return the key of the object that represents a release."""
         kind = self.service_kind if target.is_service else "Deployment"
         return kind, target.domain.namespace, target.name
 
@@ -196,10 +152,7 @@ class HealthReader(ABC):
 
     @abstractmethod
     def _service_state(self, status: Object) -> Object:
-        """Return the part of ``status`` that has the field ``lastTransitionTime``.
-
-        ``status`` is that of the object that represents a service.
-        """
+        """Return the part of a service object's status that has ``lastTransitionTime``."""
 
     @abstractmethod
     def _owns(self, target: Target, deployment: Object) -> bool:
@@ -218,13 +171,6 @@ class HealthReader(ABC):
             and self._owns(target, item)
         ]
 
-    def _removal_health(self, target: Target, item: Object | None, objects: Objects) -> Health:
-        if item is None and not (target.is_service and self._deployments(target, objects)):
-            return Health("healthy")
-        message = self._why_not_removed(item or {}) if target.is_service else ""
-        reason = f"is still being removed; {message}" if message else "is still being removed"
-        return Health("reconciled", reason, name_of(self.key(target)), failing=bool(message))
-
 
 def name_of(key: Key) -> str:
     """Return kind, namespace and name of an object as text: ``Deployment perception/od-edge``."""
@@ -233,14 +179,11 @@ def name_of(key: Key) -> str:
 
 
 def deployment_health(deployment: Object) -> Health:
-    """Return the health of a Deployment.
-
-    It is healthy if all replicas are available and run the current spec.
-    """
+    """Return ``healthy`` if all replicas are available and run the current spec."""
     metadata, status = deployment["metadata"], deployment.get("status") or {}
     name = name_of(("Deployment", metadata.get("namespace"), metadata.get("name")))
     replicas = (deployment.get("spec") or {}).get("replicas")
-    wanted = 1 if replicas is None else replicas
+    wanted = 1 if replicas is None else replicas  # the default of Kubernetes
     current = (status.get("observedGeneration") or 0) >= (metadata.get("generation") or 0)
     updated, available = status.get("updatedReplicas") or 0, status.get("availableReplicas") or 0
     if current and updated >= wanted and available >= wanted:
@@ -261,9 +204,9 @@ def why_unavailable(pods: Iterable[Any]) -> str:
             if waiting and waiting.reason not in (None, "ContainerCreating"):
                 message = f": {waiting.message}" if waiting.message else ""
                 return f"container {container.name}: {waiting.reason}{message}"
-        for found in pod.status.conditions or ():
-            if found.type == "PodScheduled" and found.status == "False":
-                return f"not scheduled: {found.message}"
+        for reported in pod.status.conditions or ():
+            if reported.type == "PodScheduled" and reported.status == "False":
+                return f"not scheduled: {reported.message}"
     return ""
 
 

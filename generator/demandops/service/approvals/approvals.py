@@ -59,20 +59,17 @@ from demandops.staterepo.write.proposal_branch import (
 
 log = logging.getLogger("demandops")
 
+# How many seconds a check of all proposals may take before it pauses for a queued demand.
 _LONGEST_CHECK_S = 0.5
-"""How many seconds a check of all proposals may take before it pauses for a queued demand."""
 
 RELEASED = "was released by a later request before it was approved"
 REPLACED = "was replaced by a later demand of the same id before it was approved"
 
-
+# A demand with its receipt, its error, or the decision that needs approval.
 Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Decision]
-"""A demand with its result: a receipt, an error, or the decision if the demand needs approval."""
 
 
 class Approvals:
-    """Keeps, updates and ends the proposals that await approval."""
-
     def __init__(
         self,
         repository: StateRepository,
@@ -81,7 +78,6 @@ class Approvals:
         with_targets: bool,
         token_file: Path | None,
     ) -> None:
-        """Resume the proposals of an earlier run; ``state`` is the state of main."""
         self._repository, self._runtime = repository, repository.runtime
         self._demands = demands
         self._with_targets = with_targets
@@ -90,39 +86,33 @@ class Approvals:
         self._timer = CheckTimer(repository.runtime, local=repository.always_current)
         self._proposals: dict[str, Proposal] = {}  # by branch
         self._changed: deque[str] = deque()
-        for ticket in demands.proposed:
-            self._resume(ticket, admit_or_none(state, ticket.goal))
+        for ticket in demands.proposed:  # of an earlier run
+            request = admit_or_none(state, ticket.goal)
+            record = replace(ticket.proposal or ProposalRecord(""), withdrawn="")
+            new = Proposal(record, searched_to=ticket.base)
+            proposal = self._proposals.setdefault(record.branch, new)
+            if ticket.state == "proposed":  # a withdrawn ticket has an older record
+                proposal.record = record
+            proposal.tickets.append(ticket)
+            proposal.requests += [request] if request else []
+            self._changed.append(proposal.branch)
         for proposal in self._proposals.values():  # the last run may have ended in `add`
             if old := self._proposals.get(proposal.record.replaced_branch):
                 self._replace(old, proposal.branch)
 
-    def _resume(self, ticket: Ticket, request: DemandRequest | None) -> None:
-        record = replace(ticket.proposal or ProposalRecord(""), withdrawn="")
-        new = Proposal(record, searched_to=ticket.base)
-        proposal = self._proposals.setdefault(record.branch, new)
-        if ticket.state == "proposed":  # a withdrawn ticket has an older record
-            proposal.record = record
-        proposal.tickets.append(ticket)
-        proposal.requests += [request] if request else []
-        self._changed.append(proposal.branch)
-
     # ---- while a batch is evaluated ----
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Withdraw each proposal that a demand of ``batch`` releases, and delete its branch.
-
-        The worker calls this before it evaluates the batch. After the deletion nobody can merge
-        the proposal. If a person merged it earlier, the batch is evaluated on a tip that includes
-        the merge.
-
-        Raises:
-            RemoteAway, PushDenied, BranchMoved: if the branch could not be deleted.
-        """
+        """Withdraw each proposal that a demand of ``batch`` releases, and delete its branch."""
+        # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
+        # merged it earlier, the batch is evaluated on a tip that includes the merge.
         for ticket in batch if self._proposals else ():
             request = _release_request(ticket, state)
             if request is None:
                 continue
-            for proposal in [p for p in self._proposals.values() if releases(request, p.requests)]:
+            for proposal in self._proposals.values():
+                if not releases(request, proposal.requests):
+                    continue
                 self._demands.withdraw_proposed(proposal.tickets, RELEASED)
                 if proposal.record.commits:
                     self._delete_branch(proposal.branch, self._branches.heads())
@@ -131,14 +121,7 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """Withdraw each demand in ``earlier`` that needs approval, if ``by`` releases the demand.
-
-        Args:
-            earlier: the demands of the batch that are evaluated already, with their results. For a
-                withdrawn demand, the result is replaced by :class:`Withdrawn`.
-            by: the next demand of the batch, of any kind.
-            state: the state on which ``by`` will be evaluated.
-        """
+        """Withdraw each demand in ``earlier`` that needs approval and that ``by`` releases."""
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
             if request and isinstance(result, Decision) and releases(request, [result.request]):
@@ -148,10 +131,8 @@ class Approvals:
     def add(self, ticket: Ticket, decision: Decision) -> None:
         """Add a demand to the proposal of the same demand, or to a new proposal.
 
-        What a person has seen on a branch never becomes another demand there. So a put with other
-        content gets a branch of its own, and replaces the earlier proposal. The demand gets an
-        error as its answer if other requesters own the earlier proposal, if a requester has too
-        many proposals, or if the demand was withdrawn.
+        The demand gets an error as its answer if other requesters own the earlier proposal, if a
+        requester has too many proposals, or if the demand was withdrawn.
         """
         request, waiting = decision.request, self._waiting(decision.request)
         owners = {name for each in waiting for name in each.requesters()}
@@ -160,11 +141,22 @@ class Approvals:
             message += "choose another demand id"
             self._demands.fail([ticket], Refused([fault("demand", message, code="not-yours")]))
             return
+        # What a person has seen on a branch never becomes another demand there. So a put with other
+        # content gets a branch of its own, and replaces the earlier proposal.
         goal = json.dumps(ticket.goal)
         proposal = next((each for each in waiting if goal in each.goals()), None)
         replaced = waiting if isinstance(request, Put) and proposal is None else []
         if proposal is None:
-            if not replaced and (full := self._requester_over_limit(request)):
+            counts = Counter(
+                name
+                for each in self._proposals.values()
+                if each.waits
+                for name in each.requesters()
+            )
+            full = next(
+                (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT), ""
+            )
+            if full and not replaced:
                 message = (
                     f"requester {quoted(full)} already has {PROPOSAL_LIMIT} proposals that await "
                     "approval; release some of the demands in these proposals, or ask a person to "
@@ -194,27 +186,14 @@ class Approvals:
         waiting = (each for each in self._proposals.values() if each.waits)
         return [each for each in waiting if key in map(key_of, each.requests)]
 
-    def _requester_over_limit(self, request: DemandRequest) -> str:
-        waiting = (each for each in self._proposals.values() if each.waits)
-        counts = Counter(name for each in waiting for name in each.requesters())
-        full = (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT)
-        return next(full, "")
-
     def withdraw_replaced(self, request: DemandRequest) -> None:
-        """Withdraw the open proposal that ``request`` replaces, if ``request`` is a put.
-
-        The caller has found that ``request`` needs no approval.
-        """
+        """Withdraw the open proposal that a put replaces which needs no approval."""
         for proposal in self._waiting(request) if isinstance(request, Put) else ():
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
 
     def _replace(self, old: Proposal, branch: str) -> None:
-        """Withdraw the demands of a proposal, because the proposal on ``branch`` replaces it.
-
-        The next check answers them: a person may have merged them meanwhile.
-        """
         self._demands.withdraw_proposed(old.tickets, f"{REPLACED}: {branch}")
-        self._changed.append(old.branch)
+        self._changed.append(old.branch)  # the next check answers them: they may be merged already
 
     # ---- after main was read ----
 
@@ -227,42 +206,31 @@ class Approvals:
         return self._timer.is_due(tip, has_news=bool(self._changed) or withdrawn)
 
     def seconds_until_due(self, tip: str, longest: float) -> float:
-        """Return the seconds until the next check, at most ``longest``."""
         if not self._proposals:
             return longest
         return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
 
     def fetch_heads(self) -> BranchHeads:
-        """Return the newest commits of main and of the proposals' branches, as they are now.
-
-        The next check is planned first, in case the fetch fails.
-
-        Raises:
-            RemoteAway: if the remote cannot be reached.
-        """
-        self._timer.began()
+        self._timer.began()  # this plans the next check, in case the fetch fails
         return self._branches.heads()
 
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
         """Answer the demands that are decided or withdrawn, and update the other proposals.
 
-        If a demand is queued, a long check stops early, and the next check does the rest.
-
-        Args:
-            snapshot: the state of main, at the commit ``heads.main`` or a later one.
-            heads: the newest commits of main and of the branches.
-
-        Raises:
-            RemoteAway: if the remote cannot be reached. The next check handles the proposals that
-                this check did not reach.
+        ``snapshot`` is the state of main, at the commit ``heads.main`` or a later one. If an error
+        is raised, the next check handles the proposals that this check did not reach.
         """
         while self._changed:
             if changed := self._proposals.get(self._changed.popleft()):
                 changed.checked_at = ""
         began, proposals = self._runtime.monotonic(), list(self._proposals.values())
         for number, proposal in enumerate(proposals):
-            if number and self._must_pause(began):
-                self._check_next(proposals[number:])
+            is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
+            if number and is_long and self._demands.has_queued:
+                # make another check due, which begins with the rest
+                unchecked = {each.branch: each for each in proposals[number:]}
+                self._proposals = unchecked | self._proposals
+                self._changed.append(proposal.branch)
                 break
             self._repository.while_waiting()
             try:
@@ -276,17 +244,9 @@ class Approvals:
                 if proposal.tickets and proposal.branch in heads.branches:
                     self._runtime.failed(f"rebuilding {proposal.branch}", error)
                 else:
-                    self._end(proposal, error)
+                    self._demands.fail(proposal.tickets, error)
+                    self._forget(proposal, str(error))
         self._timer.ended(str(snapshot.commit))
-
-    def _must_pause(self, began: float) -> bool:
-        is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
-        return is_long and self._demands.has_queued
-
-    def _check_next(self, proposals: list[Proposal]) -> None:
-        """Make another check due, which begins with ``proposals``."""
-        self._proposals = {each.branch: each for each in proposals} | self._proposals
-        self._changed.append(proposals[0].branch)
 
     def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
         objects, tip = self._repository.objects, str(snapshot.commit)
@@ -296,6 +256,7 @@ class Approvals:
             self._demands.fail(proposal.tickets, _belongs_to_another(proposal.branch))
             self._proposals.pop(proposal.branch, None)
             return
+        # a person who edited or deleted the branch may have merged it without our operation ids
         if proposal.record.pushed and head not in proposal.record.commits:
             added = ledger_files.added_by_people(objects, proposal.searched_to, snapshot.commit)
         proposal.searched_to = tip
@@ -311,7 +272,15 @@ class Approvals:
         if verdict.unapproved:
             if booked and not head:  # a person merged only some of the demands
                 proposal.record = replace(proposal.record, pushed=False)
-            if not self._leave_out(proposal, verdict, snapshot, heads):
+            # the branch is to contain only the demands that still need approval
+            before, is_updated = proposal.tickets, False
+            proposal.wait_for(verdict.unapproved)
+            try:
+                is_updated = self._update(proposal, verdict, snapshot, heads)
+            finally:
+                if not is_updated:  # the branch has them all still, and so has the next check
+                    proposal.tickets = [ticket for ticket in before if ticket.state != "done"]
+            if not is_updated:
                 self._changed.append(proposal.branch)
                 return
             proposal.checked_at = tip
@@ -344,35 +313,16 @@ class Approvals:
 
     # ---- the branch and its pull request ----
 
-    def _leave_out(
-        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
-    ) -> bool:
-        """Update the branch so that it contains only the demands that still need approval.
-
-        Returns:
-            False if the proposal must be checked again. The proposal then keeps all its demands.
-        """
-        before, is_updated = proposal.tickets, False
-        proposal.wait_for(verdict.unapproved)
-        try:
-            is_updated = self._update(proposal, verdict, snapshot, heads)
-        finally:
-            if not is_updated:
-                proposal.tickets = [ticket for ticket in before if ticket.state != "done"]
-        return is_updated
-
     def _update(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
         """Rebuild the branch if it is outdated, open its pull request and notify the requesters.
 
-        A branch with commits by a person stays unchanged.
-
-        Returns:
-            False if a demand was withdrawn meanwhile and the proposal must be checked again.
+        Return false if a demand was withdrawn meanwhile and the proposal must be checked again.
         """
         head = heads.branches.get(proposal.branch)
         if head and head not in proposal.record.commits:
+            # a rebuild would throw away what a person has written
             if not proposal.edited:
                 log.info("%s has commits by a person and stays unchanged", proposal.branch)
             proposal.edited = True
@@ -396,10 +346,7 @@ class Approvals:
     ) -> bool:
         """Rebuild the branch on main, with one commit for each demand, unless it is up to date.
 
-        If the demands would now book something else, such as another node that was chosen, the
-        proposal moves to another branch: what was approved so far is not that.
-
-        Return False if a demand was withdrawn; the branch is then not pushed.
+        Return false if a demand was withdrawn; the branch is then not pushed.
         """
         commits = CommitBatch(self._repository, snapshot)
         steps, failed = decide_in_turn(verdict.unapproved, snapshot.state, commits.read)
@@ -410,6 +357,8 @@ class Approvals:
         files = {path: text for _, step in steps for path, text in step.files.items()}
         if head and self._branches.is_up_to_date(tip, head, old.base, files):
             return True
+        # If the demands would now book something else, such as another node that was chosen, the
+        # proposal moves to another branch: what was approved so far is not that.
         if head and steps and not self._branches.books_the_same(tip, head, old.base, files):
             request, ticket = proposal.requests[0], proposal.tickets[0]
             branch = branch_name(request.demand or request.id, f"{ticket.operation} {head}")
@@ -422,6 +371,8 @@ class Approvals:
             if step.files:
                 commits.commit(step, ticket.operation, ticket.received, now, old)
         commit = commits.head.commit
+        # Journal both commits before the push: after a crash either may be the branch's head, and
+        # a head that is not known here would be taken for a person's.
         newest = (head, str(commit)) if head else (str(commit),)
         record = replace(old, commits=newest, base=str(tip))
         if not self._journal(proposal, record):
@@ -438,13 +389,13 @@ class Approvals:
         return True
 
     def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
-        """Journal ``record`` for each demand; return False if a demand was withdrawn."""
+        """Journal ``record`` for each demand; return false if a demand was withdrawn."""
         proposal.record = record
         waiting = [self._demands.propose(ticket, record) for ticket in proposal.tickets]
         return all(waiting)
 
     def _delete_replaced(self, proposal: Proposal, heads: BranchHeads) -> None:
-        """Delete the branch that a proposal replaces, unless that is a proposal still."""
+        # a replaced proposal that is still here deletes its branch itself, with its answers
         if proposal.record.replaced_branch not in self._proposals:
             self._delete_branch(proposal.record.replaced_branch, heads)
 
@@ -455,27 +406,16 @@ class Approvals:
 
     # ---- the end ----
 
-    def _end(self, proposal: Proposal, error: DemandOpsError) -> None:
-        self._demands.fail(proposal.tickets, error)
-        self._forget(proposal, str(error))
-
     def _forget(self, proposal: Proposal, closed_as: str) -> None:
         self._proposals.pop(proposal.branch, None)
         self._forge.forget(proposal.branch, code(closed_as) if closed_as else "")
 
     def _on_forge_update(self, branch: str) -> None:
-        """Make a check of the branch due, because its pull request changed.
-
-        The forge's thread calls this.
-        """
-        self._changed.append(branch)
+        self._changed.append(branch)  # in the forge's thread; appending to a deque needs no lock
         self._demands.wake()
 
     def suspend(self) -> None:
-        """Answer the demands that await approval: each gets an error, but stays in the journal.
-
-        The next start resumes these demands.
-        """
+        """Answer the demands that await approval with an error; the next start resumes them."""
         error = ShuttingDown("the demand awaits approval, and is resumed at the next start")
         for proposal in self._proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)
@@ -484,17 +424,14 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return the request of a ticket that ends demands, or None.
-
-    None if the ticket is withdrawn, or its request would be refused.
-    """
+    """Return the request of a ticket that ends demands, or None if it would be refused."""
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)
 
 
 def _belongs_to_another(branch: str) -> Refused:
-    """Return the refusal of a demand whose branch exists: two operation ids have one digest."""
+    # a branch has the digest of an operation id in its name, and digests may collide
     message = (
         f"needs the branch {branch}, which belongs to another proposal; send the demand again with "
         "another operation id"

@@ -4,15 +4,12 @@ from __future__ import annotations
 
 from demandops.runtime import Runtime
 
+# The seconds between two checks of the branches, as only a check detects a deleted branch.
 CHECK_LOCAL_S = 1.0
-"""The seconds between two checks of the branches in a repository on this disk."""
 CHECK_REMOTE_S = 5.0
-"""The seconds between two checks of a remote's branches; only a check detects a deleted branch."""
+# How many times as long as the last check to pause before the check of a new main, so that checks
+# take at most a tenth of the worker's time while main moves.
 _PAUSE_FACTOR = 9
-"""The pause before a check of a new main, as a multiple of the time that the last check took.
-
-The pause is at most the interval between two checks.
-"""
 
 
 class CheckTimer:
@@ -25,17 +22,12 @@ class CheckTimer:
         self._began = self._rest_until = self._next = 0.0
 
     def is_due(self, tip: str, *, has_news: bool) -> bool:
-        """Return whether to check now; ``tip`` is the newest commit of main.
-
-        ``has_news`` is true if a proposal has changed. A check is then due at once, unless the last
-        check failed.
-        """
+        # after a failed check, news wait for the interval: the remote is likely away
         if has_news and self._checked_at is not None:
             return True
         return self.seconds_until_due(tip) <= 0
 
     def seconds_until_due(self, tip: str) -> float:
-        """Return the seconds until the next check; zero or less if it is due."""
         has_moved = self._checked_at not in (tip, None)
         due = min(self._next, self._rest_until) if has_moved else self._next
         return due - self._runtime.monotonic()
@@ -46,7 +38,6 @@ class CheckTimer:
         self._next, self._checked_at = self._began + self._interval, None
 
     def ended(self, tip: str) -> None:
-        """Record that a check with main at ``tip`` has ended."""
         now = self._runtime.monotonic()
         self._checked_at = tip
         self._rest_until = now + _PAUSE_FACTOR * (now - self._began)

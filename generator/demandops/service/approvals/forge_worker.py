@@ -19,11 +19,10 @@ from demandops.settings import MAIN_BRANCH
 
 log = logging.getLogger("demandops")
 
+# The seconds between two queries to the forge, to learn which pull requests were closed.
 POLL_S = 30.0
-"""The seconds between two queries to the forge, to learn which pull requests were closed."""
-
+# How long to pause after a forge has answered that it got too many requests.
 _REST_S = 60.0
-"""How long to pause after a forge has answered that it got too many requests."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,8 +31,7 @@ class _Task:
     branch: str
     title: str
     body: str
-    closed_as: str = ""
-    """Why to close the pull request; empty to open it."""
+    closed_as: str = ""  # why to close the pull request; empty to open it
 
 
 class ForgeWorker:
@@ -53,8 +51,7 @@ class ForgeWorker:
         self._closed = False
 
     def close(self) -> None:
-        """End the thread once it has no task left; the pull requests stay."""
-        self._closed = True
+        self._closed = True  # the thread still does its tasks; the pull requests stay
         self._due.set()
 
     def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
@@ -70,22 +67,22 @@ class ForgeWorker:
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:
-        """Return the pull request of a branch as of the last query; None if none is known."""
         return self._pull_requests.get(branch)
 
     def forget(self, branch: str, closed_as: str) -> None:
         """Stop watching a branch; also close its pull request, if ``closed_as`` says why."""
         with self._lock:
             task = self._wanted.pop(branch, None)
-            known = self._pull_requests.pop(branch, None)
-        is_closed = known is not None and known.state == "closed"  # by a person
+            pull_request = self._pull_requests.pop(branch, None)
+        # closed by a person
+        is_closed = pull_request is not None and pull_request.state == "closed"
         if task is not None and closed_as and not is_closed:
             self._enqueue(replace(task, closed_as=closed_as))
 
     def _enqueue(self, task: _Task) -> None:
         self._tasks.append(task)
         self._due.set()
-        if self._thread is None:
+        if self._thread is None:  # most state repos have no forge, and need no thread for it
             self._thread = self._runtime.keep_running("forge", self._run)
 
     # ---- in the forge's thread ----
@@ -101,12 +98,12 @@ class ForgeWorker:
                     self._tasks.extend(self._wanted.values())
             while self._tasks:
                 task = self._tasks.popleft()
-                known = pull_request = self._pull_requests.get(task.branch)
+                pull_request = self._pull_requests.get(task.branch)
                 try:
                     forge = forge_for(task.forge, self._token_file)
                     if forge is None:
                         continue
-                    pull_request = self._handle(task, forge, known)
+                    pull_request = self._handle(task, forge, pull_request)
                 except ForgeError as error:
                     if str(error) != self._last_error:
                         log.warning("%s: %s", task.branch, error)
@@ -127,18 +124,17 @@ class ForgeWorker:
     def _handle(task: _Task, forge: Forge, known: PullRequest | None) -> PullRequest | None:
         if not task.closed_as and known is None:
             return forge.open(task.branch, MAIN_BRANCH, task.title, task.body)
-        found = forge.find(task.branch, MAIN_BRANCH) or known
-        if task.closed_as and found is not None and found.state != "merged":
+        current = forge.find(task.branch, MAIN_BRANCH) or known
+        if task.closed_as and current is not None and current.state != "merged":
             # the forge may have closed it already, because its branch is gone
-            forge.close(found, f"Closed: {task.closed_as}\n\n{task.body}")
-        return found
+            forge.close(current, f"Closed: {task.closed_as}\n\n{task.body}")
+        return current
 
     def _remember(self, task: _Task, pull_request: PullRequest | None) -> None:
         with self._lock:
-            if task.closed_as or task.branch not in self._wanted:
+            if task.closed_as or task.branch not in self._wanted:  # forgotten during the query
                 return
-            known = self._pull_requests
-            changed = task.branch not in known or known[task.branch] != pull_request
-            known[task.branch] = pull_request
-        if changed:
+            before = self._pull_requests.get(task.branch, "not queried")
+            self._pull_requests[task.branch] = pull_request
+        if before != pull_request:
             self._on_update(task.branch)

@@ -33,55 +33,37 @@ _PREFIX = "awaiting approval: "
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """The demands of a proposal, grouped by what happens to them.
-
-    ``booked``: main has the claims of these demands. ``failed``: these demands were withdrawn or
-    turned down, or can no longer be booked; each has its error. ``free``: these demands no longer
-    need approval. ``unapproved``: these demands still need approval. Booked and unapproved demands
-    have the decision that they would get on the current main; a booked demand that would be refused
-    there has the error.
-    """
-
+    # Main has the claims of these, with the decision that each would get on the current main.
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
+    # These were withdrawn or turned down, or can no longer be booked.
     failed: Failed = field(default_factory=list)
+    # These no longer need approval.
     free: list[Ticket] = field(default_factory=list)
     unapproved: Decided = field(default_factory=list)
 
 
 @dataclass(eq=False)
 class Proposal:
-    """A demand that awaits approval on a branch, with all goals that ask for it.
-
-    ``reasons`` say why approval is needed. ``searched_to`` is the commit of main up to which the
-    history was searched for merged demands. ``checked_at`` is the commit of main at the last check;
-    it is empty if the proposal must be checked again. ``edited`` is true if a person committed to
-    the branch.
-    """
+    """A demand that awaits approval on a branch, with all goals that ask for it."""
 
     record: ProposalRecord
     tickets: list[Ticket] = field(default_factory=list)
     requests: list[DemandRequest] = field(default_factory=list)
-    reasons: tuple[str, ...] = ()
-    searched_to: str = ""
-    checked_at: str = ""
-    edited: bool = False
+    reasons: tuple[str, ...] = ()  # why approval is needed
+    searched_to: str = ""  # up to this commit, main was searched for merged demands
+    checked_at: str = ""  # main at the last check; empty to check again
+    edited: bool = False  # by a person who committed to the branch
 
     @property
     def branch(self) -> str:
-        """The name of the branch that a person merges."""
         return self.record.branch
 
     @property
     def waits(self) -> bool:
-        """Whether a demand waits that was not withdrawn."""
         return any(ticket.state == "proposed" for ticket in self.tickets)
 
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
-        """Return whether main, this proposal's branch and its demands are as at the last check.
-
-        ``tip`` is the newest commit of main. ``branches`` maps the name of each branch to its
-        newest commit.
-        """
+        """Return whether main, this proposal's branch and its demands are as at the last check."""
         head = branches.get(self.branch)
         all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
         return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
@@ -97,21 +79,9 @@ class Proposal:
     ) -> Verdict:
         """Return the verdict on the proposal's demands.
 
-        A demand counts as booked if a commit of main names its operation id in a trailer. A squash
-        merge may lose the trailer. So a demand also counts as booked if it would change no file of
-        main, or if it would change only claims in ``added``.
-
-        If no demand is booked, and the branch is gone or the pull request was closed, the demands
-        that still need approval are turned down.
-
-        Args:
-            state: the state of main.
-            read: reads a file of main.
-            on_main: the operation ids in the commits of main since ``searched_to``.
-            added: the claims that people have added to main since ``searched_to``; empty unless a
-                person has edited or deleted the branch.
-            head: the newest commit of the branch; empty if the branch does not exist.
-            pull_request: the pull request, if it is known.
+        ``on_main`` has the operation ids in the commits of main since ``searched_to``. ``added``
+        has the claims that people added since then; it is empty unless a person edited or deleted
+        the branch. ``head`` is empty if the branch does not exist.
         """
         verdict = Verdict()
         for ticket in self.tickets:
@@ -119,11 +89,15 @@ class Proposal:
             try:
                 decision = decide(state, ticket.goal, ticket.received, read)
             except InvalidInput as error:
-                decision = error
-            changes_main = isinstance(decision, InvalidInput) or (
-                decision.files and not _changes_only(added, decision)
-            )
-            if ticket.operation in on_main or not changes_main:
+                decision, is_merged = error, False
+            else:
+                # A squash merge may lose the trailer that names the operation. So a demand is
+                # booked also if it would change no file of main, or only claims that people added.
+                changes = decision.changes.claims
+                is_merged = not decision.files or (
+                    bool(changes) and all(change.key in added for change in changes)
+                )
+            if ticket.operation in on_main or is_merged:
                 verdict.booked.append((ticket, decision))
             elif ticket.state == "withdrawn" and ticket.proposal:
                 verdict.failed.append((ticket, Withdrawn(ticket.proposal.withdrawn)))
@@ -138,18 +112,17 @@ class Proposal:
             why_not = f"was turned down: {self.branch} is gone and was not merged"
         elif pull_request is not None and pull_request.state == "closed":
             why_not = f"was turned down: {pull_request.link} was closed"
+        # a branch is gone after a merge too, but then its demands are booked
         if why_not and not verdict.booked:
             verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.unapproved)
             verdict.unapproved.clear()
         return verdict
 
     def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:
-        """Remove the answered demands from the proposal."""
         gone = [ticket for ticket, _ in answered]
         self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
 
     def wait_for(self, left: Decided) -> None:
-        """Keep only the demands in ``left``, which still need approval."""
         self.tickets = [ticket for ticket, _ in left]
         self.requests = [decision.request for _, decision in left]
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
@@ -159,21 +132,13 @@ class Proposal:
         return [json.dumps(each.goal) for each in self.tickets if each.state == "proposed"]
 
     def requesters(self) -> set[str]:
-        """Return the requesters of the proposal's demands."""
         return {name for request in self.requests for name in request.requesters()}
-
-
-def _changes_only(claims: Container[ClaimKey], decision: Decision) -> bool:
-    """Return whether a decision changes claims, and all that it changes are among ``claims``."""
-    changes = decision.changes.claims
-    return bool(changes) and all(change.key in claims for change in changes)
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
     """Return whether a request releases all demands in ``pending``.
 
-    It does if it has the key of one of these demands and a requester of one of them, and names all
-    their subjects or is a :class:`Release`.
+    It has the key and a requester of one of them, and names all their subjects or is a Release.
     """
     requesters = {name for each in pending for name in each.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
@@ -183,22 +148,14 @@ def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
 
 
 def key_of(request: DemandRequest) -> tuple[str, ...]:
-    """Return what tells a demand from others, whatever its content.
-
-    That is the demand id. A request of the reference's action has none, so it is the request id and
-    the requesters.
-    """
-    if request.is_reference:
+    """Return what tells a demand from others, whatever its content."""
+    if request.is_reference:  # the reference's goals have no demand id
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
 
 
 def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decided, Failed]:
-    """Decide each demand on the state after the previous one, with leases that start at approval.
-
-    Returns:
-        The accepted demands with their new decisions, and the refused demands with their errors.
-    """
+    """Decide each demand on the state after the previous one, with leases from approval on."""
     written: dict[str, str | None] = {}
     steps, failed = Decided(), Failed()
     for ticket, decision in left:
@@ -226,7 +183,6 @@ def is_release(goal: object) -> bool:
 
 
 def admit_or_none(state: State, goal: object) -> DemandRequest | None:
-    """Return the request of a goal, or None if the goal is refused."""
     try:
         return admit(state, goal)
     except InvalidInput:
@@ -234,7 +190,6 @@ def admit_or_none(state: State, goal: object) -> DemandRequest | None:
 
 
 def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
-    """Return the text that a requester gets while the demand awaits approval."""
     branch_and_link = f"{branch} {link}" if link else branch
     why = ", ".join(reasons)
     return one_line(f"{_PREFIX}{branch_and_link}" + (f" (required by {why})" if why else ""))
@@ -248,10 +203,7 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 
 
 def pull_request_texts(message: str) -> tuple[str, str]:
-    """Return the title and the text of a pull request for a commit with this message.
-
-    Requesters choose the ids in the message. Outside of a code block, an id could become a link.
-    """
+    # Requesters choose the ids in the message. Outside of a code block, an id could become a link.
     title, fence = message.partition("\n")[0], _fence(message, 3)
     return title, (
         f"{_head(message)} Merging approves the demand; closing this pull request or deleting the "
@@ -260,7 +212,7 @@ def pull_request_texts(message: str) -> tuple[str, str]:
 
 
 def push_options(message: str, labels: Iterable[str]) -> list[str]:
-    """Return the push options that make GitLab open a merge request; each option is one line."""
+    # GitLab opens a merge request for these; an option of git is one line
     title = message.partition("\n")[0]
     why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
     description = (
@@ -278,7 +230,6 @@ def push_options(message: str, labels: Iterable[str]) -> list[str]:
 
 
 def _head(message: str) -> str:
-    """Return why a pull request is there: what requires approval, and which one it replaces."""
     trailers = message_format.parse(message).trailers
     reasons = ", ".join(trailers.get(commit_log.REQUIRED_BY, ()))
     changed = "".join(

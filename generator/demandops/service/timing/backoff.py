@@ -10,34 +10,22 @@ from __future__ import annotations
 from demandops.runtime import Runtime
 
 FIRST_PAUSE_S = 0.05
+# While the remote cannot be reached.
 LONGEST_AWAY_S = 10.0
-"""The longest delay before the next attempt, while the remote cannot be reached."""
+# After another writer published first; a writer that waits longer loses again to the others.
 LONGEST_TURN_S = 0.4
-"""The longest delay before the next attempt, after another writer published first.
-
-A writer that waits longer would lose again to writers that wait less.
-"""
+# The most demands to publish together. A push takes about 50 ms, but moving a branch of a
+# repository on this disk takes less than 1 ms.
 LIMIT_LOCAL = 20
-"""The most demands to publish together in a repository on this disk."""
 LIMIT_REMOTE = 200
-"""The most demands to publish together with one push to a remote.
 
-The limit is higher than :data:`LIMIT_LOCAL`, because a push takes about 50 ms, but moving a branch
-of a repository on this disk takes less than 1 ms.
-"""
-
+# After this time, what was evaluated of a batch is published, and the other demands go back to the
+# queue. There, requesters take turns, so a demand that arrived meanwhile may come first. So it
+# waits for this time and for one decision, which has a limit too (limits.decisionMilliseconds).
 LONGEST_EVALUATION_S = 0.25
-"""After this time no further demand of a batch is evaluated, and what was evaluated is published.
-
-The other demands of the batch go back to the queue. In the queue, requesters take turns, so a
-demand that arrived meanwhile may come first. So it waits for this time and for one decision, which
-has a limit of its own (``limits.decisionMilliseconds``).
-"""
 
 
 class Backoff:
-    """The delays of one batch of demands."""
-
     def __init__(self, limit: int, runtime: Runtime) -> None:
         self._limit, self._runtime = limit, runtime
         self.published()
@@ -45,16 +33,14 @@ class Backoff:
     def published(self) -> None:
         """Reset the delays and ``max_demands``, because commits were published."""
         self.max_demands = self._limit
-        """How many demands the next attempt may publish."""
         self._turn = self._away = FIRST_PAUSE_S
 
     def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
         """Return the seconds to wait if another writer published first; adjust ``max_demands``.
 
-        Args:
-            size: how many demands the attempt tried to publish.
-            evaluating_s: the seconds that the attempt took to evaluate and commit the demands.
-            pushing_s: the seconds from the start of the push to its rejection.
+        ``size`` counts the demands that the attempt tried to publish, and ``evaluating_s`` the
+        seconds until it had decided and committed them. ``pushing_s`` goes on until the rejection
+        of the push.
         """
         # a writer that evaluates for longer than its push takes always loses to faster writers
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))

@@ -18,10 +18,9 @@ def may_take_long(goal: object) -> bool:
 
 
 def within(limits: Limits, runtime: Runtime) -> Checkpoint:
-    """Return a checkpoint that ends a decision once the calling thread has used its time.
-
-    Only a refusal may depend on it, because another machine takes another time.
-    """
+    """Return a checkpoint that ends a decision once the calling thread has used its time."""
+    # Only a refusal may depend on it, because another machine takes another time. Processor time,
+    # because other programs on this machine must not get a demand refused.
     most = limits.decision_milliseconds
     end = runtime.processor_s() + most / 1000
 

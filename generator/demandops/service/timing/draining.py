@@ -19,13 +19,11 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
+# The pause before a retry to move the applications that stayed on a drained node.
 _RETRY = timedelta(seconds=60)
-"""The pause before a retry to move the applications that stayed on a drained node."""
 
 
 class Draining:
-    """Moves placed applications off drained nodes, in one commit for each node."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._tried: dict[str, tuple[Config, datetime]] = {}
@@ -33,10 +31,7 @@ class Draining:
         self._after: dict[str, str] = {}
 
     def move_due(self, commits: CommitBatch) -> None:
-        """Commit the moves of placed applications away from drained nodes.
-
-        If an application cannot be moved yet, a later call tries again.
-        """
+        """Commit the moves of placed applications that can leave their drained node now."""
         now = self._runtime.now()
         for node in self._due(commits.head.state, now):
             tried = (commits.head.state.config, now)
@@ -59,33 +54,29 @@ class Draining:
 
     @property
     def has_more(self) -> bool:
-        """Whether the last call left applications for later, which are to be moved soon."""
+        """Whether the last call left applications for later."""
         return bool(self._after)
 
     def postpone(self) -> None:
-        """Begin again with all applications later, because a fetch or a publication failed."""
+        """Begin again with all applications later."""
         self._after.clear()
 
     def _warn(self, node: str, stays: Iterable[str], *, continued: bool = False) -> None:
-        """Log why applications stay on a drained node; repeat no text of the last try."""
+        # the texts of the last try are not logged again, as a try comes each minute
         texts, logged = frozenset(stays), self._logged.get(node, frozenset())
         for text in sorted(texts - logged):
             log.warning("'%s' is drained: %s", node, text)
         self._logged[node] = texts | logged if continued else texts
 
     def is_due(self, world: World) -> bool:
-        """Return whether applications are to be moved off a node now."""
         return bool(self._due(world, self._runtime.now()))
 
     def _due(self, world: World, now: datetime) -> list[str]:
-        """Return the drained nodes with applications.
-
-        A node is left out for a minute after a try, unless the configuration has changed.
-        """
-        found = []
+        nodes = []
         for node in world.config.drained_nodes:
+            # not for a minute after a try, unless a person changed the configuration or the clock
             config, at = self._tried.get(node, (None, now))
             is_new = config is not world.config or not at <= now < at + _RETRY
             if is_new and world.ledger.applications_on.get(node):
-                found.append(node)
-        return found
+                nodes.append(node)
+        return nodes

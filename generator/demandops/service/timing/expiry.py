@@ -26,12 +26,15 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
+# By how much the clock may gain on the monotonic clock before leases get their full term again.
 _JUMP = timedelta(seconds=30)
+# The ledger keeps a lease that has ended if its release failed, or if it got more time after a jump
+# of the clock. Without this minimum, the worker would then never wait.
 _SHORTEST_S = 1.0
+# The longest time between two checks of the leases; short, because a person may set the clock.
 LONGEST_WAIT_S = 60.0
-"""The longest time between two checks of the leases; short, because a person may set the clock."""
+# The pause after a failed try to end a lease or an override, or to scale down.
 _RETRY = timedelta(seconds=LONGEST_WAIT_S)
-"""The pause after a failed try to end a lease or an override, or to scale down."""
 
 
 class LeaseExpiry:
@@ -48,9 +51,9 @@ class LeaseExpiry:
     def tickets(self, ledger: Ledger) -> list[Ticket]:
         """Return a ticket for each demand whose lease has ended, to release its claims.
 
-        If an answered ticket did not release the claims, the demand's next ticket comes at least a
-        minute after that ticket. The tickets are correct only at the time of the call: later, a
-        requester may renew a lease, or a person may set the clock.
+        If a ticket did not release the claims, the demand's next ticket comes at least a minute
+        later. The tickets are correct only at the time of the call: later, a requester may renew a
+        lease, or a person may set the clock.
         """
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
@@ -74,23 +77,16 @@ class LeaseExpiry:
         return ticket
 
     def ended_claims(self, ledger: Ledger) -> tuple[datetime, list[Claim]]:
-        """Return the current time, and the claims whose lease has ended, earliest end first.
-
-        A demand's ended claims are released together. If one of them gets more time after a jump of
-        the clock, none of them is returned.
-        """
+        """Return the current time, and the claims whose lease has ended, earliest end first."""
         now = self._read_clocks()
         ended = ledger.ended_claims(now)
+        # A demand's claims are released together. So if one gets more time after a jump of the
+        # clock, none is released.
         granted = {claim.demand for claim in ended if not self._has_ended(claim, now)}
         return now, [claim for claim in ended if claim.demand not in granted]
 
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
-        """Return the seconds until the next check: at least one, but never above ``longest``.
-
-        Without the minimum, the worker would never wait while the ledger keeps a lease that has
-        ended. The ledger keeps such a lease if the release of the claim failed, or if the lease
-        gets more time after a jump of the clock.
-        """
+        """Return the seconds until the next check: at least one, but at most ``longest``."""
         first = ledger.first_to_end()
         if first is not self._first:  # a search is slow if many leases end at one time
             self._first, self._next_end = first, ledger.next_lease_end()
@@ -108,16 +104,17 @@ class LeaseExpiry:
         return wall
 
     def _has_ended(self, claim: Claim, now: datetime) -> bool:
+
         if claim.lease is None or self._jumped_at is None:
             return claim.lease is not None
         return now > self._jumped_at + timedelta(seconds=claim.lease.seconds + claim.lease.slack)
 
 
 class OverrideExpiry:
-    """Ends each expired override in a commit of its own."""
-
     def __init__(self) -> None:
+        # By name and end: an override whose end a person changes is tried again at once.
         self._retry_at: dict[tuple[str, datetime | None], datetime] = {}
+        # Before this time no end counts as due, but each batch of demands still commits the ends.
         self._not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
@@ -134,18 +131,13 @@ class OverrideExpiry:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
     def postpone(self, now: datetime) -> None:
-        """For a minute, count no end as due, because a fetch or a publication failed.
-
-        :meth:`end_due` commits the ends even so.
-        """
+        """For a minute, count no end as due, because a fetch or a publication failed."""
         self._not_before = now + _RETRY
 
     def is_due(self, world: World, now: datetime) -> bool:
-        """Return whether to end an override now."""
         return any(time <= now for time in self._due_times(world))
 
     def seconds_until_due(self, world: World, now: datetime, longest: float) -> float:
-        """Return the seconds until the next check: at least one, but never above ``longest``."""
         times = self._due_times(world)
         return _seconds_until(min(times), now, longest) if times else longest
 
@@ -158,8 +150,6 @@ class OverrideExpiry:
 
 
 class ScaleDown:
-    """Removes the replicas that a service no longer keeps, in one commit for each service."""
-
     def __init__(self) -> None:
         self._retry_at: dict[Instance, datetime] = {}
         self._not_before = datetime.min.replace(tzinfo=timezone.utc)
@@ -180,19 +170,14 @@ class ScaleDown:
                     break
 
     def postpone(self, now: datetime) -> None:
-        """For a minute, count no scale-down as due, because a fetch or a publication failed.
-
-        :meth:`end_due` commits the scale-downs even so.
-        """
         self._not_before = now + _RETRY
 
     def is_due(self, ledger: Ledger, now: datetime) -> bool:
-        """Return whether a scale-down is due now."""
-        retried = (self._retry_at.get(one, now) <= now for one in ledger.kept.due(now))
-        return self._not_before <= now and any(retried)
+        if now < self._not_before:
+            return False
+        return any(self._retry_at.get(due, now) <= now for due in ledger.kept.due(now))
 
     def seconds_until_due(self, ledger: Ledger, now: datetime, longest: float) -> float:
-        """Return the seconds until the next check: at least one, but never above ``longest``."""
         end = ledger.kept.next_end()
         return longest if end is None else _seconds_until(max(end, self._not_before), now, longest)
 

@@ -11,8 +11,6 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 
 class OwnWork:
-    """Ends overrides, scales down, drains nodes, and books waiting demands that fit now."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._override_expiry = OverrideExpiry()
@@ -22,30 +20,24 @@ class OwnWork:
 
     def commit_due(self, commits: CommitBatch) -> None:
         """Commit all work that is due; if a part fails, try it again later."""
+        # a scale-down frees room for what moves, and what runs moves before what waits is booked
         self._override_expiry.end_due(commits, self._runtime.now())
         self._scale_down.end_due(commits, self._runtime.now())
         self._draining.move_due(commits)
         self._waiting_turns.book_due(commits)
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand freed room.
-
-        ``before`` is the state before the last demand.
-        """
+        """Book waiting demands if the last demand, decided on ``before``, freed room."""
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
-        """For a minute, count no end of an override and no scale-down as due.
-
-        A fetch or a publication failed. :meth:`commit_due` commits ends and scale-downs even so.
-        """
+        """Begin no work for a while, because a fetch or a publication failed."""
         self._override_expiry.postpone(self._runtime.now())
         self._scale_down.postpone(self._runtime.now())
         self._draining.postpone()
         self._waiting_turns.postpone()
 
     def is_due(self, state: State) -> bool:
-        """Return whether any of the generator's own work is due now."""
         now = self._runtime.now()
         return (
             self._override_expiry.is_due(state, now)
@@ -55,11 +47,8 @@ class OwnWork:
         )
 
     def seconds_until_due(self, state: State, longest: float) -> float:
-        """Return the seconds until the next check of overrides and replicas.
-
-        It is at least one, but never above ``longest``. It is zero if other work was left off, so
-        that demands which arrived meanwhile come first.
-        """
+        """Return the seconds until the next check: at most ``longest``."""
+        # what was left off goes on at once, but after the demands that arrived meanwhile
         if self._draining.has_more or self._waiting_turns.has_more:
             return 0.0
         now = self._runtime.now()

@@ -12,18 +12,16 @@ from demandops.runtime import Runtime
 
 DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
+# A Git server may report many pushes at once; they share a fetch.
 _SHORTEST_GAP_S = 0.5
+# The longest interval for a repository on this disk, where a check is cheap: it reads one file.
 _LOCAL_S = 1.0
-"""The longest interval for a repository on this disk, where a check is cheap: it reads one file."""
 
 
 def parse_interval(text: str) -> float:
-    """Return a fetch interval in seconds; 0 means no fetches at an interval.
+    """Return an interval in seconds, from a duration like ``30s`` or a number of seconds.
 
-    The text is a duration like ``30s``, or a number of seconds.
-
-    Raises:
-        ValueError: if the text is neither of them.
+    ValueError is raised if the text is neither of them.
     """
     if re.fullmatch(r"[0-9]{1,8}(\.[0-9]{1,6})?", text):
         return float(text)
@@ -37,13 +35,7 @@ class PollTimer:
     """
 
     def __init__(self, interval: float, runtime: Runtime, *, local: bool = False) -> None:
-        """Start the timer; unless ``interval`` is 0, the first fetch is due at once.
-
-        Args:
-            interval: seconds between two fetches; with 0, only :meth:`request` makes a fetch due.
-            runtime: provides the time.
-            local: whether the repository is on this disk; then the interval is at most a second.
-        """
+        """Start the timer. With an interval of 0, only :meth:`request` makes a fetch due."""
         self._interval = min(interval, _LOCAL_S) if local else interval
         self._runtime = runtime
         self._pause = self._interval
@@ -52,34 +44,23 @@ class PollTimer:
         self._requested = runtime.event()
 
     def request(self) -> None:
-        """Make a fetch due now, or half a second after the last one, if that is later.
-
-        Several requests before the fetch starts cause one fetch.
-        """
+        """Make a fetch due now, or half a second after the last one, if that is later."""
         self._requested.set()
 
     def seconds_until_due(self) -> float | None:
-        """Return the seconds until the next fetch, or None if none is planned."""
         times = [] if self._next is None else [self._next]
         if self._requested.is_set():
             times.append(self._last + _SHORTEST_GAP_S)
         return max(min(times) - self._runtime.monotonic(), 0.0) if times else None
 
     def start_if_due(self) -> bool:
-        """Return whether a fetch is due; if it is, the caller must fetch.
-
-        The fetch serves every earlier :meth:`request`. A later request makes another fetch due.
-        """
         due = self.seconds_until_due() == 0.0
-        if due:
+        if due:  # clear before the fetch: a later push needs another one
             self._requested.clear()
         return due
 
     def finished(self, *, reached: bool) -> None:
-        """Plan the next fetch after a fetch or a push, which both tell of others' new commits.
-
-        ``reached`` says whether the remote could be reached. If it could not, the interval grows.
-        """
+        """Plan the next fetch after a fetch or a push, which both tell of others' commits."""
         longest = max(_LONGEST_BACKOFF_S, self._interval)
         self._last = self._runtime.monotonic()
         if self._next is not None:

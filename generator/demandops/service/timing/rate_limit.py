@@ -18,8 +18,6 @@ _WINDOW = timedelta(minutes=1)
 
 
 class RateLimit:
-    """Counts the demands of the last minute, for each requester that has a limit."""
-
     def __init__(self) -> None:
         self._seen: dict[tuple[str, str], deque[tuple[datetime, str]]] = {}
 
@@ -28,12 +26,12 @@ class RateLimit:
     ) -> Iterator[Fault]:
         """Count a demand, and yield a fault for each quota that a requester exceeds with it.
 
-        Requests that add no claims are not limited. A demand counts even if it is
-        refused afterwards.
+        A demand counts even if it is refused afterwards. A request that adds no claims is not
+        limited.
         """
         if not request.adds_claims:
             return
-        homes = (config.domain_of.get(one.held.home) for one in request.demanded)
+        homes = (config.domain_of.get(demanded.held.home) for demanded in request.demanded)
         domains = {domain.name: domain for domain in homes if domain is not None}
         for domain in domains.values():
             most = domain.quotas.demands_per_minute
@@ -47,25 +45,21 @@ class RateLimit:
                     yield fault("", message, code="quota")
 
     def _count(self, key: tuple[str, str], operation: str, received: datetime) -> int:
-        """Count a demand for ``key``, and return its number among those of the last minute.
-
-        A demand that is counted already keeps its number.
-        """
-        self._forget_idle(received)
+        """Count a demand, and return its number among those of the last minute."""
+        # forget requesters that sent nothing for a minute, because vehicles come and go
+        while self._seen:
+            idlest = next(iter(self._seen))
+            times = self._seen[idlest]
+            if times and abs(received - times[-1][0]) <= _WINDOW:
+                break
+            del self._seen[idlest]
         seen = self._seen.pop(key, None) or deque()
         self._seen[key] = seen  # at the end, so that the requester that is idle longest is first
         while seen and abs(received - seen[0][0]) > _WINDOW:  # the clock may have been set back
             seen.popleft()
-        operations = [known for _, known in seen]
+        # a demand that is evaluated again keeps its number
+        operations = [earlier for _, earlier in seen]
         if operation in operations:
             return operations.index(operation) + 1
         seen.append((received, operation))
         return len(seen)
-
-    def _forget_idle(self, now: datetime) -> None:
-        """Forget requesters that sent nothing for a minute, because vehicles come and go."""
-        while self._seen:
-            key = next(iter(self._seen))
-            if self._seen[key] and abs(now - self._seen[key][-1][0]) <= _WINDOW:
-                return
-            del self._seen[key]

@@ -8,30 +8,25 @@ FIRST_S, LONGEST_S = 1.0, 60.0
 
 
 class Rest:
-    """A pause after an error; each further error doubles it, up to a minute, until a success."""
+    """A pause after an error; each further error doubles it until a success."""
 
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._next, self._until = FIRST_S, runtime.monotonic()
 
     def __bool__(self) -> bool:
-        """Return whether the pause goes on."""
         return self._runtime.monotonic() < self._until
 
     @property
     def follows_success(self) -> bool:
-        """Whether the next pause is the first one since a success or since the start."""
         return self._next == FIRST_S
 
     def seconds_left(self) -> float:
-        """Return the seconds until the end of the pause; negative after the end."""
         return self._until - self._runtime.monotonic()
 
     def begin(self) -> None:
-        """Begin a pause now."""
         self._until = self._runtime.monotonic() + self._next
         self._next = min(2 * self._next, LONGEST_S)
 
     def succeeded(self) -> None:
-        """Make the next pause short again."""
         self._next = FIRST_S

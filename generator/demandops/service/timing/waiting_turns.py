@@ -19,57 +19,49 @@ from demandops.staterepo.write.commit_batch import CommitBatch
 
 log = logging.getLogger("demandops")
 
+# After this processor time, new demands come before the waiting demands that were not tried yet.
 _LONGEST_ROUND_S = 0.25
-"""After this processor time the other waiting demands are tried later, so that new demands come."""
 
 
 class WaitingTurns:
-    """Books waiting demands once there is room for them, in one commit for each."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._tried: World | None = None
         self._left: list[str] = []
 
     def book_due(self, commits: CommitBatch) -> None:
-        """Commit each waiting demand that fits and needs no approval, in its turn.
-
-        The turns are those of :func:`in_turn`. After some time, the others are left for later.
-        Do nothing if all waiting demands were already tried on this state.
-        """
+        """Commit each waiting demand that fits and needs no approval, in its turn."""
         state = commits.head.state
         if not self.is_due(state):
             return
         if not self._is_tried(state) or not self._left:
-            self._left = [one.demand for one in in_turn(state.ledger.waiting)]
+            self._left = [waiting.demand for waiting in in_turn(state.ledger.waiting)]
         end = self._runtime.processor_s() + _LONGEST_ROUND_S
         while self._left:
-            if self._is_late(commits, self._left.pop(0)) or self._runtime.processor_s() > end:
+            demand = self._left.pop(0)
+            state, now = commits.head.state, self._runtime.now()
+            waiting = state.ledger.waiting.get(demand)
+            if waiting is None:  # it was released meanwhile
+                continue
+            checkpoint = within(state.config.repo_settings.limits, self._runtime)
+            try:
+                decision = decide(
+                    state, dict(waiting.goal), now, commits.read, checkpoint=checkpoint
+                )
+            except InvalidInput as error:
+                log.debug("demand %s still waits: %s", quoted(demand), error)
+                if isinstance(error, OverLimit):  # a template took too long, and the next may too
+                    break
+            else:
+                if decision.outcome == "booked" and not decision.approval:
+                    commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
+                    log.info("demand %s no longer waits", quoted(demand))
+            if self._runtime.processor_s() > end:  # after a try, so that each round gets on
                 break
         self._tried = commits.head.state
 
-    def _is_late(self, commits: CommitBatch, demand: str) -> bool:
-        """Book a waiting demand if it fits; return whether a template took too long for it."""
-        state, now = commits.head.state, self._runtime.now()
-        waiting = state.ledger.waiting.get(demand)
-        if waiting is None:  # it was released meanwhile
-            return False
-        checkpoint = within(state.config.repo_settings.limits, self._runtime)
-        try:
-            decision = decide(state, dict(waiting.goal), now, commits.read, checkpoint=checkpoint)
-        except InvalidInput as error:
-            log.debug("demand %s still waits: %s", quoted(demand), error)
-            return isinstance(error, OverLimit)
-        if decision.outcome == "booked" and not decision.approval:
-            commits.commit(decision, self._runtime.fresh_id(), waiting.since, now)
-            log.info("demand %s no longer waits", quoted(demand))
-        return False
-
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand freed room.
-
-        ``before`` is the state before the last demand.
-        """
+        """Book waiting demands if the last demand, decided on ``before``, freed room."""
         if commits.frees:
             commits.frees = False
             self._tried = None
@@ -79,17 +71,17 @@ class WaitingTurns:
 
     @property
     def has_more(self) -> bool:
-        """Whether the last round left demands for later, which are to be tried soon."""
+        """Whether the last round left demands for later."""
         return bool(self._left)
 
     def postpone(self) -> None:
-        """Begin again with all waiting demands later, because a fetch or a publication failed."""
+        """Begin again with all waiting demands later."""
         self._left.clear()
 
     def is_due(self, state: State) -> bool:
-        """Return whether there are waiting demands that were not yet tried on this state."""
         return bool(state.ledger.waiting) and (bool(self._left) or not self._is_tried(state))
 
     def _is_tried(self, state: World) -> bool:
+        # by identity: ledger and configuration are frozen, and to compare their content takes long
         tried = self._tried
         return tried is not None and tried.ledger is state.ledger and tried.config is state.config
