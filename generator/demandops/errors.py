@@ -15,8 +15,8 @@ from functools import lru_cache
 
 from demandops.quoting import clipped, escaped, one_line
 
+# How many faults of one file, or of a request, are listed; further ones are only counted
 MOST_FAULTS = 100
-"""How many faults of one file, or of a request, are listed; further ones are only counted."""
 _LONGEST_FIELD = 2_000
 _MORE = "more"
 _COMPARED = 12

@@ -57,10 +57,10 @@ class Forge(ABC):
     """A project on a forge. Every method raises :class:`ForgeError` if a call fails."""
 
     NAME: ClassVar[str]
+    # The HTTP headers of each call, with `{token}` for the token
     HEADERS: ClassVar[dict[str, str]]
-    """The HTTP headers of each call, with ``{token}`` for the token."""
+    # The HTTP status with which the forge refuses a second pull request for a branch
     EXISTS: ClassVar[int]
-    """The HTTP status with which the forge refuses a second pull request for a branch."""
 
     def __init__(self, api: str, token: str, owner: str, name: str) -> None:
         self._api = api.rstrip("/")

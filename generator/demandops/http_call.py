@@ -26,13 +26,13 @@ if TYPE_CHECKING:
 _MOST_BYTES = 4_000_000
 _TOO_MANY_REQUESTS = 429
 _INVALID = "the URL, a header or the proxy's address is not valid; check them"
+# The reason for each type of httpx error whose own text may echo the request
 _CAUSES = {
     "LocalProtocolError": _INVALID,
     "UnsupportedProtocol": _INVALID,
     "RemoteProtocolError": "the answer is not HTTP, or not complete; check the URL and the server",
     "ProxyError": "the proxy refuses the connection; check HTTPS_PROXY and ALL_PROXY",
 }
-"""The reason for each type of httpx error whose own text may echo the request."""
 
 for _name in ("httpx", "httpcore"):  # they log URLs and headers
     logging.getLogger(_name).setLevel(logging.WARNING)

@@ -7,14 +7,12 @@ import unicodedata
 
 from demandops.quoting import is_visible, quoted
 
+# The maximum length of an id, in characters. A file or an object that is named after a long id has
+# a shortened name with a hash.
 MAX_ID = 1024
-"""The maximum length of an id, in characters.
 
-A file or an object that is named after a long id has a shortened name with a hash.
-"""
-
+# The maximum length of a topic name, in characters: ROS 2's `RMW_TOPIC_MAX_NAME_LENGTH`
 MAX_TOPIC = 247
-"""The maximum length of a topic name, in characters: ROS 2's ``RMW_TOPIC_MAX_NAME_LENGTH``."""
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _MESSAGE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
@@ -95,6 +93,7 @@ def message_type_problem(name: str) -> str:
 _LOWER = "lower-case letters, digits"
 _ANY = "letters, digits"
 
+# For each regular expression of a field: the texts that match it, in words for messages
 PATTERN_WORDS = {
     r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": f"{_LOWER} and '-' between them, such as c-its",
     r"^[a-z][a-z0-9_-]*$": f"{_LOWER}, '_' and '-', with a letter first, for example road-station",
@@ -142,4 +141,3 @@ PATTERN_WORDS = {
         "and '_', no digit first, and at most one {instance}"
     ),
 }
-"""For each regular expression of a field: the texts that match it, in words for messages."""

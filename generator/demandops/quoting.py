@@ -12,12 +12,12 @@ import logging
 import re
 from typing import Any
 
+# The longest line of text from outside, in characters; the rest is cut off
 LONGEST_LINE = 4000
-"""The longest line of text from outside, in characters; the rest is cut off."""
 
 _INVISIBLE = "\u034f\u115f-\u1160\u17b4-\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0"
+# Matches characters that are displayed as nothing, although Python calls them printable
 _HIDDEN = re.compile(f"[{_INVISIBLE}\U0001d159\U000e0100-\U000e01ef]")
-"""Matches characters that are displayed as nothing, although Python calls them printable."""
 _BMP = 0xFFFF
 
 
@@ -39,6 +39,8 @@ def escaped(text: str, kept: str = "") -> str:
     )
 
 
+# Matches text that ends in the character at which a forge, or a pipeline, takes it for an order.
+# The last line is for an issue elsewhere, `Closes ABC-1`.
 _TRIGGER = re.compile(
     r"""
     (?<![A-Za-z0-9_])@(?=[A-Za-z0-9_])       # @name, @org/team
@@ -51,10 +53,6 @@ _TRIGGER = re.compile(
     """,
     re.IGNORECASE | re.VERBOSE,
 )
-"""Matches text that ends in the character at which a forge, or a pipeline, takes it for an order.
-
-The last line is for an issue elsewhere, ``Closes ABC-1``.
-"""
 
 
 def harmless(text: str) -> str:

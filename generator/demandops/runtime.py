@@ -25,8 +25,8 @@ log = logging.getLogger("demandops")
 Thread = threading.Thread
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
+# A thread counts as recovered if its last failure is at least this many seconds ago
 _STEADY_S = 2 * _LONGEST_PAUSE_S
-"""A thread counts as recovered if its last failure is at least this many seconds ago."""
 _LONGEST_REASON = 300
 
 

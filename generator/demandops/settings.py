@@ -11,47 +11,41 @@ import os
 from pathlib import Path
 from typing import Final
 
+# `apiVersion` of every configuration file
 API_VERSION: Final = "demandops/v1"
-"""``apiVersion`` of every configuration file."""
 
+# `apiVersion` of every claim file
 LEDGER_API_VERSION = "demandops.ledger/v2"
-"""``apiVersion`` of every claim file."""
 
+# The version of rendering. It is increased whenever the same ledger and configuration render to
+# other bytes than before.
 RENDER_VERSION = 2
-"""The version of rendering.
 
-It is increased whenever the same ledger and configuration render to other bytes than before.
-"""
-
+# The branch that Flux and Argo CD read and the generator writes
 MAIN_BRANCH = "main"
-"""The branch that Flux and Argo CD read and the generator writes."""
 
+# The action that the reference's clients send goals to (robotkube's event detector)
 DEFAULT_ACTION_NAME = "/event_detector_operator_plugin/operator_plugin/deployment_request"
-"""The action that the reference's clients send goals to (robotkube's event detector)."""
 
+# The action that our own clients send goals to
 DEFAULT_DEMAND_ACTION_NAME = "/demandops/demand"
-"""The action that our own clients send goals to."""
 
+# How many demands may be queued; a further demand is rejected
 QUEUE_LIMIT = 10_000
-"""How many demands may be queued; a further demand is rejected."""
 
+# How many demands of one requester may have no answer yet; a further demand is rejected. Demands
+# that await approval do not count.
 REQUESTER_QUEUE_LIMIT = 1_000
-"""How many demands of one requester may have no answer yet; a further demand is rejected.
 
-Demands that await approval do not count.
-"""
-
+# How many proposals of one requester may await approval. A demand that needs a further proposal is
+# refused.
 PROPOSAL_LIMIT = 100
-"""How many proposals of one requester may await approval.
 
-A demand that needs a further proposal is refused.
-"""
-
+# The top-level folders whose files are all rendered from ledger and configuration
 GENERATED_ROOTS = ("bootstrap", "clusters")
-"""The top-level folders whose files are all rendered from ledger and configuration."""
 
+# The folder for JSON Schemas in each state repo; editors read the schemas
 SCHEMAS_ROOT = "schemas"
-"""The folder for JSON Schemas in each state repo; editors read the schemas."""
 
 
 def modeline(path: str, schema: str) -> str:
@@ -60,9 +54,8 @@ def modeline(path: str, schema: str) -> str:
     return f"# yaml-language-server: $schema={up}{SCHEMAS_ROOT}/{schema}.json\n"
 
 
+# The top-level folder with the generator's reports to people. No decision depends on the reports.
 NOTES_ROOT = ".demandops"
-"""The top-level folder with the generator's reports to people. No decision depends on the reports.
-"""
 
 _PACKAGE = Path(__file__).parent
 _CHECKOUT = _PACKAGE.parents[1]

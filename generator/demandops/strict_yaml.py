@@ -29,20 +29,17 @@ _WORDS = frozenset(
     ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
 )  # some parsers do not read these words as text
 
+# How many characters a file may have; an inventory of 20,000 nodes has fewer
 MAX_LENGTH = 4_000_000
-"""How many characters a file may have; an inventory of 20,000 nodes has fewer."""
 MAX_DEPTH = 100
+# How many bits a whole number may have. Python prints at most 4,300 digits.
 _MAX_BITS = 14_000
-"""How many bits a whole number may have. Python prints at most 4,300 digits."""
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
 _MISFIT = "not valid YAML: it has a tag, number or character that cannot be read"
 
+# Finds the digits before the `e` of a JSON number like `1e-09`. YAML 1.1 would read such a number
+# as text. The pattern matches quoted texts as a whole, so that no digits inside them are found.
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
-"""Finds the digits before the ``e`` of a JSON number like ``1e-09``.
-
-YAML 1.1 would read such a number as text. The pattern matches quoted texts as a whole, so that no
-digits inside them are found.
-"""
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
@@ -78,6 +75,7 @@ def _integer(node: yaml.ScalarNode) -> int:
     return number
 
 
+# The function that makes the value of a date, number, truth value or null, by YAML tag
 _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}timestamp": _CONSTRUCTOR.construct_scalar,  # dates stay text
     f"{_TAG}int": _integer,
@@ -85,7 +83,6 @@ _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
 }
-"""The function that makes the value of a date, number, truth value or null, by YAML tag."""
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
@@ -262,17 +259,15 @@ def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]
         yield from _Parser(text).documents(most)
 
 
+# Matches a field with a list of plain texts, as `to_json` writes it
 _LISTED = re.compile(
     r'^( *[A-Za-z][\w-]*: )(\["[ !#-\[\]-~]*"(?:, "[ !#-\[\]-~]*")*\])$', re.MULTILINE
 )
-"""Matches a field with a list of plain texts, as :func:`to_json` writes it."""
+# Lists of at least this many characters are read by the json module. It is 20 times faster than
+# PyYAML.
 _LONG = 200
-"""Lists of at least this many characters are read by the json module.
-
-It is 20 times faster than PyYAML.
-"""
+# The prefix of the stand-ins: words that replace long lists while PyYAML reads the other text
 _STAND_IN = "demandops-list"
-"""The prefix of the stand-ins: words that replace long lists while PyYAML reads the other text."""
 
 
 def _load_around_lists(text: str) -> list[Any]:
@@ -313,8 +308,8 @@ def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which mo
         raise InvalidInput(faults_in(error, file)) from error.__cause__
 
 
+# How many characters a text may have for its value to be cached
 _MOST_KEPT = 10_000
-"""How many characters a text may have for its value to be cached."""
 
 
 @lru_cache(1024)
@@ -345,8 +340,8 @@ class _NotSimple(Exception):
     """Raised for a text that only PyYAML writes: with escapes, of several lines, or long."""
 
 
+# Matches a text that fits in double quotes on one line, without escapes
 _SIMPLE = re.compile(r"[ !#-\[\]-~]{0,1000}")
-"""Matches a text that fits in double quotes on one line, without escapes."""
 _MOST_OF_KEY = 100
 
 

@@ -6,12 +6,10 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
+# The identity of a topic within its subject. In an application, that is role, topic and source; an
+# application without inputs has one empty key. In a connection, that is the topic's name on the
+# source node.
 TopicKey: TypeAlias = "tuple[str, ...]"
-"""The identity of a topic within its subject.
-
-In an application, that is role, topic and source; an application without inputs has one empty key.
-In a connection, that is the topic's name on the source node.
-"""
 
 
 class SubjectKind(Enum):

@@ -28,19 +28,19 @@ from demandops.quoting import quoted
 Model = TypeVar("Model", bound=BaseModel)
 Item = TypeVar("Item")
 
+# A list in a file. The model has the items as a tuple.
 Items = Annotated[tuple[Item, ...], Field(strict=False)]
-"""A list in a file. The model has the items as a tuple."""
 
+# A whole number above zero
 Positive = Annotated[int, Field(ge=1)]
-"""A whole number above zero."""
 
+# A name that is valid in Kubernetes (RFC 1123 label)
 DnsLabel = Annotated[
     str, StringConstraints(pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$", max_length=63)
 ]
-"""A name that is valid in Kubernetes (RFC 1123 label)."""
 
+# A short name in a configuration file, such as that of a role, a channel or a capability
 Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
-"""A short name in a configuration file, such as that of a role, a channel or a capability."""
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
@@ -73,17 +73,15 @@ def _hidden(value: str) -> str:
     return control and f"{quoted(value)} has the control character {control}; remove it"
 
 
+# A validator that rejects control characters, and characters that reorder text. Line breaks and
+# tabs are valid.
 Visible = without(_hidden)
-"""A validator that rejects control characters, and characters that reorder text.
 
-Line breaks and tabs are valid.
-"""
-
+# Any text that `Visible` accepts
 Text = Annotated[str, Visible]
-"""Any text that :data:`Visible` accepts."""
 
+# Whether a demand needs a person's approval
 Approval = Literal["none", "required"]
-"""Whether a demand needs a person's approval."""
 
 
 class FrozenModel(BaseModel):

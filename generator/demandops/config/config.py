@@ -33,6 +33,9 @@ IMAGES_FILE = "registry/images.yaml"
 CLIENTS_FILE = "registry/clients.yaml"
 VERSIONS_FILE = "registry/versions.yaml"
 
+# The collections of entries, each named by the file that usually lists its entries. Files in the
+# folder `inventory/nodes/` may list further entries of the collection `inventory/nodes.yaml`, and
+# likewise for the others (`collection_of`).
 COLLECTIONS = (
     CLUSTERS_FILE,
     NODES_FILE,
@@ -43,14 +46,9 @@ COLLECTIONS = (
     CLIENTS_FILE,
     VERSIONS_FILE,
 )
-"""The collections of entries, each named by the file that usually lists its entries.
 
-Files in the folder ``inventory/nodes/`` may list further entries of the collection
-``inventory/nodes.yaml``, and likewise for the others (:func:`collection_of`).
-"""
-
+# The top-level entries of a state repo that hold the configuration, which people write
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
-"""The top-level entries of a state repo that hold the configuration, which people write."""
 
 
 def collection_of(path: str) -> str | None:
@@ -91,49 +89,47 @@ class Config:
     images: Mapping[str, Image]
     appdefs: Mapping[str, ApplicationDefinition]
     definitions: Mapping[str, ServiceDefinition]
+    # For each appdef, its own services and those of `definitions` that it uses
     services: Mapping[str, Services]
-    """For each appdef, its own services and those of ``definitions`` that it uses."""
+    # The access domain of each node that is in one
     domain_of: Mapping[str, AccessDomain]
-    """The access domain of each node that is in one."""
+    # The text of each file below `appdefs/`, such as a template or a chart, by path
     files: Mapping[str, str]
-    """The text of each file below ``appdefs/``, such as a template or a chart, by path."""
+    # For each node in a further access domain (`edge@city`), the inventory's id (`edge`)
     hosts: Mapping[str, str] = field(default_factory=dict)
-    """For each node in a further access domain (``edge@city``), the inventory's id (``edge``)."""
+    # Every override; `demandops.ledger.world.World` knows which of them have ended
     overrides: Mapping[str, Override] = field(default_factory=dict)
-    """Every override; :class:`demandops.ledger.world.World` knows which of them have ended."""
     clients: ClientsFile = DEFAULT_SETTINGS
     versions: Mapping[str, VersionList] = field(default_factory=dict)
+    # For each collection, a map from each entry to the file that has the entry
     entry_files: Mapping[str, Mapping[str, str]] = field(
         default_factory=dict, compare=False, repr=False
     )
-    """For each collection, a map from each entry to the file that has the entry."""
+    # A map from each `topic_part(id)` to the ids of the nodes that have this topic part
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """A map from each ``topic_part(id)`` to the ids of the nodes that have this topic part."""
+    # For each role, the nodes with this `type`, sorted by id. The empty role has all nodes.
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
-    """For each role, the nodes with this ``type``, sorted by id. The empty role has all nodes."""
+    # For each `(capability,)` or `(label key, value)`, the nodes with it, sorted by id
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """For each ``(capability,)`` or ``(label key, value)``, the nodes with it, sorted by id."""
+    # For each property, the type of its value on most nodes, and the first node with this type
     property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
-    """For each property, the type of its value on most nodes, and the first node with this type."""
+    # The nodes that are drained, sorted
     drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    """The nodes that are drained, sorted."""
+    # Whether any node declares a capacity
     limits_capacity: bool = field(init=False, compare=False, repr=False)
-    """Whether any node declares a capacity."""
+    # The input roles, sorted, that are the `root` of a service in at least one appdef
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    """The input roles, sorted, that are the ``root`` of a service in at least one appdef."""
+    # The names of the services whose scaling has `downAfter`, in at least one appdef
     services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
-    """The names of the services whose scaling has ``downAfter``, in at least one appdef."""
+    # For each appdef, a map from names of versions and channels to versions. The empty name stands
+    # for the default version.
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
         init=False, compare=False, repr=False
     )
-    """For each appdef, a map from names of versions and channels to versions.
-
-    The empty name stands for the default version.
-    """
 
     def __post_init__(self) -> None:
         found: dict[str, tuple[str, ...]] = {}

@@ -28,15 +28,15 @@ from demandops.config.node_property import PropertyName, PropertyValue
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
 from demandops.quoting import quoted
 
+# A host name or an IP address
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
-"""A host name or an IP address."""
 
+# A key in a Kubernetes Secret; in the pod, the key is a file's name
 SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
-"""A key in a Kubernetes Secret; in the pod, the key is a file's name."""
 
 _ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
+# A Zenoh endpoint whose protocol needs no certificates, like `tcp/host:7447`
 Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), Visible]
-"""A Zenoh endpoint whose protocol needs no certificates, like ``tcp/host:7447``."""
 
 
 class Tls(CamelModel):
@@ -141,27 +141,27 @@ def _plain_number(value: object) -> object:
     return str(value) if is_number else value
 
 
+# A quantity as Kubernetes writes it, like `500m`. A plain number needs no quotes.
 Quantity = Annotated[
     str,
     BeforeValidator(_plain_number, json_schema_input_type=str | int | float),
     readable_by(amount_of),
 ]
-"""A quantity as Kubernetes writes it, like ``500m``. A plain number needs no quotes."""
 
+# A name of a resource: `cpu`, `memory`, `gpu`, `nvidia.com/gpu`
 ResourceName = Annotated[
     str, StringConstraints(pattern=r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$", max_length=120)
 ]
-"""A name of a resource: ``cpu``, ``memory``, ``gpu``, ``nvidia.com/gpu``."""
 
+# How much of each resource a node has, or a service requests
 Resources = dict[ResourceName, Quantity]
-"""How much of each resource a node has, or a service requests."""
 
 NodeId = Annotated[str, without(id_problem)]
 Topic = Annotated[str, without(topic_problem)]
 MessageType = Annotated[str, without(message_type_problem)]
 
+# The label that selects a node by its id, as in the reference
 NODE_LABEL = "node_id"
-"""The label that selects a node by its id, as in the reference."""
 
 LabelKey = Annotated[
     str,
@@ -197,8 +197,8 @@ class Toleration(CamelModel):
         return self
 
 
+# A middleware of ROS. The word `image` stands for the middleware of the container's image.
 Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp", "image"]
-"""A middleware of ROS. The word ``image`` stands for the middleware of the container's image."""
 
 
 RosDomainId = Annotated[int, Field(ge=0, le=232)]
@@ -241,46 +241,39 @@ class Node(CamelModel):
     """
 
     id: NodeId
+    # The role of the node; any word
     type: Word
-    """The role of the node; any word."""
     cluster: DnsLabel
+    # By default `{node_id: <id>}`, the label that the reference uses
     selector: dict[LabelKey, LabelValue] | None = None
-    """By default ``{node_id: <id>}``, the label that the reference uses."""
+    # The node's usual topic for each input role. The names of releases and derived topics contain
+    # the node's id. For a further topic of the node, these names also contain the topic.
     topics: dict[Word, Topic] = Field(default_factory=dict)
-    """The node's usual topic for each input role.
-
-    The names of releases and derived topics contain the node's id. For a further topic of the node,
-    these names also contain the topic.
-    """
     tolerations: Items[Toleration] = ()
     image_pull_secrets: Items[DnsLabel] = ()
     host_network: bool = True
+    # A ROS domain of the access domain replaces the ROS domain that is given here
     ros: Ros = Ros()
-    """A ROS domain of the access domain replaces the ROS domain that is given here."""
     zenoh: Zenoh | None = None
+    # The address at which ROS connections reach the node
     wan: Wan | None = None
-    """The address at which ROS connections reach the node."""
+    # The message types of topics, for requests that give no type
     types: dict[Topic, MessageType] = Field(default_factory=dict)
-    """The message types of topics, for requests that give no type."""
+    # For each other node, the topics that the initial deployment already carries to that node. The
+    # topics keep their names. Connections skip these topics.
     bridged: dict[NodeId, Items[Topic]] = Field(default_factory=dict)
-    """For each other node, the topics that the initial deployment already carries to that node.
-
-    The topics keep their names. Connections skip these topics.
-    """
+    # Words for what the node has
     capabilities: Items[Word] = ()
-    """Words for what the node has."""
+    # The value of each property: a number, text, true or false
     properties: dict[PropertyName, PropertyValue] = Field(default_factory=dict)
-    """The value of each property: a number, text, true or false."""
     position: Position | None = None
+    # The generator chooses no drained node, and moves away what it placed there
     drained: bool = False
-    """The generator chooses no drained node, and moves away what it placed there."""
+    # What all services on the node may request together (`demandops.plan.nodes.capacity`)
     capacity: Resources | None = None
-    """What all services on the node may request together (:mod:`demandops.plan.nodes.capacity`)."""
+    # The node's further domains. For each further domain, the configuration has a node
+    # `<id>@<domain>` (`in_domain`).
     access_domains: Items[FurtherDomain] = ()
-    """The node's further domains.
-
-    For each further domain, the configuration has a node ``<id>@<domain>`` (:meth:`in_domain`).
-    """
 
     @model_validator(mode="after")
     def _findable(self) -> Node:

@@ -312,8 +312,8 @@ def _in_further_domains(
     return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
 
 
+# How many of the domains that match one node a message names
 _MOST_DOMAINS = 3
-"""How many of the domains that match one node a message names."""
 
 
 def _domains_of_nodes(

@@ -23,11 +23,11 @@ _TEXT = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._+:/-]{0,61}[A-Za-z0-9])?")
 _CONDITION = re.compile(rf"({_NAME})(>=|<=|=)(.+)")
 _BOUNDS = {"min": ">=", "max": "<="}
 
+# The name of a property; it includes the unit of the value, as in `memoryGiB`
 PropertyName = Annotated[str, StringConstraints(pattern=f"^{_NAME}$", max_length=63)]
-"""The name of a property; it includes the unit of the value, as in ``memoryGiB``."""
 
+# The type of a property's values, in words
 Kind = Literal["a number", "text", "true or false"]
-"""The type of a property's values, in words."""
 
 
 class PropertyCondition(NamedTuple):
@@ -80,12 +80,12 @@ _LIMITS: dict[str, Any] = {
     "additionalProperties": False,
     "minProperties": 1,
 }
+# The value of a node's property
 PropertyValue = Annotated[Any, AfterValidator(_value), WithJsonSchema({"anyOf": _PLAIN})]
-"""The value of a node's property."""
+# The value that a definition requires of a property; for a number also bounds: `{min: 8}`
 RequiredValue = Annotated[
     Any, AfterValidator(_required_value), WithJsonSchema({"anyOf": [*_PLAIN, _LIMITS]})
 ]
-"""The value that a definition requires of a property; for a number also bounds: ``{min: 8}``."""
 
 
 def condition_texts(properties: Mapping[str, object]) -> Iterator[str]:

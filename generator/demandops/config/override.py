@@ -42,8 +42,8 @@ _MOMENT = re.compile(
 )
 _SHAPING = ("values", "version", "images", "replicas", "node")
 _OF_SERVICES = ("version", "replicas", "node", "keep")
+# The effects of overrides, in the order in which messages list them
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
-"""The effects of overrides, in the order in which messages list them."""
 
 
 def parse_time(text: str) -> datetime:

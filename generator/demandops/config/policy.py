@@ -115,6 +115,7 @@ class Kind(FrozenModel):
     resource: DnsLabel
 
 
+# The kinds of Kubernetes objects that a policy may name by one word
 KINDS = {
     kind: Kind(kind=kind, group=group, resource=resource)
     for group, kinds in {
@@ -138,16 +139,13 @@ KINDS = {
     }.items()
     for kind, resource in kinds.items()
 }
-"""The kinds of Kubernetes objects that a policy may name by one word."""
 
+# Kinds that are allowed only if a policy names them. A DaemonSet runs on all nodes of a cluster,
+# and not only on the demanded node.
 NOT_BY_DEFAULT = ("DaemonSet",)
-"""Kinds that are allowed only if a policy names them.
 
-A DaemonSet runs on all nodes of a cluster, and not only on the demanded node.
-"""
-
+# The kinds that every domain needs, for the clients of connections and for Helm's releases
 NEEDED_KINDS = ("ConfigMap", "Deployment", "Secret")
-"""The kinds that every domain needs, for the clients of connections and for Helm's releases."""
 
 _NETWORK_POLICY = "NetworkPolicy"
 

@@ -55,8 +55,8 @@ class Client(ABC):
     name: str
     node: Node
     domain: AccessDomain
+    # The connections that the client carries
     connections: tuple[str, ...]
-    """The connections that the client carries."""
     shaping: Shaping = field(default=UNSHAPED, kw_only=True)
 
     @property
@@ -148,8 +148,8 @@ def message_type(route: Route, sender: str, config: Config) -> str:
     return route.type or (known.types.get(route.read_topic, "") if known else "")
 
 
+# The code of a fault if the inventory or the registry does not permit a connection's type
 UNSUPPORTED = "unsupported-connection-type"
-"""The code of a fault if the inventory or the registry does not permit a connection's type."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
 
@@ -171,25 +171,23 @@ class Connections(Protocol):
 class ConnectionType(ABC):
     """How clients carry a connection. Each subclass has one instance."""
 
+    # The type's name in messages; files, templates and clients use `word` instead
     name: ClassVar[str]
-    """The type's name in messages; files, templates and clients use ``word`` instead."""
+    # The type's number in `DeploymentRequest`
     number: ClassVar[int]
-    """The type's number in ``DeploymentRequest``."""
+    # The name of the clients' image in the registry
     image: ClassVar[str]
-    """The name of the clients' image in the registry."""
+    # The route options that this connection type supports. Message type and direction are not
+    # listed, because every type supports them.
     options: ClassVar[frozenset[str]]
-    """The route options that this connection type supports.
-
-    Message type and direction are not listed, because every type supports them.
-    """
+    # Whether a topic may have another name at the target than at the source
     renames: ClassVar[bool] = False
-    """Whether a topic may have another name at the target than at the source."""
+    # Whether a demand may name a broker
     takes_broker: ClassVar[bool] = False
-    """Whether a demand may name a broker."""
+    # Whether the clients speak DDS themselves, so that both nodes must run a DDS middleware
     speaks_dds: ClassVar[bool] = True
-    """Whether the clients speak DDS themselves, so that both nodes must run a DDS middleware."""
+    # Whether the clients must know the message type of each topic
     needs_types: ClassVar[bool] = False
-    """Whether the clients must know the message type of each topic."""
 
     def __repr__(self) -> str:
         return self.name

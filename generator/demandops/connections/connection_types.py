@@ -18,8 +18,8 @@ from demandops.connections.zenoh import ZENOH
 from demandops.errors import Fault, fault, sentences
 from demandops.identifiers import topic_problem
 
+# All connection types, in the order of the automatic choice
 CONNECTION_TYPES: tuple[ConnectionType, ...] = (ZENOH, MQTT, ROS)
-"""All connection types, in the order of the automatic choice."""
 
 
 def type_numbered(number: int) -> ConnectionType | None:

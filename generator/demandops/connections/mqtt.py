@@ -32,8 +32,8 @@ from demandops.connections.route import Route
 from demandops.errors import Fault, Refused, fault
 from demandops.quoting import quoted
 
+# The path at which the certificate of the CA that signs for the broker is mounted
 CA_FILE = "/tls/ca.crt"
-"""The path at which the certificate of the CA that signs for the broker is mounted."""
 
 _NO_BROKER = "no-broker"
 
@@ -157,8 +157,8 @@ class MqttEnd(End):
     """One end of an MQTT connection."""
 
     broker: Broker
+    # The prefix of this connection's MQTT topics, the same at both ends
     channel: str
-    """The prefix of this connection's MQTT topics, the same at both ends."""
 
     def facts(self) -> list[str]:
         """Return one line for each topic, and one for the broker."""

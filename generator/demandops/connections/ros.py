@@ -136,8 +136,8 @@ def _number(connection: str) -> int:
 class RosEnd(End):
     """One end of a ROS connection. Each route in ``topics`` has its message type set."""
 
+    # The id of the node that listens; its address is `wan`, and its port is `port`
     listener: str
-    """The id of the node that listens; its address is ``wan``, and its port is ``port``."""
     wan: Wan
     port: int
 

@@ -33,11 +33,9 @@ from demandops.templating.values import SchemaTask, ValuesTask
 
 log = logging.getLogger("demandops")
 
+# How many seconds of processor time the evaluations of one demand may take together. The values of
+# a service with 8,000 topics take half of it.
 DEMAND_S = 0.5
-"""How many seconds of processor time the evaluations of one demand may take together.
-
-The values of a service with 8,000 topics take half of it.
-"""
 MEMORY_MIB = 512
 _MOST_IDLE = 2  # the worker's and the page's
 _LONGEST_ANSWER = 64_000_000
@@ -248,6 +246,6 @@ def _plain(value: object) -> object:
     raise TypeError(f"a {type(value).__name__} cannot be sent to a child")
 
 
+# The evaluator of this process
 EVALUATE = Evaluator()
-"""The evaluator of this process."""
 os.register_at_fork(after_in_child=EVALUATE.forget)

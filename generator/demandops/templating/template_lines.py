@@ -10,11 +10,9 @@ from demandops.errors import Fault
 
 _EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
 _PLACE = re.compile(r"line (\d+)")
+# The most characters that a searched line may have. The search for a longer line could take too
+# long.
 _LONGEST = 2_000
-"""The most characters that a searched line may have.
-
-The search for a longer line could take too long.
-"""
 _VALUES = "values."
 
 

@@ -66,11 +66,9 @@ class SchemaTask:
     origin: str = ""
 
 
+# Returns the values of a task, given the files that it may need: path → text. Raises InvalidInput
+# with the faults of what people wrote, or OverLimit if that takes too long.
 Evaluate = Callable[[Mapping[str, str], ValuesTask | SchemaTask], dict[str, Any]]
-"""Returns the values of a task, given the files that it may need: path → text.
-
-Raises InvalidInput with the faults of what people wrote, or OverLimit if that takes too long.
-"""
 
 
 def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:

@@ -23,23 +23,23 @@ class Service(Deployed):
     """A service of one appdef, with the origins of its inputs."""
 
     name: str
+    # The folder in `appdefs/` that has the service's definition
     folder: str
-    """The folder in ``appdefs/`` that has the service's definition."""
     shared: bool
     scope: Scope
+    # The origin of each input: a role of the appdef, or `<service>.<output>`
     inputs: dict[str, str]
-    """The origin of each input: a role of the appdef, or ``<service>.<output>``."""
     parameters: dict[str, Parameter]
+    # For a service that runs once for each topic of a role: that role
     root: str | None = None
-    """For a service that runs once for each topic of a role: that role."""
+    # If each instance has only one source: the roles of the source's topics that the instance
+    # reads, directly or through other services. Empty for any other service.
     roots: tuple[str, ...] = ()
-    """If each instance has only one source: the roles of the source's topics that the instance
-    reads, directly or through other services. Empty for any other service."""
+    # For a service that runs once for each cluster: the service's node in each cluster
     nodes: dict[str, str] = Field(default_factory=dict)
-    """For a service that runs once for each cluster: the service's node in each cluster."""
+    # For a service that runs once for each cluster: a map from the node of an application to the
+    # node of the service in the same cluster
     runs_at: dict[str, str] = Field(default_factory=dict)
-    """For a service that runs once for each cluster: a map from the node of an application to the
-    node of the service in the same cluster."""
 
     @property
     def at_source(self) -> bool:
@@ -66,11 +66,11 @@ class Service(Deployed):
         return f"appdefs/{self.folder}/{'service' if self.shared else 'appdef'}.yaml"
 
 
+# All services of an appdef, by name: those that it defines, and the shared ones that it uses
 Services: TypeAlias = "Mapping[str, Service]"
-"""All services of an appdef, by name: those that it defines, and the shared ones that it uses."""
 
+# The path of a field of an appdef, and a message about the field
 Problem: TypeAlias = "tuple[str, str]"
-"""The path of a field of an appdef, and a message about the field."""
 
 
 def resolved_services(

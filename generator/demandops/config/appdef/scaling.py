@@ -14,23 +14,19 @@ from demandops.config.durations import seconds_of
 from demandops.config.policy import Duration
 from demandops.errors import sentences
 
+# A number of replicas
 Count = Annotated[int, Field(ge=0, le=1000)]
-"""A number of replicas."""
 
+# A percentage of what a pod requests of a resource. It may be above 100, because a pod may use more
+# than it requests.
 Percent = Annotated[int, Field(ge=1, le=1000)]
-"""A percentage of what a pod requests of a resource.
 
-It may be above 100, because a pod may use more than it requests.
-"""
-
+# What the generator counts to get the number of replicas. Each replica serves up to a fixed number
+# of the counted things.
 Measure = Literal["topics", "sources", "claims", "requesters"]
-"""What the generator counts to get the number of replicas.
 
-Each replica serves up to a fixed number of the counted things.
-"""
-
+# The resource whose usage an autoscaler measures
 Resource = Literal["cpu", "memory"]
-"""The resource whose usage an autoscaler measures."""
 
 
 class Sizes(CamelModel):

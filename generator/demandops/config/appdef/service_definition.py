@@ -14,19 +14,17 @@ from demandops.config.inventory import LabelKey, LabelValue, NodeId, Resources
 from demandops.config.node_property import PropertyName, RequiredValue
 from demandops.errors import sentences, suggestion
 
+# The name of an output's topic. `{instance}` stands for the source, the application or the node
+# that the service runs for.
 TopicPattern = Annotated[
     str,
     StringConstraints(
         pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
     ),
 ]
-"""The name of an output's topic.
 
-``{instance}`` stands for the source, the application or the node that the service runs for.
-"""
-
+# The scope of a service: what each of its instances is for
 Scope = Literal["application", "topic", "node", "cluster"]
-"""The scope of a service: what each of its instances is for."""
 
 
 class Place(CamelModel):
