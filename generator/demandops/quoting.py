@@ -18,7 +18,6 @@ LONGEST_LINE = 4000
 _INVISIBLE = "\u034f\u115f-\u1160\u17b4-\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0"
 # Matches characters that are displayed as nothing, although Python calls them printable
 _HIDDEN = re.compile(f"[{_INVISIBLE}\U0001d159\U000e0100-\U000e01ef]")
-_BMP = 0xFFFF
 
 
 def is_visible(text: str) -> bool:
@@ -27,10 +26,7 @@ def is_visible(text: str) -> bool:
 
 
 def escaped(text: str, kept: str = "") -> str:
-    """Return text with an escape like ``\\u202e`` for each character that is not visible.
-
-    ``kept`` are characters that stay as they are.
-    """
+    """Return text with an escape like ``\\u202e`` for each character not visible or ``kept``."""
     if is_visible(text):
         return text
     return "".join(
@@ -56,58 +52,54 @@ _TRIGGER = re.compile(
 
 
 def harmless(text: str) -> str:
-    """Return text that no forge acts on, with an escape like ``\\x40`` in the place of ``@``.
-
-    Forges look into commit messages, titles and texts of pull requests: ``[skip ci]`` stops a
-    pipeline, ``Fixes #1`` closes an issue, ``@name`` calls a person.
-    """
-    return _TRIGGER.sub(lambda found: f"{found[0][:-1]}\\x{ord(found[0][-1]):02x}", text)
+    """Return text that no forge acts on, with an escape like ``\\x40`` in the place of ``@``."""
+    # Forges look into commit messages, titles and texts of pull requests: `[skip ci]` stops a
+    # pipeline, `Fixes #1` closes an issue, `@name` calls a person.
+    return _TRIGGER.sub(lambda match: f"{match[0][:-1]}\\x{ord(match[0][-1]):02x}", text)
 
 
 def clipped(text: str, most: int) -> str:
-    """Return text of at most ``most`` characters, with ``…`` if it was longer."""
     return text if len(text) <= most else text[: most - 1].rstrip() + "…"
 
 
 def one_line(text: str, most: int = LONGEST_LINE) -> str:
-    """Return text on one line: escaped, and cut to at most ``most`` characters."""
+    """Return text on one line: escaped and cut."""
+    # cut before the escape too, because a text of megabytes would be escaped character by character
     return clipped(escaped(text[: most + 1]), most)
 
 
 def lines(text: str) -> str:
-    """Return text of several lines, escaped except for line breaks and tabs."""
+    """Return text, escaped except for line breaks and tabs."""
     return escaped(text, kept="\n\t")
 
 
 def quoted(value: str, most: int = 80) -> str:
-    """Return a value on one line, cut to at most ``most`` characters and then put in quotes."""
+    """Return a value on one line, cut and then put in quotes."""
     return f"'{one_line(value, most)}'"
 
 
 def json_escaped(text: str) -> str:
-    """Return JSON text with each invisible character replaced by JSON's escape for it.
-
-    Line breaks stay. The result parses to the same data.
-    """
+    """Return JSON text of the same data, with JSON's escape for each invisible character."""
     if is_visible(text.replace("\n", "")):
         return text
     return "".join(
-        char if char == "\n" or is_visible(char) else _json_escape(char) for char in text
+        char
+        if char == "\n" or is_visible(char)
+        # beyond 16 bits, JSON needs two escapes, a surrogate pair, which json.dumps writes
+        else json.dumps(char)[1:-1]
+        if ord(char) > 0xFFFF
+        else f"\\u{ord(char):04x}"
+        for char in text
     )
-
-
-def _json_escape(char: str) -> str:
-    return json.dumps(char)[1:-1] if ord(char) > _BMP else f"\\u{ord(char):04x}"
 
 
 class OneLineFormatter(logging.Formatter):
     """Formats a log record as one line. A traceback follows on lines of its own."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """Return the record's line: the lines of its message are joined by ``; ``."""
         record.message = one_line("; ".join(record.message.splitlines()))
         return super().formatMessage(record)
 
     def formatException(self, info: Any) -> str:  # noqa: ANN401 - as the base class has it
-        """Return a traceback, indented, so that none of its lines looks like a log record."""
+        # indented, so that no line of it looks like a log record
         return lines(super().formatException(info)).replace("\n", "\n  ")

@@ -13,16 +13,13 @@ TopicKey: TypeAlias = "tuple[str, ...]"
 
 
 class SubjectKind(Enum):
-    """The kinds of subjects; the values are the ledger's folder names."""
-
+    # the values are the names of folders in ledger/
     APPLICATION = "applications"
     CONNECTION = "connections"
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """An application or a connection, by its exact id."""
-
     kind: SubjectKind
     id: str
 
