@@ -16,23 +16,20 @@ MAX_TOPIC = 247
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _MESSAGE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
+# Unicode's categories of control characters, of halves of characters, and of line separators
 _UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
+# characters that change the direction of the text after them
 _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
 def absolute_topic(topic: str) -> str:
-    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``.
-
-    An empty name and a private name (``~…``) stay unchanged, so :func:`topic_problem` refuses them.
-    """
+    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``."""
+    # an empty or private name (`~…`) stays as it is, so that `topic_problem` refuses it
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
 
 def control_character(text: str) -> str:
-    """Return the name of a text's first control character, like ``U+202E``, or an empty text.
-
-    Line separators, lone surrogates and characters that change the text's direction count too.
-    """
+    """Return the name of a text's first control character, like ``U+202E``, or an empty text."""
     if text.isprintable():  # Python calls no such character printable
         return ""
     for char in text:
@@ -42,11 +39,7 @@ def control_character(text: str) -> str:
 
 
 def id_problem(value: str) -> str:
-    """Return what is wrong with an id, or an empty string.
-
-    An id may be nearly any text of up to :data:`MAX_ID` characters. It must not contain invisible
-    characters or ``..``, and must not start or end with white space.
-    """
+    """Return what is wrong with an id, or an empty string."""
     if not value:
         return "is empty; give an id"
     if len(value) > MAX_ID:
@@ -81,10 +74,7 @@ def topic_problem(name: str) -> str:
 
 
 def message_type_problem(name: str) -> str:
-    """Return what is wrong with the name of a ROS 2 message type, or an empty string.
-
-    The name must include the package.
-    """
+    """Return what is wrong with the name of a ROS 2 message type, or an empty string."""
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
     return f"{quoted(name)} is not a message type; write it like std_msgs/msg/String"

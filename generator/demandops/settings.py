@@ -62,45 +62,34 @@ _CHECKOUT = _PACKAGE.parents[1]
 
 
 def data_folder(name: str) -> Path:
-    """Return the folder of packaged data: ``templates``, ``appdefs`` or ``skeleton``.
-
-    An installed wheel has these folders inside the package. In a checkout or an editable install
-    they are the repository's own top-level folders.
-    """
+    """Return the folder of packaged data: ``templates``, ``appdefs`` or ``skeleton``."""
     packaged = _PACKAGE / "_data" / name
-    if packaged.is_dir():
+    if packaged.is_dir():  # in an installed wheel
         return packaged
+    # in a checkout, or in an editable install of one
     return _CHECKOUT / {"skeleton": "state-repo-skeleton"}.get(name, name)
 
 
 def documentation() -> Path | None:
-    """Return the folder of the documentation's site, or None if it was not built.
-
-    The wheel of a published version contains the site. In a checkout, ``make docs`` builds it.
-    """
+    """Return the folder of the documentation's site, or None if it was not built."""
+    # the wheel of a published version contains the site; in a checkout, `make docs` builds it
     folders = (_PACKAGE / "_data" / "docs", _CHECKOUT / "build" / "site")
     return next((folder for folder in folders if (folder / "index.html").is_file()), None)
 
 
 def forge_token_file() -> Path | None:
-    """Return the file of the forge's token, which ``DEMANDOPS_FORGE_TOKEN_FILE`` names, or None."""
     named = os.environ.get("DEMANDOPS_FORGE_TOKEN_FILE")
     return Path(named).expanduser() if named else None
 
 
 def alive_file() -> Path | None:
-    """Return the file that ``DEMANDOPS_ALIVE_FILE`` names, or None; a generator touches it."""
+    """Return the file that a generator touches as long as it works, or None."""
     named = os.environ.get("DEMANDOPS_ALIVE_FILE")
     return Path(named).expanduser() if named else None
 
 
 def data_home(state_repo: str) -> Path:
-    """Return the folder of the generator's journal and clone for one state repo.
-
-    It is inside ``DEMANDOPS_DATA_HOME`` or, if that is not set, ``$XDG_STATE_HOME/demandops``
-    (``~/.local/state/demandops``). Its name is a digest of the state repo's address, because the
-    address may contain a password.
-    """
+    """Return the folder of the generator's journal and clone for one state repo."""
     if Path(state_repo).exists():  # all spellings of a path give the same folder
         state_repo = str(Path(state_repo).resolve())
     root = os.environ.get("DEMANDOPS_DATA_HOME")
@@ -109,4 +98,5 @@ def data_home(state_repo: str) -> Path:
     else:
         state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
         base = Path(state) / "demandops"
+    # a digest, because the address may contain a password
     return base / hashlib.sha256(state_repo.encode()).hexdigest()[:16]
