@@ -112,16 +112,14 @@ _FACTORS = {"m": 1, "": 1000} | {
 def amount_of(text: str) -> int:
     """Return a quantity of a resource in thousandths: 500 for ``500m``, 2000 for ``2``.
 
-    Raises:
-        ValueError: if the text is not a plain quantity (``2``, ``1.5``, ``16Gi``), or is finer than
-            a thousandth. Of Kubernetes' notations, exponents and the units above Ti are refused.
+    Of Kubernetes' notations, exponents and the units above Ti are refused, with a ValueError.
     """
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise ValueError(f"{quoted(text)} is not a quantity; write one like 2, 500m, 1.5 or 16Gi")
     whole, decimals, unit = match.groups(default="")
-    amount, rest = divmod(int(whole + decimals.ljust(3, "0")) * int(_FACTORS[unit]), 1000)
-    if rest:
+    amount, remainder = divmod(int(whole + decimals.ljust(3, "0")) * int(_FACTORS[unit]), 1000)
+    if remainder:
         raise ValueError(f"{quoted(text)} is finer than a thousandth; round it")
     return amount
 
@@ -132,8 +130,8 @@ def amount_text(amount: int, resource: str) -> str:
         for unit in ("Ti", "Gi", "Mi", "Ki"):
             if amount and amount % _FACTORS[unit] == 0:
                 return f"{amount // _FACTORS[unit]}{unit}"
-    whole, rest = divmod(amount, 1000)
-    return f"{whole}.{rest:03}".rstrip("0") if rest else str(whole)
+    whole, decimals = divmod(amount, 1000)
+    return f"{whole}.{decimals:03}".rstrip("0") if decimals else str(whole)
 
 
 def _plain_number(value: object) -> object:
@@ -286,11 +284,11 @@ class Node(CamelModel):
         return self
 
     def labels(self) -> dict[str, str]:
-        """Return the node selector: the labels that select the node in its cluster."""
+        """Return the labels that select the node in its cluster."""
         return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 
     def in_domain(self, further: FurtherDomain) -> Node:
-        """Return the node as it is in a further access domain."""
+        # `zenoh` and `wan` are not the node's own, because two programs cannot listen on one port
         return self.model_copy(
             update={
                 "id": id_in_domain(self.id, further.name),
@@ -303,21 +301,17 @@ class Node(CamelModel):
         )
 
     def most(self, resource: str) -> int | None:
-        """Return the node's capacity of a resource in thousandths; ``None`` means no limit.
-
-        A node without ``capacity`` limits no resource. A ``capacity`` without cpu or memory does
-        not limit cpu or memory. Of any other resource that ``capacity`` leaves out, the node has 0.
-        """
+        """Return the node's capacity of a resource in thousandths; ``None`` means no limit."""
         if self.capacity is None:
             return None
-        listed = self.capacity.get(resource)
-        if listed is not None:
-            return amount_of(listed)
+        if resource in self.capacity:
+            return amount_of(self.capacity[resource])
+        # every node has cpu and memory, but a resource such as a GPU only if it is listed
         return None if resource in ("cpu", "memory") else 0
 
 
 def id_in_domain(node: str, domain: str) -> str:
-    """Return the name of a node in a further access domain: ``<node>@<domain>``."""
+    """Return the name of a node in a further access domain."""
     return f"{node}@{domain}"
 
 

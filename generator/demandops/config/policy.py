@@ -39,9 +39,9 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
     return any(name == pattern or _compiled(pattern)(name) for pattern in patterns)
 
 
-@lru_cache(65_536)
+@lru_cache(65_536)  # a policy may have thousands, more than Python's own cache
 def _compiled(pattern: str) -> Callable[[str], object]:
-    """Return a function that matches one pattern; a policy may have thousands of them."""
+    # fnmatch has sets of characters, which begin with a bracket; here a bracket is only itself
     return re.compile(translate(pattern.replace("[", "[[]"))).match
 
 
@@ -204,13 +204,10 @@ class AccessDomain(CamelModel):
 
     @property
     def allowed_kinds(self) -> tuple[Kind, ...]:
-        """The kinds of objects that the domain's charts may have; the cluster enforces them.
-
-        Without ``kinds``, these are the kinds of ordinary charts. With ``network: namespace`` they
-        do not include NetworkPolicy, because a chart could use it to open the closed namespace.
-        """
+        """The kinds of objects that the domain's charts may have; the cluster enforces them."""
         if self.kinds is not None:
             return self.kinds
+        # with a NetworkPolicy, a chart could open the closed namespace
         without = {*NOT_BY_DEFAULT, *([_NETWORK_POLICY] if self.network == "namespace" else [])}
         return tuple(kind for name, kind in KINDS.items() if name not in without)
 
@@ -229,10 +226,10 @@ class AccessDomain(CamelModel):
     @property
     def allowed_resources(self) -> dict[str, list[str]]:
         """The resources of :attr:`allowed_kinds`, by API group."""
-        found: dict[str, list[str]] = {}
+        by_group: dict[str, list[str]] = {}
         for kind in self.allowed_kinds:
-            found.setdefault(kind.group, []).append(kind.resource)
-        return found
+            by_group.setdefault(kind.group, []).append(kind.resource)
+        return by_group
 
     @model_validator(mode="after")
     def _kinds_fit(self) -> AccessDomain:

@@ -31,6 +31,8 @@ def as_git_url(text: str) -> str:
     return f"ssh://{scp['user']}@{scp['host']}/{scp['path']}" if scp else text
 
 
+# The address is in files of the repo and in the clusters, so it must not hold a password. Git's
+# short form `user@host:path` is refused, because the controllers read only URLs.
 def _git_url_problem(text: str) -> str:
     if _GIT_URL.fullmatch(text):
         return ""

@@ -11,7 +11,6 @@ from pydantic import Field
 from demandops.config.appdef.application_definition import ApplicationDefinition
 from demandops.config.appdef.service_definition import (
     Deployed,
-    OwnService,
     Parameter,
     Scope,
     ServiceDefinition,
@@ -53,16 +52,12 @@ class Service(Deployed):
 
     @property
     def is_placeable(self) -> bool:
-        """Whether the generator may choose the service's node separately from the application's.
-
-        The result is true if each instance serves applications of only one appdef, and the service
-        does not run at its sources.
-        """
+        """Whether the generator may choose the service's node separately from the application's."""
+        # an instance of another service serves applications of several appdefs
         return self.scope == "application" or not (self.shared or self.at_source)
 
     @property
     def file(self) -> str:
-        """The file that defines the service."""
         return f"appdefs/{self.folder}/{'service' if self.shared else 'appdef'}.yaml"
 
 
@@ -82,7 +77,8 @@ def resolved_services(
     """
     services = {
         name: Service.model_construct(
-            **{**dict(own), "inputs": _with_each(own)},
+            # a role in `each` is an input, even if `inputs` lacks it
+            **{**dict(own), "inputs": ({own.each: own.each} if own.each else {}) | own.inputs},
             name=name,
             folder=appdef.name,
             shared=False,
@@ -99,10 +95,10 @@ def resolved_services(
     if problems:
         return {}, problems
     graph = {
-        name: [origin.partition(".")[0] for origin in one.inputs.values() if "." in origin]
-        for name, one in services.items()
+        name: [origin.partition(".")[0] for origin in service.inputs.values() if "." in origin]
+        for name, service in services.items()
     }
-    try:
+    try:  # the roots of a service follow from those of the services that it reads
         order = list(TopologicalSorter(graph).static_order())
     except CycleError as error:
         circle = " reads ".join(f"'{name}'" for name in reversed(error.args[1]))
@@ -113,17 +109,13 @@ def resolved_services(
     return ({}, problems) if problems else (services, [])
 
 
-def _with_each(service: OwnService) -> dict[str, str]:
-    return ({service.each: service.each} if service.each else {}) | service.inputs
-
-
 def _unbound(
     appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
 ) -> Iterator[Problem]:
     for name, bound in appdef.uses.items():
         if name not in definitions:
-            known = suggestion(name, definitions)
-            yield f"uses.{name}", f"appdefs/{name}/service.yaml does not exist; add it{known}"
+            hint = suggestion(name, definitions)
+            yield f"uses.{name}", f"appdefs/{name}/service.yaml does not exist; add it{hint}"
             continue
         inputs = definitions[name].inputs
         for role in inputs.keys() - bound.keys():
@@ -133,21 +125,21 @@ def _unbound(
                 "<service>.<output>",
             )
         for role in bound.keys() - inputs.keys():
-            known = suggestion(role, inputs)
-            yield f"uses.{name}.{role}", f"'{name}' has no input '{role}'; leave it out{known}"
+            hint = suggestion(role, inputs)
+            yield f"uses.{name}.{role}", f"'{name}' has no input '{role}'; leave it out{hint}"
 
 
 def _unknown(appdef: ApplicationDefinition, services: Services) -> Iterator[Problem]:
     for service in services.values():
         for role, origin in service.inputs.items():
             name, _, output = origin.partition(".")
-            known = services[name].outputs if name in services else services
+            outputs = services[name].outputs if name in services else {}
             if not output and origin not in appdef.inputs:
                 problem = f"'{origin}' is not an input{suggestion(origin, appdef.inputs)}"
             elif output and name not in services:
                 problem = f"'{name}' is not a service{suggestion(name, services)}"
-            elif output and output not in known:
-                problem = f"'{name}' has no output '{output}'{suggestion(output, known)}"
+            elif output and output not in outputs:
+                problem = f"'{name}' has no output '{output}'{suggestion(output, outputs)}"
             else:
                 continue
             yield _place(service, role), problem
@@ -161,10 +153,7 @@ def _place(service: Service, role: str) -> str:
 
 
 def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
-    """Set ``root`` and ``roots`` of a service, and yield the problems.
-
-    The services whose outputs this service reads must have their roots already.
-    """
+    """Set ``root`` and ``roots`` of a service, after those of the services that it reads."""
     service, root = services[name], None
     made_from: dict[str, tuple[str, ...]] = {}
     for role, origin in service.inputs.items():
@@ -205,7 +194,7 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
                     "or the node",
                 )
     elif service.at_source:
-        roots = tuple(sorted({one for of in made_from.values() for one in of}))
+        roots = tuple(sorted({role for roles in made_from.values() for role in roles}))
         if not roots:
             yield (
                 f"uses.{name}",

@@ -141,8 +141,8 @@ class ServiceDefinition(Deployed, FileModel):
         if (self.each is None) is (self.scope == "topic"):
             raise ValueError("scope 'topic' needs 'each', and no other scope may have 'each'")
         if self.each and self.each not in self.inputs:
-            known = suggestion(self.each, self.inputs)
-            raise ValueError(f"each: '{self.each}' is not an input{known}")
+            hint = suggestion(self.each, self.inputs)
+            raise ValueError(f"each: '{self.each}' is not an input{hint}")
         if self.placement == "source" and self.scope == "application":
             raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
         if self.place and self.scope != "application":
@@ -172,5 +172,5 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)
-        known = suggestion(str(parameter.default), sizes.replicas)
-        yield f"{place}: '{name}' has the default {default}, which is not a size{known}"
+        hint = suggestion(str(parameter.default), sizes.replicas)
+        yield f"{place}: '{name}' has the default {default}, which is not a size{hint}"
