@@ -50,11 +50,9 @@ class Zenoh(ConnectionType):
                 ).within(file)
 
     def shares_clients(self, config: Config) -> bool:
-        """Return whether any node has a bridge: a bridge may carry several connections."""
         return any(node.zenoh for node in config.nodes.values())
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault if an end has no bridge, or if the two bridges cannot reach each other."""
         source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
         if source is None or target is None:
             return
@@ -80,14 +78,9 @@ class Zenoh(ConnectionType):
             )
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
-        """Return the keys of both nodes' bridges."""
         return ClientKey(self, source), ClientKey(self, target)
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Bridge | None:
-        """Return a node's bridge, the client of all its Zenoh connections.
-
-        Return ``None`` if they carry no topic.
-        """
         publishers: dict[str, tuple[float, str]] = {}
         subscribers: set[str] = set()
         peers: dict[str, str] = {}
@@ -132,11 +125,7 @@ ZENOH = Zenoh()
 
 
 def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
-    """Return the endpoints that a bridge connects to: its routers, and some of its peers.
-
-    If two peers can reach each other, only the peer whose id sorts first connects to the other. So
-    there is only one link between the two.
-    """
+    """Return the endpoints that a bridge connects to: its routers, and some of its peers."""
     if node.zenoh is None:
         message = (
             f"'{node.id}' carries Zenoh connections, but has no 'zenoh' in "
@@ -147,6 +136,7 @@ def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
     for id in peers:
         peer = config.nodes.get(id)
         endpoint = peer.zenoh.endpoint if peer and peer.zenoh else None
+        # if both can reach the other, only the first connects, so that there is only one link
         if endpoint and (not node.zenoh.endpoint or node.id < id):
             endpoints.add(endpoint)
     return tuple(sorted(endpoints))
@@ -169,11 +159,9 @@ class Bridge(Client):
 
     @property
     def description(self) -> str:
-        """The bridge's description, which names the node."""
         return f"Zenoh bridge on {self.node.id}"
 
     def facts(self) -> list[str]:
-        """Return the bridge's connections, topics and rates, and the endpoints it connects to."""
         return [
             *(f"connection {id}" for id in self.connections),
             *(f"reads {topic}" for topic in self.publishers),
@@ -183,12 +171,8 @@ class Bridge(Client):
         ]
 
     def configuration(self) -> dict[str, Any]:
-        """Return the configuration of a node's bridge.
-
-        ``allow`` lists the topics that pass. If ``allow`` lacks ``publishers`` or ``subscribers``,
-        no topic of that kind passes. Multicast scouting is off, because the state repo defines
-        which bridges connect.
-        """
+        """Return the configuration of a node's bridge."""
+        # if `allow` lacks `publishers` or `subscribers`, no topic of that kind passes
         lists = {"publishers": self.publishers, "subscribers": self.subscribers}
         ros: dict[str, Any] = {
             "nodename": naming.ros_name(self.name),
@@ -207,12 +191,12 @@ class Bridge(Client):
             "mode": "router",
             "connect": {"endpoints": list(self.connect)},
             "listen": {"endpoints": list(self.listen)},
+            # the state repo defines which bridges connect
             "scouting": {"multicast": {"enabled": False}},
             "plugins": {"ros2dds": ros},
         }
 
     def written(self, configuration: Mapping[str, Any]) -> str:
-        """Return a configuration as JSON."""
         return json.dumps(configuration, indent=2, ensure_ascii=False) + "\n"
 
 
