@@ -13,7 +13,6 @@ _PLACE = re.compile(r"line (\d+)")
 # The most characters that a searched line may have. The search for a longer line could take too
 # long.
 _LONGEST = 2_000
-_VALUES = "values."
 
 
 class TemplateLines:
@@ -26,36 +25,29 @@ class TemplateLines:
 
     def located(self, fault: Fault) -> Fault:
         """Return a fault of the rendered text, with the template's line if this line is known."""
+        if fault.line:
+            return fault
         place = _PLACE.match(fault.field)
-        number = int(place[1]) if place else self._number_of(fault.field.removeprefix(_VALUES))
-        return replace(fault, line=fault.line or (self._line_of(number) if number else None))
-
-    def _number_of(self, path: str) -> int | None:
-        if self._fields is None:
-            self._fields = field_lines.lines(self._text)
-        return field_lines.nearest(path, self._fields)
-
-    def _line_of(self, number: int) -> int | None:
-        """Return the number of the template's line that produced a line of the rendered text.
-
-        If the template has an identical line, lines with expressions are not tried. Return None if
-        no line of the template, or more than one, may have produced the rendered line.
-        """
-        if number > len(self._rendered) or len(self._rendered[number - 1]) > _LONGEST:
-            return None
+        if place:
+            number: int | None = int(place[1])
+        else:
+            if self._fields is None:
+                self._fields = field_lines.lines(self._text)
+            number = field_lines.nearest(fault.field.removeprefix("values."), self._fields)
+        if not number or number > len(self._rendered):
+            return fault
         rendered = self._rendered[number - 1]
+        if len(rendered) > _LONGEST:
+            return fault
         lines = [*enumerate(self._template, 1)]
         same = [at for at, line in lines if line == rendered]
-        found = same or [at for at, line in lines if _may_write(line, rendered)]
-        return found[0] if len(found) == 1 else None
+        candidates = same or [at for at, line in lines if _may_write(line, rendered)]
+        # a wrong line would mislead, so of several none is named
+        return replace(fault, line=candidates[0]) if len(candidates) == 1 else fault
 
 
 def _may_write(line: str, rendered: str) -> bool:
-    """Return whether a line of a template may have produced a rendered line.
-
-    The template's line must have expressions, and the rendered line must contain all text around
-    these expressions in the same order.
-    """
+    """Return whether ``rendered`` has all text around the expressions of a template's line."""
     first, *others = _EXPRESSION.split(line)
     if not others or not "".join((first, *others)).strip() or not rendered.startswith(first):
         return False

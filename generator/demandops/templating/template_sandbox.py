@@ -48,6 +48,7 @@ _METHODS: dict[type, list[str]] = {
 }
 _BUILT_IN = (str, int, float, bytes, dict, list, tuple, range)
 _VIEWS = (KeysView, ItemsView, ValuesView)
+# the text of StrictUndefined is an error of its own, which names what is missing
 _PLAIN = (str, int, float, type(None), range, Undefined)
 
 
@@ -111,22 +112,18 @@ class _Concatenations(NodeTransformer):
 class Sandbox(ImmutableSandboxedEnvironment):
     """Jinja's sandbox, with the filters and methods that this module lists."""
 
-    intercepted_binops = frozenset({"%"})
+    intercepted_binops = frozenset({"%"})  # the format `%s` would write anything as text
 
     def __init__(self, filters: Mapping[str, Callable[..., Any]], **options: Any) -> None:  # noqa: ANN401
-        """Create a sandbox whose templates may use ``filters``, besides Jinja's that are listed.
-
-        ``options`` are those of Jinja's environment.
-        """
         super().__init__(**options)
-        written = self.finalize
-        assert written is not None  # noqa: S101 - our own options
-        self.finalize = lambda value: written(_as_data(value))
-        kept = {name: self.filters[name] for name in _FILTERS}
-        named = {**kept, **filters, "_concatenated": _concatenated}
-        self.filters = {name: _of_data(function) for name, function in named.items()}
+        finalize = self.finalize
+        assert finalize is not None  # noqa: S101 - our own options
+        self.finalize = lambda value: finalize(_as_data(value))
+        listed = {name: self.filters[name] for name in _FILTERS}
+        allowed = {**listed, **filters, "_concatenated": _concatenated}
+        self.filters = {name: _of_data(function) for name, function in allowed.items()}
         del self.tests["sameas"]  # whether two values are one object is an accident
-        del self.globals["lipsum"]
+        del self.globals["lipsum"]  # writes random text
 
     def _parse(self, source: str, name: str | None, filename: str | None) -> nodes.Template:
         tree: nodes.Template = _Concatenations(self).visit(super()._parse(source, name, filename))

@@ -50,7 +50,7 @@ class ValuesTask:
 
     @property
     def file(self) -> str:
-        """The file that is named if the task takes too long."""
+        # named if the task takes too long
         return self.template
 
 
@@ -72,14 +72,13 @@ Evaluate = Callable[[Mapping[str, str], ValuesTask | SchemaTask], dict[str, Any]
 
 
 def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:
-    """Return the values of a task, computed in this process and without limits."""
     if isinstance(task, SchemaTask):
         validator(files[task.file], task.file)
         if task.values is not None:
             chart = task.file.rpartition("/")[0]
             _check(task.values, chart, files, task.origin, "the values")
         return {}
-    lines = None
+    lines = None  # not known if the template itself fails
     try:
         text = _rendered(files, task)
         lines = TemplateLines(files[task.template], text)
@@ -99,8 +98,6 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
 
 
 class _FilesLoader(BaseLoader):
-    """Loads templates by their path in the state repo."""
-
     def __init__(self, files: Mapping[str, str]) -> None:
         self._files = files
 
@@ -169,15 +166,12 @@ def _mapping(text: str, template: str) -> dict[str, Any]:
 def _check(
     values: Mapping[str, Any], chart: str, files: Mapping[str, str], origin: str, author: str
 ) -> None:
-    """Raise InvalidInput if values do not match a chart's schema.
-
-    Like Helm, first merge the values into the chart's defaults, because a schema may require a
-    value that has a default. The faults name the file ``origin``, which the values come from.
-    """
+    """Raise InvalidInput, for the file ``origin``, if values do not match a chart's schema."""
     path = f"{chart}/values.schema.json"
     if path not in files:
         return
     schema = validator(files[path], path)
+    # as Helm does, because a schema may require a value that has a default
     merged = chart_files.merged(chart_files.defaults(chart, files), values)
     faults = [
         fault(
@@ -192,18 +186,13 @@ def _check(
 
 @lru_cache(maxsize=256)
 def validator(text: str, file: str) -> Any:  # noqa: ANN401
-    """Return the validator for a schema, given the text and the path of the schema's file.
-
-    Its patterns are matched in linear time, so look-arounds and back references are faults.
-
-    Raises:
-        InvalidInput: if ``text`` is not a valid schema, or refers to another document.
-    """
+    """Return the validator for a schema; one that refers to another document is a fault."""
     try:
         schema = json.loads(text)
         draft = str(schema.get("$schema")) if isinstance(schema, dict) else ""
         faults = list(_foreign(schema, (), "id" if "draft-04" in draft else "$id"))
         if not faults:
+            # patterns in linear time, as Helm's Go has them, without look-arounds
             options = jsonschema_rs.RegexOptions()
             return jsonschema_rs.validator_for(schema, retriever=_refuse, pattern_options=options)
     except RecursionError:
@@ -221,10 +210,7 @@ def _refuse(uri: str) -> None:
 
 
 def _foreign(schema: object, place: tuple[int | str, ...], id: str) -> Iterator[Fault]:
-    """Yield a fault for each reference to another document, and for each ``id`` below the root.
-
-    Such an id would change what a reference with ``#`` means within its part.
-    """
+    """Yield a fault for each reference to another document, and for each ``id`` below the root."""
     if isinstance(schema, dict):
         for key, part in schema.items():
             if not isinstance(part, str):
@@ -235,7 +221,7 @@ def _foreign(schema: object, place: tuple[int | str, ...], id: str) -> Iterator[
                     "followed, so copy the definition here"
                 )
                 yield fault(field_path((*place, key)), message)
-            elif key == id and place:
+            elif key == id and place:  # it would change what a reference with # means in its part
                 message = "only the whole schema may have an id; remove it, and refer by '#/…'"
                 yield fault(field_path((*place, key)), message)
     elif isinstance(schema, list):
