@@ -42,7 +42,6 @@ class Fault:
         object.__setattr__(self, "message", one_line(self.message))
 
     def __str__(self) -> str:
-        """Return ``file:line: field: message`` on one line, without the empty parts."""
         places = (one_line(place) for place in (self.place, self.field))
         return ": ".join(part for part in (*places, self.message) if part)
 
@@ -96,7 +95,6 @@ class InvalidInput(DemandOpsError):
         return "\n".join(str(fault) for fault in self.faults)
 
     def text_with_codes(self) -> str:
-        """Return one line for each fault: ``<code>: `` and the fault's text."""
         return "\n".join(f"{fault.code}: {fault}" for fault in self.faults)
 
     @classmethod

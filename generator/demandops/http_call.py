@@ -77,7 +77,7 @@ def call(
         trust = ssl.create_default_context()
     end = REAL.monotonic() + 2 * timeout
     try:
-        with (
+        with (  # httpx follows no redirect by itself, and so takes no token to another host
             httpx.Client(verify=trust, timeout=timeout) as client,
             client.stream(method, url, headers=headers, content=body) as answer,
         ):

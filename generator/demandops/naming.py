@@ -16,7 +16,8 @@ import re
 from functools import lru_cache
 
 MAX_NAME = 53  # Helm's limit for a release name
-_HASH = 12  # 48 bits
+# 48 bits: a longer hash would only raise the price of a search, and people read names
+_HASH = 12
 
 # a name that ends like a hash gets a hash of its own, or another id could be shortened to it
 _LOOKS_HASHED = re.compile(rf"(^|.*[-_])[0-9a-f]{{{_HASH}}}")
@@ -29,7 +30,6 @@ MOST_DIGITS = 64
 
 
 def hash_of(exact: str, digits: int) -> str:
-    """Return the first hexadecimal digits of the SHA-256 of a text."""
     # only a trailer of a forged commit may have half a character
     data = exact.encode(errors="surrogatepass")
     return hashlib.sha256(data).hexdigest()[: min(digits, MOST_DIGITS)]
@@ -69,6 +69,7 @@ def topic_part(id: str, extra: str = "") -> str:
     of one source; such a name has a hash.
     """
     plain = re.sub("[-/]", "_", id)
+    # exactly the reference's name, so that subscribers of a fleet that moves over still hear it
     if not extra and len(id) <= _MAX_TOKEN and _TOPIC_TOKEN.fullmatch(plain):
         return plain
     words = re.sub(r"[^A-Za-z0-9]+", "_", f"{id}_{extra}" if extra else id).strip("_")[:80]

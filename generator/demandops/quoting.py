@@ -63,7 +63,6 @@ def clipped(text: str, most: int) -> str:
 
 
 def one_line(text: str, most: int = LONGEST_LINE) -> str:
-    """Return text on one line: escaped and cut."""
     # cut before the escape too, because a text of megabytes would be escaped character by character
     return clipped(escaped(text[: most + 1]), most)
 
@@ -74,7 +73,6 @@ def lines(text: str) -> str:
 
 
 def quoted(value: str, most: int = 80) -> str:
-    """Return a value on one line, cut and then put in quotes."""
     return f"'{one_line(value, most)}'"
 
 

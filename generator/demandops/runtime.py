@@ -102,7 +102,6 @@ class Runtime:
             log.error("internal error in %s: %s", name, _reason(error), exc_info=error)
 
     def recovered(self, name: str) -> None:
-        """Record that the work of a thread succeeded."""
         if self._failures.pop(name, None):
             log.info("%s works again", name)
 

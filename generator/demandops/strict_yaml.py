@@ -25,6 +25,7 @@ from demandops.errors import Fault, InvalidInput
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
+# Finds texts that every parser reads as text without quotes, except for a few words
 _PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*(?:[:@=][A-Za-z0-9_./-]+)*")
 _WORDS = frozenset(
     ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
@@ -116,6 +117,7 @@ class _Parser:
     def _value(self, event: Any, depth: int) -> Any:  # noqa: ANN401
         kind = type(event)
         if kind is yaml.AliasEvent or event.anchor:
+            # a few lines of aliases of aliases would grow to more than the memory holds
             where = f"line {event.start_mark.line + 1}"
             message = "anchors and aliases (& and *) are not allowed; write the value out"
             raise InvalidInput.at(where, message)
@@ -139,9 +141,9 @@ class _Parser:
         mapping: dict[str, Any] = {}
         while type(event := self._next()) is not yaml.MappingEndEvent:
             key = self._value(event, depth + 1)
-            if not isinstance(key, str):
+            if not isinstance(key, str):  # YAML 1.1 reads the key `on` as true
                 raise _problem(f"the key {short_repr(key)} must be text; put it in quotes", event)
-            if key in mapping:
+            if key in mapping:  # parsers differ in which of the two counts
                 raise _problem(f"the key {key!r} appears twice; remove one", event)
             mapping[key] = self._value(self._next(), depth + 1)
         return mapping
@@ -300,6 +302,7 @@ def _only_document(text: str) -> Any:  # noqa: ANN401
 
 
 def dump(data: Mapping[str, Any]) -> str:
+    """Return ``data`` as block YAML, in its order."""
     try:
         return _block(data, "").lstrip("\n ") + "\n"
     except _NotSimple:
@@ -365,6 +368,7 @@ def set_key(text: str, key: str, value: object) -> str:
     else:
         newline = "" if text.endswith("\n") else "\n"
         added = f"{newline}\n{dump({key: value})}"
+        # a file from Windows keeps its line ends
         changed = text + (added.replace("\n", "\r\n") if "\r\n" in text else added)
     try:  # the text may have other forms than those above, such as flow style
         succeeded = load(changed) == {**load(text), key: value}

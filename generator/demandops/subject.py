@@ -24,5 +24,4 @@ class Subject:
     id: str
 
     def __str__(self) -> str:
-        """Return the kind and the id, for example ``application 'edge/fusion'``."""
         return f"{self.kind.value[:-1]} '{self.id}'"

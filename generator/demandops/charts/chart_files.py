@@ -70,7 +70,6 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def below(folder: str, paths: Sequence[str]) -> Sequence[str]:
-    """Return those of the sorted ``paths`` that are in a folder."""
     # "0" is the character after "/"
     return paths[bisect_left(paths, f"{folder}/") : bisect_left(paths, f"{folder}0")]
 
@@ -170,7 +169,6 @@ def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
 
 
 def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield the faults in the metadata of a chart or library."""
     path = f"{folder}/Chart.yaml"
     for place, name in _metadata(folder, files.get(path, ""))[1]:
         message = f"{name} is not a name that Helm allows; use letters, digits, '-', '_' and '.'"

@@ -220,7 +220,6 @@ class Config:
         return None
 
     def versions_of(self, appdef: str) -> list[str]:
-        """Return the channels and versions that a demand for this appdef may request."""
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
@@ -230,7 +229,6 @@ class Config:
         return self.place_of(CHARTS_FILE)
 
     def users_of(self, service: str) -> list[str]:
-        """Return the appdefs that have a service of this name."""
         return [appdef for appdef, services in self.services.items() if service in services]
 
     def parameters_of(self, appdef: str) -> set[str]:

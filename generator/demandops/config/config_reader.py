@@ -112,7 +112,6 @@ class ConfigReader:
             self.add_fault(file, f"{field}{dot_key}", f"'{name}' is in {other} too; remove one")
 
     def entry_files(self) -> dict[str, dict[str, str]]:
-        """Return each entry's file, by collection and entry."""
         return {
             collection: {name: file for name, (file, _) in places.items()}
             for collection, places in self._places.items()
@@ -128,7 +127,6 @@ class ConfigReader:
         return self._places[collection][name]
 
     def add_alias(self, collection: str, name: str, item: str) -> None:
-        """Register ``name`` as a further name of ``item``."""
         self._places[collection][name] = self._places[collection][item]
 
     def is_complete(self, collection: str) -> bool:

@@ -199,6 +199,7 @@ class Toleration(CamelModel):
 Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp", "image"]
 
 
+# DDS computes its ports from the number; with a higher one they would be above 65535
 RosDomainId = Annotated[int, Field(ge=0, le=232)]
 
 
@@ -284,7 +285,6 @@ class Node(CamelModel):
         return self
 
     def labels(self) -> dict[str, str]:
-        """Return the labels that select the node in its cluster."""
         return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 
     def in_domain(self, further: FurtherDomain) -> Node:
@@ -311,7 +311,6 @@ class Node(CamelModel):
 
 
 def id_in_domain(node: str, domain: str) -> str:
-    """Return the name of a node in a further access domain."""
     return f"{node}@{domain}"
 
 

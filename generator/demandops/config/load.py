@@ -144,7 +144,8 @@ def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]
     clients, files = DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of(CLIENTS_FILE):
         part = reader.read_file(file, ClientsFile)
-        for word in part.connection_types if part else ():
+        words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
+        for word in sorted(words):
             first = files.setdefault(word, file)
             if first != file:
                 reader.add_duplicate(word, (first, word), (file, word))
@@ -253,8 +254,11 @@ def _in_further_domains(
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
     """Return nodes, domains and hosts, with a node ``<id>@<domain>`` for each further domain."""
+    # Everything follows from the node: namespace, rules, quotas, keys of releases. A domain beside
+    # each node would have to be asked for at each place, and a place that forgets it would mix the
+    # data of two domains.
     nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
-    for node in [node for node in nodes.values() if node.access_domains]:
+    for node in [node for node in nodes.values() if node.access_domains]:  # `nodes` grows
         file, place = reader.place_of(NODES_FILE, node.id)
         first = domain_of.get(node.id)
         ros = {_in_ros_domain(node, first).ros.domain_id: first.name} if first else {}
@@ -283,6 +287,7 @@ def _in_further_domains(
                         "'ros: {domainId: …}' in " + reader.place_of(DOMAINS_FILE, domain.name)[0]
                     )
                     reader.add_fault(file, f"{where}.name", message)
+                # the first domain keeps the plain name, so a further one changes nothing that runs
                 nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
                 reader.add_alias(NODES_FILE, id, node.id)
     return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
@@ -314,7 +319,7 @@ def _domains_of_nodes(
             matching.setdefault(name, pattern)
             if len(matching) > _MOST_DOMAINS:
                 break
-        if len(matching) > 1:
+        if len(matching) > 1:  # an overlap by accident must not move the node
             by = " and ".join(
                 f"'{name}' by {quoted(pattern)} in {reader.place_of(DOMAINS_FILE, name)[0]}"
                 for name, pattern in sorted(matching.items())[:_MOST_DOMAINS]

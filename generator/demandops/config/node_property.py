@@ -102,7 +102,6 @@ def comparable_kind(value: object) -> Kind | None:
 
 @lru_cache(maxsize=1024)
 def read_condition(text: str) -> PropertyCondition | None:
-    """Return the condition that a text states, or ``None`` if the text is not a condition."""
     match = _CONDITION.fullmatch(text)
     condition = PropertyCondition(*match.groups()) if match else None
     if condition and condition.sign != "=" and _number(condition.value) is None:

@@ -217,7 +217,6 @@ class OverrideFile(FileModel):
 
     @property
     def end(self) -> datetime | None:
-        """The time at which the override ends, or ``None`` if it has no end."""
         return parse_time(self.expires) if self.expires else None
 
 
@@ -228,7 +227,6 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
     @classmethod
     def from_file(cls, name: str, file: OverrideFile) -> Override:
-        """Return the override in a parsed file."""
         return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
 
     def __eq__(self, other: object) -> bool:
@@ -241,7 +239,6 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
     @property
     def rank(self) -> tuple[int, str]:
-        """The higher rank wins."""
         return (self.priority, self.name)
 
 
@@ -310,6 +307,6 @@ def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) ->
     return [
         override
         for name, override in overrides.items()
-        # with a new expiry, an ended override is active again
+        # a person who extends an ended override gives it a new expiry, and so it is active again
         if override.end is None or ended.get(name) != format_time(override.end)
     ]

@@ -225,7 +225,6 @@ class AccessDomain(CamelModel):
 
     @property
     def allowed_resources(self) -> dict[str, list[str]]:
-        """The resources of :attr:`allowed_kinds`, by API group."""
         by_group: dict[str, list[str]] = {}
         for kind in self.allowed_kinds:
             by_group.setdefault(kind.group, []).append(kind.resource)

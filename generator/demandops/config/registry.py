@@ -95,7 +95,6 @@ class Chart(ChartSource):
         return next((source for source in self.sources() if source.version == version), None)
 
     def versions(self) -> tuple[str, ...]:
-        """Return the channels and versions that :meth:`at` accepts."""
         return (*self.channels, *(source.version for source in self.sources()))
 
 
@@ -125,7 +124,6 @@ class Image(FrozenModel):
         return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
 
     def reference(self) -> str:
-        """Return the image's reference, by digest if it has one."""
         return (
             f"{self.repository}@{self.digest}" if self.digest else f"{self.repository}:{self.tag}"
         )
@@ -167,7 +165,6 @@ class ImagePin(FrozenModel):
         return self
 
     def over(self, image: Image) -> Image:
-        """Return ``image`` with the fields of this pin in place of its own."""
         # a digest would win over a new tag, and a tag would misname a new digest
         pins_anew = self.tag or self.digest
         return Image(
@@ -245,6 +242,7 @@ class ApplicationVersion:
     @cached_property
     def rank(self) -> tuple[Precedence, ...]:
         """The key that sorts the versions of a definition; equal keys mean the same version."""
+        # without a list of versions, a version is that of the charts
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 
@@ -313,11 +311,6 @@ class ClientsFile(FileModel):
     mqtt: MqttClientSettings = MqttClientSettings()
     zenoh: ClientSettings = ClientSettings()
     ros: ClientSettings = ClientSettings()
-
-    @property
-    def connection_types(self) -> tuple[str, ...]:
-        """The connection types for which the file has settings."""
-        return tuple(sorted(self.model_fields_set - {"apiVersion", "kind"}))
 
     def of(self, connection_type: str) -> ClientSettings:
         """Return the settings of a connection type, which is a word like ``mqtt``."""

@@ -71,6 +71,7 @@ class ArgoCd(FrozenModel):
     namespace: DnsLabel = "argocd"
 
 
+# A token is sent there, so plain HTTP is only for this machine
 _WEB_URL = re.compile(
     r"(https://[^\s:@/?#]+|http://(127\.0\.0\.1|localhost|\[::1\]))(:\d+)?(/[^\s?#]*)?"
 )

@@ -64,7 +64,6 @@ class Connection:
         return replace(self, topics=merged_routes(self.topics))
 
     def extended(self, more: Connection) -> Connection:
-        """Return the topics of both as one connection, which else is as ``more`` has it."""
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)
 

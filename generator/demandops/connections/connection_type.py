@@ -83,7 +83,6 @@ class Client(ABC):
         return configuration
 
     def settings(self, config: Config) -> ClientSettings:
-        """Return the settings with which the client runs, patched by overrides."""
         settings = config.clients.of(self.type.word)
         for file, patch in self.shaping.patches:
             settings = patched_settings(settings, patch, file)
@@ -177,7 +176,6 @@ class ConnectionType(ABC):
         return iter(())
 
     def shares_clients(self, config: Config) -> bool:
-        """Return whether a client may carry several connections."""
         return False
 
     @abstractmethod
@@ -235,7 +233,7 @@ def make_end(
     config: Config,
     **more: Any,  # noqa: ANN401 - any field
 ) -> AnyEnd:
-    """Return one end of a connection; ``more`` has the fields that only the class ``end`` has."""
+    """Return one end of a connection; ``more`` has the fields that its own class adds."""
     own, peer = connection.source, connection.target
     if key.side == "target":
         own, peer = peer, own

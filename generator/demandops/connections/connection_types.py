@@ -18,12 +18,12 @@ from demandops.connections.zenoh import ZENOH
 from demandops.errors import Fault, fault, sentences
 from demandops.identifiers import topic_problem
 
-# All connection types, in the order of the automatic choice
+# All connection types, in the order of the automatic choice. The ledger records the choice, so a
+# later change of the inventory does not change the type of a connection.
 CONNECTION_TYPES: tuple[ConnectionType, ...] = (ZENOH, MQTT, ROS)
 
 
 def type_numbered(number: int) -> ConnectionType | None:
-    """Return the type with this number in ``DeploymentRequest``, or ``None`` if no type has it."""
     return next((kind for kind in CONNECTION_TYPES if kind.number == number), None)
 
 

@@ -50,7 +50,6 @@ class Mqtt(ConnectionType):
     speaks_dds = False
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield a fault if there is a broker, but no image for the clients."""
         if config.brokers and reader.is_missing(IMAGES_FILE, self.image):
             message = f"'{self.image}' is missing; add it, because MQTT connections run it"
             yield fault("images", message).within(IMAGES_FILE)
@@ -126,7 +125,6 @@ MQTT = Mqtt()
 
 
 def choose_broker(connection: Connection, config: Config) -> Broker | None:
-    """Return the broker of a connection, or ``None`` if no broker fits."""
     # as the reference chooses: the only broker, or else the named one, then that of an end
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))
@@ -164,7 +162,6 @@ class MqttEnd(End):
         return variables
 
     def configuration(self) -> dict[str, Any]:
-        """Return the content of one end's ROS parameter file."""
         # An MQTT topic is named after the connection and the source topic, because the name of the
         # ROS topic may differ between the ends.
         bridge: dict[str, Any] = {}
@@ -191,6 +188,8 @@ class MqttEnd(End):
             if self.broker.tls.ca_secret:
                 broker["tls"]["ca_certificate"] = CA_FILE
         parameters = {"broker": broker, "client": {"id": self.name}, "bridge": bridge}
+        # ROS merges the entries of all wildcards: the init container adds user name and password
+        # under /**
         return {"/**/*": {"ros__parameters": parameters}}
 
 

@@ -135,7 +135,6 @@ class RosEnd(End):
         return [*End.facts(self), f"address {self.wan.host}:{self.port}"]
 
     def configuration(self) -> dict[str, Any]:
-        """Return the configuration of one end's router."""
         # Each topic passes in one direction only: the router at one end subscribes to it, and the
         # router at the other end publishes it. The key `routes` is for topics that come from the
         # source, as most do.

@@ -46,7 +46,6 @@ class Route:
     rate: float = 0.0
 
     def options(self) -> dict[str, Any]:
-        """Return the options that differ from their defaults."""
         return {
             name: value for name, default in _DEFAULTS if (value := getattr(self, name)) != default
         }
@@ -70,7 +69,6 @@ class Route:
         return f"topic {self.source} {direction} {self.target}" + (f" ({listed})" if listed else "")
 
     def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
-        """Return the node that sends the topic, and the node that receives it."""
         return (target, source) if self.reverse else (source, target)
 
 

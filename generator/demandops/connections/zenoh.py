@@ -37,7 +37,7 @@ class Zenoh(ConnectionType):
     options = frozenset({"rate"})
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield a fault for each bridge that shares host and ROS domain with an earlier bridge."""
+        # two bridges on one host and ROS domain do not work
         hosts: dict[tuple[object, ...], str] = {}
         for node in config.nodes.values():
             host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
@@ -171,7 +171,6 @@ class Bridge(Client):
         ]
 
     def configuration(self) -> dict[str, Any]:
-        """Return the configuration of a node's bridge."""
         # if `allow` lacks `publishers` or `subscribers`, no topic of that kind passes
         lists = {"publishers": self.publishers, "subscribers": self.subscribers}
         ros: dict[str, Any] = {
@@ -201,4 +200,4 @@ class Bridge(Client):
 
 
 def _exactly(topic: str) -> str:
-    return f"^{re.escape(topic)}$"
+    return f"^{re.escape(topic)}$"  # the bridge takes regular expressions

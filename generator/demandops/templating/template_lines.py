@@ -16,8 +16,6 @@ _LONGEST = 2_000
 
 
 class TemplateLines:
-    """The lines of a template, and the lines of the text that it rendered to."""
-
     def __init__(self, template: str, rendered: str) -> None:
         self._template, self._rendered = template.splitlines(), rendered.splitlines()
         self._text = rendered

@@ -110,8 +110,6 @@ class _Concatenations(NodeTransformer):
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja's sandbox, with the filters and methods that this module lists."""
-
     intercepted_binops = frozenset({"%"})  # the format `%s` would write anything as text
 
     def __init__(self, filters: Mapping[str, Callable[..., Any]], **options: Any) -> None:  # noqa: ANN401

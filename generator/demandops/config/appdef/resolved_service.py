@@ -47,13 +47,13 @@ class Service(Deployed):
 
     @property
     def is_movable(self) -> bool:
-        """Whether an override may move the service to another node."""
         return not self.at_source and not self.nodes
 
     @property
     def is_placeable(self) -> bool:
         """Whether the generator may choose the service's node separately from the application's."""
-        # an instance of another service serves applications of several appdefs
+        # What several appdefs share is not placed: a demand could be refused because of a node that
+        # somebody else's demand had chosen.
         return self.scope == "application" or not (self.shared or self.at_source)
 
     @property

@@ -228,7 +228,6 @@ def _separating_fields(
 
 
 def patterns_overlap(one: str, other: str) -> bool:
-    """Return whether some text matches both patterns."""
     # row[i]: whether the part of ``one`` read so far overlaps with the first i characters of other
     row = [not other[:length].strip("*") for length in range(len(other) + 1)]
     for a in one:
