@@ -92,11 +92,9 @@ def data_home(state_repo: str) -> Path:
     """Return the folder of the generator's journal and clone for one state repo."""
     if Path(state_repo).exists():  # all spellings of a path give the same folder
         state_repo = str(Path(state_repo).resolve())
-    root = os.environ.get("DEMANDOPS_DATA_HOME")
-    if root:
-        base = Path(root)
-    else:
-        state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-        base = Path(state) / "demandops"
+    root: str | Path | None = os.environ.get("DEMANDOPS_DATA_HOME")
+    if not root:
+        state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        root = Path(state) / "demandops"
     # a digest, because the address may contain a password
-    return base / hashlib.sha256(state_repo.encode()).hexdigest()[:16]
+    return Path(root) / hashlib.sha256(state_repo.encode()).hexdigest()[:16]

@@ -38,7 +38,6 @@ MAX_DEPTH = 100
 _MAX_BITS = 14_000
 # what PyYAML raises, beside its own errors, for texts that do not fit a tag, such as `!!int x`
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
-_MISFIT = "not valid YAML: it has a tag, number or character that cannot be read"
 
 # Finds the digits before the `e` of a JSON number like `1e-09`. YAML 1.1 would read such a number
 # as text. The pattern matches quoted texts as a whole, so that no digits inside them are found.
@@ -231,7 +230,8 @@ def _strict(file: str) -> Iterator[None]:
         message = f"not valid YAML: {problem or str(error).splitlines()[0]}"
         raise InvalidInput.at(where, message, file=file) from error
     except _MISFITS as error:
-        raise InvalidInput.at("", _MISFIT, file=file) from error
+        message = "not valid YAML: it has a tag, number or character that cannot be read"
+        raise InvalidInput.at("", message, file=file) from error
     except InvalidInput as error:
         raise InvalidInput(faults_in(error, file)) from None
 

@@ -231,24 +231,19 @@ class AccessDomain(CamelModel):
         return by_group
 
     @model_validator(mode="after")
-    def _kinds_fit(self) -> AccessDomain:
-        if self.kinds is None:
-            return self
-        missing = [name for name in NEEDED_KINDS if KINDS[name] not in self.kinds]
+    def _consistent(self) -> AccessDomain:
+        kinds = self.allowed_kinds
+        missing = [name for name in NEEDED_KINDS if KINDS[name] not in kinds]
         if missing:
             raise ValueError(
                 f"kinds: lacks {' and '.join(missing)}, but connections and Helm's releases need "
                 "them; add what is missing"
             )
-        if self.network == "namespace" and KINDS[_NETWORK_POLICY] in self.kinds:
+        if self.network == "namespace" and KINDS[_NETWORK_POLICY] in kinds:
             raise ValueError(
                 "kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; remove "
                 "NetworkPolicy from 'kinds', or remove 'network'"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _named_once(self) -> AccessDomain:
         names = [rule.name for rule in self.rules]
         for name in names:
             if names.count(name) > 1:

@@ -86,11 +86,22 @@ class Evaluator:
         seconds = min(limits.each, limits.left)
         if seconds <= 0:
             raise _over(task, "the evaluations before it took all the time of this demand")
-        try:
-            child, answer = self._answered(files, task, seconds)
-        except _Died as death:
-            limits.left -= seconds if death.is_late else 0
-            raise _over(task, str(death)) from None
+        while True:
+            try:
+                child, is_fresh = self._idle.pop(), False  # threads may share a list in CPython
+            except IndexError:
+                child, is_fresh = _Child(), True
+            try:
+                answer = child.answer(files, task, seconds)
+                break
+            except _Died as death:
+                # somebody may have ended an idle child, or it kept much of earlier evaluations
+                if is_fresh or death.is_late:
+                    limits.left -= seconds if death.is_late else 0
+                    raise _over(task, str(death)) from None
+            except BaseException:
+                child.kill()  # its answer was not read, so the next one would be taken for it
+                raise
         if len(self._idle) < _MOST_IDLE:
             self._idle.append(child)
         else:
@@ -102,24 +113,6 @@ class Evaluator:
             raise RuntimeError(f"evaluation of {task.file} failed: {answer['error']}")
         values: dict[str, Any] = answer["values"]
         return values
-
-    def _answered(
-        self, files: Mapping[str, str], task: ValuesTask | SchemaTask, seconds: float
-    ) -> tuple[_Child, dict[str, Any]]:
-        while True:
-            try:
-                child, is_fresh = self._idle.pop(), False  # threads may share a list in CPython
-            except IndexError:
-                child, is_fresh = _Child(), True
-            try:
-                return child, child.answer(files, task, seconds)
-            except _Died as death:
-                # somebody may have ended an idle child, or it kept much of earlier evaluations
-                if is_fresh or death.is_late:
-                    raise
-            except BaseException:
-                child.kill()  # its answer was not read, so the next one would be taken for it
-                raise
 
     def forget(self) -> None:
         # without ending them, because a forked process has its parent's children here

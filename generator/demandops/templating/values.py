@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import Any
 
 import jsonschema_rs
-from jinja2 import BaseLoader, Environment, TemplateError
+from jinja2 import FunctionLoader, TemplateError
 from jinja2.exceptions import TemplateNotFound, TemplateSyntaxError
 
 from demandops import strict_yaml
@@ -97,25 +97,19 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
 # ---- the template ----
 
 
-class _FilesLoader(BaseLoader):
-    def __init__(self, files: Mapping[str, str]) -> None:
-        self._files = files
-
-    def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        if template not in self._files:
-            raise TemplateNotFound(template)
-        text = self._files[template]
-        if len(text) > _MAX_LENGTH:
-            message = f"has {len(text)} characters; at most {_MAX_LENGTH} are allowed"
-            raise TemplateSyntaxError(message, 1)
-        return text, template, lambda: True
-
-
 _COMPILED = CompiledTemplates()
 
 
 def _rendered(files: Mapping[str, str], task: ValuesTask) -> str:
-    sandbox = Sandbox(FILTERS, loader=_FilesLoader(files), bytecode_cache=_COMPILED, **OPTIONS)
+    def load(path: str) -> tuple[str, str, Callable[[], bool]] | None:
+        text = files.get(path)
+        if text is not None and len(text) > _MAX_LENGTH:
+            message = f"has {len(text)} characters; at most {_MAX_LENGTH} are allowed"
+            raise TemplateSyntaxError(message, 1)
+        return None if text is None else (text, path, lambda: True)
+
+    loader = FunctionLoader(load)
+    sandbox = Sandbox(FILTERS, loader=loader, bytecode_cache=_COMPILED, **OPTIONS)
     try:
         text = sandbox.get_template(task.template).render(**task.context)
         if len(text) <= _MAX_RENDERED:

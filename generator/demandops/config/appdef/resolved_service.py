@@ -91,7 +91,7 @@ def resolved_services(
         if name in definitions:
             used = {**dict(definitions[name]), "inputs": bound}
             services[name] = Service.model_construct(**used, folder=name, shared=True)
-    problems = [*_unbound(appdef, definitions), *_unknown(appdef, services)]
+    problems = [*_input_problems(appdef, definitions, services)]
     if problems:
         return {}, problems
     graph = {
@@ -109,8 +109,10 @@ def resolved_services(
     return ({}, problems) if problems else (services, [])
 
 
-def _unbound(
-    appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
+def _input_problems(
+    appdef: ApplicationDefinition,
+    definitions: Mapping[str, ServiceDefinition],
+    services: Services,
 ) -> Iterator[Problem]:
     for name, bound in appdef.uses.items():
         if name not in definitions:
@@ -127,9 +129,6 @@ def _unbound(
         for role in bound.keys() - inputs.keys():
             hint = suggestion(role, inputs)
             yield f"uses.{name}.{role}", f"'{name}' has no input '{role}'; leave it out{hint}"
-
-
-def _unknown(appdef: ApplicationDefinition, services: Services) -> Iterator[Problem]:
     for service in services.values():
         for role, origin in service.inputs.items():
             name, _, output = origin.partition(".")
