@@ -184,9 +184,9 @@ def internal(error: Exception) -> StateRepoError:
     return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
 
-def closest(word: str, known: Iterable[str]) -> str | None:
-    """Return a known word that is similar to ``word``; among many words it may be missed."""
-    names = tuple(known)
+def closest(word: str, words: Iterable[str]) -> str | None:
+    """Return one of ``words`` that is similar to ``word``; among many it may be missed."""
+    names = tuple(words)
     forwards, backwards = _orders(names)
     compared = forwards
     if len(names) > _MOST_COMPARED:
@@ -203,16 +203,15 @@ def sentences(problems: Iterable[str]) -> str:
     return ". ".join(problems).replace("?. ", "? ")
 
 
-def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
-    """Return ``; did you mean 'x'?``, or ``; known: …``, or nothing if no words are known."""
-    words = tuple(known)
-    names = _orders(words)[0]
-    close = closest(word, words)
+def suggestion(word: str, words: Iterable[str], *, most: int = 8) -> str:
+    """Return ``; did you mean 'x'?``, or ``; known: …``, or nothing if there are no words."""
+    names = tuple(words)
+    close = closest(word, names)
     if close:
         return f"; did you mean '{close}'?"
     if not names:
         return ""
-    listed = ", ".join(names[:most]) + (", …" if len(names) > most else "")
+    listed = ", ".join(_orders(names)[0][:most]) + (", …" if len(names) > most else "")
     return f"; known: {listed}"
 
 

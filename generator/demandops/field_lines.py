@@ -33,7 +33,7 @@ def lines(text: str, document: int = 0) -> dict[str, int]:
                 add(item, f"{path}[{index}]")
 
     with suppress(InvalidInput, yaml.YAMLError):
-        for _ in load_all(text):  # refuses anchors and deep nesting, which `add` could not follow
+        for _ in load_all(text):  # refuses what nests too deeply for `add`
             pass
         nodes = yaml.compose_all(text, Loader=LOADER)
         add(next(islice(nodes, document, None), None), "")

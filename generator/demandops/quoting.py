@@ -26,7 +26,7 @@ def is_visible(text: str) -> bool:
 
 
 def escaped(text: str, kept: str = "") -> str:
-    """Return text with an escape like ``\\u202e`` for each character not visible or ``kept``."""
+    """Return text with an escape like ``\\u202e`` for what is neither visible nor ``kept``."""
     if is_visible(text):
         return text
     return "".join(
@@ -80,15 +80,14 @@ def json_escaped(text: str) -> str:
     """Return JSON text of the same data, with JSON's escape for each invisible character."""
     if is_visible(text.replace("\n", "")):
         return text
-    return "".join(
-        char
-        if char == "\n" or is_visible(char)
-        # beyond 16 bits, JSON needs two escapes, a surrogate pair, which json.dumps writes
-        else json.dumps(char)[1:-1]
-        if ord(char) > 0xFFFF
-        else f"\\u{ord(char):04x}"
-        for char in text
-    )
+
+    def escape(char: str) -> str:
+        if char == "\n" or is_visible(char):
+            return char
+        # json.dumps knows the two escapes beyond 16 bits, but leaves DEL as it is
+        return json.dumps(char)[1:-1] if ord(char) > 0xFFFF else f"\\u{ord(char):04x}"
+
+    return "".join(map(escape, text))
 
 
 class OneLineFormatter(logging.Formatter):

@@ -157,16 +157,16 @@ def _refuse_unread(reader: ConfigReader) -> None:
     # whoever mistypes a file's name must not believe that its entries are in force
     folders = {collection.partition("/")[0] for collection in COLLECTIONS}
     for path in sorted(reader.files):
-        folder, *rest = path.split("/")
+        folder, *names = path.split("/")
         if folder not in folders or not path.endswith((".yaml", ".yml")):
             continue
-        if collection_of(path) is None and not any(part.startswith(".") for part in rest):
-            names = [PurePosixPath(file).stem for file in COLLECTIONS if file.startswith(folder)]
+        if collection_of(path) is None and not any(name.startswith(".") for name in names):
+            stems = [PurePosixPath(file).stem for file in COLLECTIONS if file.startswith(folder)]
             reader.add_fault(
                 path,
                 "",
                 f"is not read; only <name>.yaml and <name>/*.yaml in {folder}/ are read, where "
-                f"<name> is one of {', '.join(sorted(names))}; rename the file, or remove it",
+                f"<name> is one of {', '.join(sorted(stems))}; rename the file, or remove it",
             )
 
 

@@ -128,10 +128,10 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             )
 
 
-def contradictions(one: Route, other: Route) -> Iterator[tuple[str, object, object]]:
+def contradictions(route: Route, other: Route) -> Iterator[tuple[str, object, object]]:
     """Yield (option, first value, second value) for each contradiction between two routes."""
     for name, _ in _DEFAULTS:
-        first, second = getattr(one, name), getattr(other, name)
+        first, second = getattr(route, name), getattr(other, name)
         # an empty type leaves it to the other route, or to the inventory
         if first == second or (name == "type" and not (first and second)):
             continue

@@ -114,8 +114,8 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
                 "'podSecurity: host-network'"
             )
             reader.add_fault(file, f"{place}.hostNetwork", message)
+    closed = [d.name for d in config.domains.values() if d.pod_security == "baseline"]
     for word, file in config.entry_files[CLIENTS_FILE].items():
-        closed = [d.name for d in config.domains.values() if d.pod_security == "baseline"]
         if closed and config.clients.of(word).host_network:
             message = (
                 f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
@@ -156,13 +156,10 @@ def _check_chart(
         return
     version = metadata.get("version") if isinstance(metadata, dict) else None
     if version != chart.version:
-        reader.add_fault(
-            file,
-            f"{where}.version",
-            f"is {chart.version}, but {path} has no version; add it there"
-            if version is None
-            else f"is {chart.version}, but {path} says {version}; make them equal",
-        )
+        message = f"is {chart.version}, but {path} says {version}; make them equal"
+        if version is None:
+            message = f"is {chart.version}, but {path} has no version; add it there"
+        reader.add_fault(file, f"{where}.version", message)
 
 
 def _check_services(config: Config, reader: ConfigReader) -> None:
@@ -225,9 +222,9 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
         for cluster, node in definition.nodes.items():
             reader.check_reference(file, f"nodes.{cluster}", cluster, CLUSTERS_FILE)
             reader.check_reference(file, f"nodes.{cluster}", node, NODES_FILE)
-            found = config.nodes.get(node)
-            if found is not None and found.cluster != cluster:
-                message = f"'{node}' is in cluster '{found.cluster}'; name a node of '{cluster}'"
+            actual = config.nodes[node].cluster if node in config.nodes else cluster
+            if actual != cluster:
+                message = f"'{node}' is in cluster '{actual}'; name a node of '{cluster}'"
                 reader.add_fault(file, f"nodes.{cluster}", message)
     for appdef, services in config.services.items():
         for name, service in services.items():

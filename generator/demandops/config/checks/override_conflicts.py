@@ -140,49 +140,50 @@ def _rivals(
         yield from ((rival, override) for rival in rivals.values())
 
 
-def contested_effects(one: Override, other: Override) -> list[str]:
+def contested_effects(first: Override, second: Override) -> list[str]:
     """Return the effects for which the order of two overrides matters."""
     contested = [
         name
         for name in _SINGLE
-        if None not in (left := getattr(one, name), right := getattr(other, name)) and left != right
+        if None not in (left := getattr(first, name), right := getattr(second, name))
+        and left != right
     ]
-    if one.values and other.values and not patches_commute(one.values, other.values):
+    if first.values and second.values and not patches_commute(first.values, second.values):
         contested.append("values")
-    pins = (one.images or {}, other.images or {})
+    pins = (first.images or {}, second.images or {})
     contested += [
         f"images.{name}"
         for name in sorted({*pins[0]} & {*pins[1]})
         if pins[0][name] != pins[1][name]
     ]
-    for holding, shaping in ((one, other), (other, one)):
+    for holding, shaping in ((first, second), (second, first)):
         effects = [name for name in shaping.effects() if name in _FROZEN]
         if holding.hold and effects:
             contested += ["hold", *effects]
     return contested
 
 
-def patches_commute(one: object, other: object) -> bool:
+def patches_commute(first: object, second: object) -> bool:
     """Return whether two merge patches have the same result in either order."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return all(patches_commute(one[key], other[key]) for key in one if key in other)
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return all(patches_commute(first[key], second[key]) for key in first if key in second)
     # unlike ==, JSON distinguishes 1 from True
-    return json.dumps(one, sort_keys=True) == json.dumps(other, sort_keys=True)
+    return json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)
 
 
 def may_match_same_release(
-    one: Selector, other: Selector, config: Config, shares_clients: bool
+    first: Selector, second: Selector, config: Config, shares_clients: bool
 ) -> bool:
     """Return whether some release, now or later, may match both selectors."""
-    if (one.connections and _selects_services(other)) or (
-        other.connections and _selects_services(one)
+    if (first.connections and _selects_services(second)) or (
+        second.connections and _selects_services(first)
     ):
         return False
-    for name in _separating_fields(one, other, config, shares_clients):
-        left, right = getattr(one, name), getattr(other, name)
+    for name in _separating_fields(first, second, config, shares_clients):
+        left, right = getattr(first, name), getattr(second, name)
         if left and right and not _any_overlap(left, right):
             return False
-    left, right = one.labels or {}, other.labels or {}
+    left, right = first.labels or {}, second.labels or {}
     return all(left[key] == right[key] for key in left if key in right)
 
 
@@ -193,9 +194,9 @@ def _any_overlap(left: Iterable[str], right: Iterable[str]) -> bool:
         return True
     # two texts without wildcards overlap only if they are equal, and lists of names may be long
     return any(
-        patterns_overlap(one, other)
-        for one in left
-        for other in ({*right} - plain[1] if one in plain[0] else right)
+        patterns_overlap(first, second)
+        for first in left
+        for second in ({*right} - plain[1] if first in plain[0] else right)
     )
 
 
@@ -204,11 +205,11 @@ def _selects_services(selector: Selector) -> bool:
 
 
 def shares_any_clients(config: Config) -> bool:
-    return any(known.shares_clients(config) for known in connection_types.CONNECTION_TYPES)
+    return any(kind.shares_clients(config) for kind in connection_types.CONNECTION_TYPES)
 
 
 def _separating_fields(
-    one: Selector, other: Selector, config: Config, shares_clients: bool
+    first: Selector, second: Selector, config: Config, shares_clients: bool
 ) -> Iterator[str]:
     """Yield the fields that can separate two selectors.
 
@@ -217,22 +218,22 @@ def _separating_fields(
     yield from ("services", "nodes")
     may_match_shared_service = any(
         service.scope != "application"
-        and all(not s.services or matches(name, s.services) for s in (one, other))
+        and all(not s.services or matches(name, s.services) for s in (first, second))
         for services in config.services.values()
         for name, service in services.items()
     )
     if not may_match_shared_service:
         yield from ("applications", "appdefs")
-    if one.connections and other.connections and not shares_clients:
+    if first.connections and second.connections and not shares_clients:
         yield "connections"
 
 
-def patterns_overlap(one: str, other: str) -> bool:
-    # row[i]: whether the part of ``one`` read so far overlaps with the first i characters of other
-    row = [not other[:length].strip("*") for length in range(len(other) + 1)]
-    for a in one:
+def patterns_overlap(first: str, second: str) -> bool:
+    # row[i]: whether the part of `first` read so far overlaps with i characters of `second`
+    row = [not second[:length].strip("*") for length in range(len(second) + 1)]
+    for a in first:
         after = [row[0] and a == "*"]
-        for b, above, before in zip(other, row[1:], row, strict=False):
+        for b, above, before in zip(second, row[1:], row, strict=False):
             if "*" in (a, b):
                 after.append(above or after[-1])
             else:
