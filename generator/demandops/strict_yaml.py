@@ -196,8 +196,7 @@ def _text(text: str) -> yaml.ScalarEvent:
     """Return PyYAML's event that writes a text, in quotes if a parser could misread the text."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
         return yaml.ScalarEvent(None, None, (True, False), text)
-    # a literal block is readable, but only plain lines with one line break at the end need no
-    # indicator and no escape in it
+    # a literal block has no escapes, and with another begin or end it would need an indicator
     is_block = (
         text.endswith("\n")
         and not text.endswith("\n\n")

@@ -31,7 +31,6 @@ Item = TypeVar("Item")
 # A list in a file. The model has the items as a tuple.
 Items = Annotated[tuple[Item, ...], Field(strict=False)]
 
-# A whole number above zero
 Positive = Annotated[int, Field(ge=1)]
 
 # A name that is valid in Kubernetes (RFC 1123 label)
@@ -77,7 +76,6 @@ Visible = without(_hidden)
 # Any text that `Visible` accepts
 Text = Annotated[str, Visible]
 
-# Whether a demand needs a person's approval
 Approval = Literal["none", "required"]
 
 

@@ -88,7 +88,6 @@ class Config:
     definitions: Mapping[str, ServiceDefinition]
     # For each appdef, its own services and those of `definitions` that it uses
     services: Mapping[str, Services]
-    # The access domain of each node that is in one
     domain_of: Mapping[str, AccessDomain]
     # The text of each file below `appdefs/`, such as a template or a chart, by path
     files: Mapping[str, str]
@@ -114,9 +113,7 @@ class Config:
     )
     # For each property, the type of its value on most nodes, and the first node with this type
     property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
-    # The nodes that are drained, sorted
     drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    # Whether any node declares a capacity
     limits_capacity: bool = field(init=False, compare=False, repr=False)
     # The input roles, sorted, that are the `root` of a service in at least one appdef
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)

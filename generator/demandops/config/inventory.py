@@ -28,7 +28,6 @@ from demandops.config.node_property import PropertyName, PropertyValue
 from demandops.identifiers import id_problem, message_type_problem, topic_problem
 from demandops.quoting import quoted
 
-# A host name or an IP address
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
 
 # A key in a Kubernetes Secret; in the pod, the key is a file's name
@@ -261,9 +260,7 @@ class Node(CamelModel):
     # For each other node, the topics that the initial deployment already carries to that node. The
     # topics keep their names. Connections skip these topics.
     bridged: dict[NodeId, Items[Topic]] = Field(default_factory=dict)
-    # Words for what the node has
     capabilities: Items[Word] = ()
-    # The value of each property: a number, text, true or false
     properties: dict[PropertyName, PropertyValue] = Field(default_factory=dict)
     position: Position | None = None
     # The generator chooses no drained node, and moves away what it placed there

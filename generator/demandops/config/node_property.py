@@ -78,7 +78,6 @@ _LIMITS: dict[str, Any] = {
     "additionalProperties": False,
     "minProperties": 1,
 }
-# The value of a node's property
 PropertyValue = Annotated[Any, AfterValidator(_value), WithJsonSchema({"anyOf": _PLAIN})]
 # The value that a definition requires of a property; for a number also bounds: `{min: 8}`
 RequiredValue = Annotated[

@@ -54,7 +54,6 @@ class Client(ABC):
     name: str
     node: Node
     domain: AccessDomain
-    # The connections that the client carries
     connections: tuple[str, ...]
     shaping: Shaping = field(default=UNSHAPED, kw_only=True)
 

@@ -217,6 +217,5 @@ def _encoded(message: object) -> bytes:
     return json.dumps(message, default=plain).encode("ascii") + b"\n"
 
 
-# The evaluator of this process
 EVALUATE = Evaluator()
 os.register_at_fork(after_in_child=EVALUATE.forget)

@@ -14,7 +14,6 @@ from demandops.config.durations import seconds_of
 from demandops.config.policy import Duration
 from demandops.errors import sentences
 
-# A number of replicas
 Count = Annotated[int, Field(ge=0, le=1000)]
 
 # A percentage of what a pod requests of a resource. It may be above 100, because a pod may use more
@@ -25,7 +24,6 @@ Percent = Annotated[int, Field(ge=1, le=1000)]
 # of the counted things.
 Measure = Literal["topics", "sources", "claims", "requesters"]
 
-# The resource whose usage an autoscaler measures
 Resource = Literal["cpu", "memory"]
 
 
