@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
 
 from demandops import field_lines
@@ -15,33 +16,25 @@ _PLACE = re.compile(r"line (\d+)")
 _LONGEST = 2_000
 
 
-class TemplateLines:
-    def __init__(self, template: str, rendered: str) -> None:
-        self._template, self._rendered = template.splitlines(), rendered.splitlines()
-        self._text = rendered
-        self._fields: dict[str, int] | None = None
-
-    def located(self, fault: Fault) -> Fault:
-        """Return a fault of the rendered text, with the template's line if this line is known."""
-        if fault.line:
-            return fault
-        place = _PLACE.match(fault.field)
-        if place:
+def with_template_lines(faults: Iterable[Fault], template: str, rendered: str) -> Iterator[Fault]:
+    """Yield faults of a rendered text, each with the template's line if this line is known."""
+    template_lines, rendered_lines = template.splitlines(), rendered.splitlines()
+    fields: Mapping[str, int] | None = None
+    for fault in faults:
+        if place := _PLACE.match(fault.field):
             number: int | None = int(place[1])
         else:
-            if self._fields is None:
-                self._fields = field_lines.lines(self._text)
-            number = field_lines.nearest(fault.field.removeprefix("values."), self._fields)
-        if not number or number > len(self._rendered):
-            return fault
-        rendered = self._rendered[number - 1]
-        if len(rendered) > _LONGEST:
-            return fault
-        lines = [*enumerate(self._template, 1)]
-        same = [at for at, line in lines if line == rendered]
-        candidates = same or [at for at, line in lines if _may_write(line, rendered)]
+            fields = field_lines.lines(rendered) if fields is None else fields
+            number = field_lines.nearest(fault.field.removeprefix("values."), fields)
+        candidates: list[int] = []
+        if number and number <= len(rendered_lines):
+            written = rendered_lines[number - 1]
+            lines = [*enumerate(template_lines, 1)] if len(written) <= _LONGEST else []
+            candidates = [at for at, line in lines if line == written]
+            candidates = candidates or [at for at, line in lines if _may_write(line, written)]
         # a wrong line would mislead, so of several none is named
-        return replace(fault, line=candidates[0]) if len(candidates) == 1 else fault
+        line = candidates[0] if len(candidates) == 1 else None
+        yield replace(fault, line=fault.line or line)
 
 
 def _may_write(line: str, rendered: str) -> bool:

@@ -25,7 +25,7 @@ from demandops.charts import chart_files
 from demandops.errors import Fault, InvalidInput, fault, field_path
 from demandops.quoting import quoted
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
-from demandops.templating.template_lines import TemplateLines
+from demandops.templating.template_lines import with_template_lines
 from demandops.templating.template_sandbox import Sandbox
 
 _MAX_LENGTH = 100_000  # characters of a values template
@@ -78,15 +78,14 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
             chart = task.file.rpartition("/")[0]
             _check(task.values, chart, files, task.origin, "the values")
         return {}
-    lines = None  # not known if the template itself fails
+    text = _rendered(files, task)
     try:
-        text = _rendered(files, task)
-        lines = TemplateLines(files[task.template], text)
         values = _mapping(text, task.template)
         if task.chart:
             _check(values, task.chart, files, task.template, "the template")
     except InvalidInput as error:
-        raise InvalidInput(map(lines.located, error.faults) if lines else error.faults) from None
+        template = files[task.template]
+        raise InvalidInput(with_template_lines(error.faults, template, text)) from None
     for override, patch in task.patches:
         values = chart_files.merge_patch(values, patch)
         if task.chart:

@@ -2,11 +2,6 @@
 
 Such a pair needs an order, and only different priorities give one. It is refused even if no release
 matches both overrides yet, because a later demand could add a release that does.
-
-Two selectors cannot match the same release if they exclude each other in a field for which a
-release has only one value, like service or node. A shared service has many applications and
-requesters, and a Zenoh bridge has many connections, so two selectors that exclude each other in
-these fields may still match the same release.
 """
 
 from __future__ import annotations
@@ -211,10 +206,9 @@ def shares_any_clients(config: Config) -> bool:
 def _separating_fields(
     first: Selector, second: Selector, config: Config, shares_clients: bool
 ) -> Iterator[str]:
-    """Yield the fields that can separate two selectors.
-
-    If both selectors have one of these fields and do not overlap in it, no release matches both.
-    """
+    """Yield the fields in which selectors must overlap to match the same release."""
+    # A release has only one service and one node. But a shared service has many applications and
+    # requesters, and a Zenoh bridge has many connections.
     yield from ("services", "nodes")
     may_match_shared_service = any(
         service.scope != "application"
