@@ -21,6 +21,7 @@ _LONGEST_FIELD = 2_000
 # With more names, a word is compared only with its neighbors. The comparison is slow, and one file
 # or goal may have thousands of unknown words.
 _MOST_COMPARED = 12
+_MOST_LISTED = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +204,7 @@ def sentences(problems: Iterable[str]) -> str:
     return ". ".join(problems).replace("?. ", "? ")
 
 
-def suggestion(word: str, words: Iterable[str], *, most: int = 8) -> str:
+def suggestion(word: str, words: Iterable[str]) -> str:
     """Return ``; did you mean 'x'?``, or ``; known: …``, or nothing if there are no words."""
     names = tuple(words)
     close = closest(word, names)
@@ -211,8 +212,8 @@ def suggestion(word: str, words: Iterable[str], *, most: int = 8) -> str:
         return f"; did you mean '{close}'?"
     if not names:
         return ""
-    listed = ", ".join(_orders(names)[0][:most]) + (", …" if len(names) > most else "")
-    return f"; known: {listed}"
+    listed = ", ".join(_orders(names)[0][:_MOST_LISTED])
+    return f"; known: {listed}" + (", …" if len(names) > _MOST_LISTED else "")
 
 
 @lru_cache(maxsize=8)  # thousands of unknown words are looked for among the same names

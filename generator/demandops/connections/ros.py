@@ -142,8 +142,10 @@ class RosEnd(End):
         topics, tuned, reverse = [], [], []
         for route in self.topics:
             reads = self.reads(route)
-            # ROS prefixes the DDS name of a topic with rt
-            topic = {"name": f"rt{route.read_topic}", "type": dds_type(route.type)}
+            # the names that ROS gives a topic and its type in DDS
+            package, kind, name = route.type.split("/")
+            dds_type = f"{package}::{kind}::dds_::{name}_"
+            topic = {"name": f"rt{route.read_topic}", "type": dds_type}
             topics.append(topic)
             qos: dict[str, Any] = {}
             if route.reliability:
@@ -184,11 +186,6 @@ class RosEnd(End):
         # So a new topic restarts the router only if it needs an entry in `topics` (QoS settings) or
         # `topic-routes` (reverse direction).
         return {name: value for name, value in configuration.items() if name != "allowlist"}
-
-
-def dds_type(ros_type: str) -> str:
-    package, kind, name = ros_type.split("/")
-    return f"{package}::{kind}::dds_::{name}_"
 
 
 def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
