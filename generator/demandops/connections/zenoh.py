@@ -16,7 +16,6 @@ from typing import Any
 from demandops import naming
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.config_reader import ConfigReader
-from demandops.config.inventory import Node
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
@@ -105,6 +104,19 @@ class Zenoh(ConnectionType):
         if not peers:
             return None
         node, domain = config.node_and_domain(key.id)
+        if node.zenoh is None:
+            message = (
+                f"'{node.id}' carries Zenoh connections, but has no 'zenoh' in "
+                f"{config.file_of(NODES_FILE, node.id)} any longer; restore 'zenoh' there"
+            )
+            raise Refused.at("node", message, code=UNSUPPORTED)
+        endpoints = {*node.zenoh.connect}
+        for id in {*peers.values()}:
+            peer = config.nodes.get(id)
+            endpoint = peer.zenoh.endpoint if peer and peer.zenoh else None
+            # if both can reach the other, only the first connects, so that there is only one link
+            if endpoint and (not node.zenoh.endpoint or node.id < id):
+                endpoints.add(endpoint)
         return Bridge(
             type=self,
             name=key.name,
@@ -116,30 +128,12 @@ class Zenoh(ConnectionType):
             rates=MappingProxyType(
                 {t: rate for t, (rate, _) in sorted(publishers.items()) if rate}
             ),
-            connect=_connect(node, set(peers.values()), config),
-            listen=node.zenoh.listening() if node.zenoh else (),
+            connect=tuple(sorted(endpoints)),
+            listen=node.zenoh.listening(),
         )
 
 
 ZENOH = Zenoh()
-
-
-def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
-    """Return the endpoints that a bridge connects to: its routers, and some of its peers."""
-    if node.zenoh is None:
-        message = (
-            f"'{node.id}' carries Zenoh connections, but has no 'zenoh' in "
-            f"{config.file_of(NODES_FILE, node.id)} any longer; restore 'zenoh' there"
-        )
-        raise Refused.at("node", message, code=UNSUPPORTED)
-    endpoints = set(node.zenoh.connect)
-    for id in peers:
-        peer = config.nodes.get(id)
-        endpoint = peer.zenoh.endpoint if peer and peer.zenoh else None
-        # if both can reach the other, only the first connects, so that there is only one link
-        if endpoint and (not node.zenoh.endpoint or node.id < id):
-            endpoints.add(endpoint)
-    return tuple(sorted(endpoints))
 
 
 @dataclass(frozen=True, slots=True)
