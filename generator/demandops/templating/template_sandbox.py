@@ -9,14 +9,7 @@ is not the sandbox's matter: it runs in a process with limits (:mod:`demandops.e
 from __future__ import annotations
 
 import re
-from collections.abc import (
-    Callable,
-    ItemsView,
-    Iterator,
-    KeysView,
-    Mapping,
-    ValuesView,
-)
+from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, ValuesView
 from functools import lru_cache, wraps
 from typing import Any
 
@@ -54,24 +47,22 @@ _PLAIN = (str, int, float, type(None), range, Undefined)
 
 def _as_data(value: Any) -> Any:  # noqa: ANN401
     """Return a value, an iterator or view as a list; raise SecurityError if a part is no data."""
-    if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
+    if isinstance(value, (Iterator, *_VIEWS)):
         value = list(value)
     parts = [value]
     while parts:
         part = parts.pop()
-        if isinstance(part, list | tuple):
+        if isinstance(part, (list, tuple, *_VIEWS)):
             parts.extend(part)
         elif isinstance(part, Mapping):
             parts.extend(part)
             parts.extend(part.values())
-        elif isinstance(part, _VIEWS):
-            parts.extend(part)
         elif not isinstance(part, _PLAIN):
             raise SecurityError(not_writable(part))
     return value
 
 
-@lru_cache(maxsize=256)  # each configuration has a sandbox, but all have the same filters
+@lru_cache(maxsize=256)  # each rendering has a sandbox, but all have the same filters
 def _of_data(function: Callable[..., Any]) -> Callable[..., Any]:
     """Change a filter or format so that its arguments must be data."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
@@ -97,16 +88,8 @@ class _Concatenations(NodeTransformer):
     def visit_Concat(self, node: nodes.Concat) -> nodes.Filter:
         self.generic_visit(node)
         operands = nodes.List(node.nodes, lineno=node.lineno)
-        return nodes.Filter(
-            operands,
-            "_concatenated",
-            [],
-            [],
-            None,
-            None,
-            lineno=node.lineno,
-            environment=self._environment,
-        )
+        place = {"lineno": node.lineno, "environment": self._environment}
+        return nodes.Filter(operands, "_concatenated", [], [], None, None, **place)
 
 
 class Sandbox(ImmutableSandboxedEnvironment):

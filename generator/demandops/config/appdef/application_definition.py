@@ -6,12 +6,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from demandops.config.appdef.service_definition import (
-    Input,
-    OwnService,
-    Parameter,
-    size_problems,
-)
+from demandops.config.appdef.service_definition import Input, OwnService, Parameter, size_problems
 from demandops.config.base_model import Approval, CamelModel, DnsLabel, FileModel, Text, Word
 from demandops.errors import sentences, suggestion
 

@@ -9,12 +9,7 @@ from typing import TypeAlias
 from pydantic import Field
 
 from demandops.config.appdef.application_definition import ApplicationDefinition
-from demandops.config.appdef.service_definition import (
-    Deployed,
-    Parameter,
-    Scope,
-    ServiceDefinition,
-)
+from demandops.config.appdef.service_definition import Deployed, Parameter, Scope, ServiceDefinition
 from demandops.errors import suggestion
 
 
