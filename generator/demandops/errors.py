@@ -8,18 +8,20 @@ faults that were found together, so that a person can fix a file or a request in
 from __future__ import annotations
 
 from bisect import bisect
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from functools import lru_cache
 
 from demandops.quoting import clipped, escaped, one_line
 
+# How many faults of one file, or of a request, are listed; further ones are only counted
 MOST_FAULTS = 100
-"""How many faults of one file, or of a request, are listed; further ones are only counted."""
 _LONGEST_FIELD = 2_000
-_MORE = "more"
-_COMPARED = 12
+# With more names, a word is compared only with its neighbors. The comparison is slow, and one file
+# or goal may have thousands of unknown words.
+_MOST_COMPARED = 12
+_MOST_LISTED = 8
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,9 +29,7 @@ class Fault:
     """One problem in an input.
 
     ``code`` is a stable word for programs (``unknown-node``). ``field`` is the path inside the
-    input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it, on one
-    line. ``file`` names the file, if the input is a file. ``line`` is the line of the field, if it
-    is known.
+    input (``apps[0].header.node_id``). ``message`` says what is wrong and how to fix it.
     """
 
     code: str
@@ -39,21 +39,19 @@ class Fault:
     line: int | None = None
 
     def __post_init__(self) -> None:
-        """Escape and cut ``message``; ``file`` and ``field`` are escaped by :meth:`__str__`."""
+        # A message may quote any text of a file or a goal. Whoever prints it relies on one line.
         object.__setattr__(self, "message", one_line(self.message))
 
     def __str__(self) -> str:
-        """Return ``file:line: field: message`` on one line, without the empty parts."""
         places = (one_line(place) for place in (self.place, self.field))
         return ": ".join(part for part in (*places, self.message) if part)
 
     @property
     def place(self) -> str:
-        """The file and the line, as far as they are known: ``inventory/nodes.yaml:12``."""
+        """``inventory/nodes.yaml:12``, as far as file and line are known."""
         return place_text(self.file, self.line)
 
     def within(self, file: str) -> Fault:
-        """Return the same fault, located in ``file``."""
         return replace(self, file=file)
 
 
@@ -71,7 +69,6 @@ class DemandOpsError(Exception):
     """
 
     def __str__(self) -> str:
-        """Return the text on one line, with an escape for each invisible character."""
         return one_line(super().__str__())
 
 
@@ -79,39 +76,31 @@ class InvalidInput(DemandOpsError):
     """Raised when something that a person wrote is invalid; nothing was changed."""
 
     def __init__(self, faults: Iterable[Fault]) -> None:
-        self.faults = tuple(_fewer(faults))
+        # A file may have a fault on each of its lines, but a person and a page must show the text.
+        kept: list[Fault] = []
+        counts: dict[str, int] = {}
+        for fault in faults:
+            if fault.code == "more":  # from an error whose faults become part of this one
+                kept.append(fault)
+                continue
+            count = counts[fault.file] = counts.get(fault.file, 0) + 1
+            if count <= MOST_FAULTS:
+                kept.append(replace(fault, field=clipped(fault.field, _LONGEST_FIELD)))
+        for file, count in counts.items():
+            if count > MOST_FAULTS:
+                kept.append(Fault("more", "", f"has {count - MOST_FAULTS} more faults", file))
+        self.faults = tuple(kept)
         super().__init__(self.faults)
 
     def __str__(self) -> str:
-        """Return one line for each fault."""
         return "\n".join(str(fault) for fault in self.faults)
 
     def text_with_codes(self) -> str:
-        """Return one line for each fault: ``<code>: `` and the fault's text."""
         return "\n".join(f"{fault.code}: {fault}" for fault in self.faults)
 
     @classmethod
     def at(cls, field: str, message: str, *, code: str = "invalid", file: str = "") -> InvalidInput:
-        """Return an error with a single fault, made from the arguments."""
         return cls([Fault(code, field, message, file)])
-
-
-def _fewer(faults: Iterable[Fault]) -> Iterator[Fault]:
-    """Yield the first faults of each file, and one fault that says how many more the file has.
-
-    Long field names are shortened. A fault with the code ``more``, from an earlier call, is kept.
-    """
-    counts: dict[str, int] = {}
-    for fault in faults:
-        if fault.code == _MORE:
-            yield fault
-            continue
-        count = counts[fault.file] = counts.get(fault.file, 0) + 1
-        if count <= MOST_FAULTS:
-            yield replace(fault, field=clipped(fault.field, _LONGEST_FIELD))
-    for file, count in counts.items():
-        if count > MOST_FAULTS:
-            yield Fault(_MORE, "", f"has {count - MOST_FAULTS} more faults", file)
 
 
 class OverLimit(InvalidInput):
@@ -129,9 +118,11 @@ class Refused(InvalidInput):
 class OverBudget(Exception):
     """Raised within a decision that takes more work than one demand may cause.
 
-    It is no ``Refused``, so that nothing which looks for another way, such as another node, goes on
-    with the work. The decision turns it into a refusal with the code ``too-large``.
+    The decision turns it into a refusal with the code ``too-large``.
     """
+
+    # It is no Refused, so that nothing which looks for another way, such as another node, goes on
+    # with the work.
 
 
 class StateRepoError(DemandOpsError):
@@ -147,10 +138,7 @@ class TurnedDown(DemandOpsError):
 
 
 class NotReached(DemandOpsError):
-    """Raised when a published demand did not reach the requested level in time.
-
-    ``level`` is the requested level: reconciled or healthy.
-    """
+    """Raised when a published demand was not in time ``level``: reconciled or healthy."""
 
     def __init__(self, level: str, message: str) -> None:
         super().__init__(message)
@@ -168,9 +156,10 @@ class ShuttingDown(DemandOpsError):
 class Unsound(DemandOpsError):
     """Raised when a demand could be lost, booked twice, or answered by another process as well.
 
-    No requester gets an answer, and the process ends with exit code 3. The next start reads the
-    journal.
+    No requester gets an answer, and the process ends with exit code 3.
     """
+
+    # The next start reads the journal, and so finds what this process could not be sure about.
 
 
 class QueueFull(DemandOpsError):
@@ -178,7 +167,6 @@ class QueueFull(DemandOpsError):
 
 
 def fault(field: str, message: str, *, code: str = "invalid", line: int | None = None) -> Fault:
-    """Return a fault without a file; :meth:`Fault.within` adds the file later."""
     return Fault(code=code, field=field, message=message, line=line)
 
 
@@ -188,62 +176,44 @@ def field_path(location: tuple[int | str, ...]) -> str:
     for part in location:
         if isinstance(part, int):
             path += f"[{part}]"
-        elif part != "[key]":
+        elif part != "[key]":  # pydantic adds it where the key of a mapping is wrong
             path += f".{part}" if path else part
     return escaped(path)
 
 
 def internal(error: Exception) -> StateRepoError:
-    """Return the error for a demand that failed because of a fault of the program."""
     return StateRepoError(f"internal error of the generator: {error!r}; see its log")
 
 
-def closest(word: str, known: Iterable[str]) -> str | None:
-    """Return a known word that is similar to ``word``, or None if none is found.
-
-    If many words are known, only some of them are compared, so a similar word may be missed.
-    """
-    close = get_close_matches(word, _neighbors(word, tuple(known)), n=1)
+def closest(word: str, words: Iterable[str]) -> str | None:
+    """Return one of ``words`` that is similar to ``word``; among many it may be missed."""
+    names = tuple(words)
+    forwards, backwards = _orders(names)
+    compared = forwards
+    if len(names) > _MOST_COMPARED:
+        compared = []
+        # the order of the names read backwards finds a word whose beginning is mistyped
+        for ordered, step in ((forwards, 1), (backwards, -1)):
+            at = bisect(ordered, word[::step])
+            compared += [name[::step] for name in ordered[max(0, at - 3) : at + 3]]
+    close = get_close_matches(word, compared, n=1)
     return close[0] if close else None
 
 
 def sentences(problems: Iterable[str]) -> str:
-    """Return one text in which each problem is a sentence."""
     return ". ".join(problems).replace("?. ", "? ")
 
 
-def suggestion(word: str, known: Iterable[str], *, most: int = 8) -> str:
-    """Return ``; did you mean 'x'?`` if a known word is similar to ``word``.
-
-    Otherwise return ``; known: …`` with at most ``most`` known words. Return an empty string if no
-    words are known.
-    """
-    words = tuple(known)
-    names = _orders(words)[0]
-    close = closest(word, words)
+def suggestion(word: str, words: Iterable[str]) -> str:
+    """Return ``; did you mean 'x'?``, or ``; known: …``, or nothing if there are no words."""
+    names = tuple(words)
+    close = closest(word, names)
     if close:
         return f"; did you mean '{close}'?"
     if not names:
         return ""
-    listed = ", ".join(names[:most]) + (", …" if len(names) > most else "")
-    return f"; known: {listed}"
-
-
-def _neighbors(word: str, names: tuple[str, ...]) -> list[str]:
-    """Return the names that are worth comparing with a word.
-
-    These are the word's neighbors in two orders: the alphabetical order, and the alphabetical order
-    of the names read backwards. If there are few names, all are returned. To compare a word with
-    thousands of names is slow, and one file or goal may have thousands of unknown words.
-    """
-    forwards, backwards = _orders(names)
-    if len(names) <= _COMPARED:
-        return forwards
-    found = []
-    for ordered, step in ((forwards, 1), (backwards, -1)):
-        at = bisect(ordered, word[::step])
-        found += [name[::step] for name in ordered[max(0, at - 3) : at + 3]]
-    return found
+    listed = ", ".join(_orders(names)[0][:_MOST_LISTED])
+    return f"; known: {listed}" + (", …" if len(names) > _MOST_LISTED else "")
 
 
 @lru_cache(maxsize=8)  # thousands of unknown words are looked for among the same names

@@ -22,19 +22,17 @@ from demandops.input_file import read_secret
 from demandops.quoting import quoted
 
 _TIMEOUT_S = 15.0
-_NOT_FOUND = 404
-_NO_JSON = object()
+_NO_JSON = object()  # null is JSON, so None cannot say it
 
 PullRequestState = Literal["open", "merged", "closed"]
 
 
 class ForgeError(DemandOpsError):
-    """Raised when a call of a forge fails, or cannot be made.
+    """Raised when a call of a forge fails, or cannot be made. No message contains the token.
 
     ``status`` is the HTTP status with which the forge refused the call. It is None if the forge
     gives no answer, or none that can be read. ``asks_to_wait`` says whether the forge asks to call
-    again later, mostly because it got too many calls. No message
-    contains the token.
+    again later, mostly because it got too many calls.
     """
 
     def __init__(
@@ -46,8 +44,6 @@ class ForgeError(DemandOpsError):
 
 @dataclass(frozen=True, slots=True)
 class PullRequest:
-    """A request to merge a branch: its number, its web page and its state."""
-
     number: int
     link: str
     state: PullRequestState
@@ -57,10 +53,10 @@ class Forge(ABC):
     """A project on a forge. Every method raises :class:`ForgeError` if a call fails."""
 
     NAME: ClassVar[str]
+    # The HTTP headers of each call, with `{token}` for the token
     HEADERS: ClassVar[dict[str, str]]
-    """The HTTP headers of each call, with ``{token}`` for the token."""
+    # The HTTP status with which the forge refuses a second pull request for a branch
     EXISTS: ClassVar[int]
-    """The HTTP status with which the forge refuses a second pull request for a branch."""
 
     def __init__(self, api: str, token: str, owner: str, name: str) -> None:
         self._api = api.rstrip("/")
@@ -70,26 +66,19 @@ class Forge(ABC):
 
     @abstractmethod
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the pull request from a branch to ``target``, open or not, or None.
-
-        If there are several, the forge decides which one it is.
-        """
+        """Return the pull request from a branch to ``target``, open or not, or None."""
 
     @abstractmethod
     def _is_merged(self, data: Any) -> bool:  # noqa: ANN401 - any JSON
-        """Return whether a pull request is merged, from ``data``, the forge's JSON about it.
-
-        Raises KeyError or TypeError if ``data`` is not about a pull request.
-        """
+        """Raise KeyError or TypeError if ``data`` is not the forge's JSON about a pull request."""
 
     def open(self, branch: str, target: str, title: str, body: str) -> PullRequest:
         """Return the pull request from a branch to ``target``; create it if there never was one.
 
-        A branch gets only one pull request, so a closed one is returned as it is. An existing one
-        keeps its title and body.
+        An existing one keeps its title and body.
         """
         existing = self.find(branch, target)
-        if existing is not None:
+        if existing is not None:  # a branch gets only one, so a closed one is returned as it is
             return existing
         content = {"title": title, "head": branch, "base": target, "body": body}
         try:
@@ -101,14 +90,10 @@ class Forge(ABC):
             return existing  # an earlier call opened it, but its answer was lost
 
     def close(self, request: PullRequest, body: str) -> None:
-        """Close a pull request without merging it, and replace its text, which says why.
-
-        A comment would need a further permission of the token.
-        """
+        # the text says why, because a comment would need a further permission of the token
         self._call("PATCH", f"{self._pulls}/{request.number}", {"state": "closed", "body": body})
 
     def _call(self, method: str, path: str, body: Mapping[str, object] | None = None) -> Any:  # noqa: ANN401 - the caller knows the answer's form
-        """Send JSON, if any, to a path below the API's address; return the answer's JSON."""
         where = f"{method} {self._api}{path}"
         headers = {key: value.format(token=self._token) for key, value in self.HEADERS.items()}
         content = None
@@ -124,11 +109,15 @@ class Forge(ABC):
         except (ValueError, RecursionError):
             data = _NO_JSON
         if not answer.is_success:
-            known = data if isinstance(data, dict) else {"message": answer.reason}
-            reason = _reason(known, self._token)
-            moved = "; redirects are not followed: check the API's address"
-            remedy = moved if answer.is_redirect else ""
-            text = f"{where}: {answer.status} {reason}{remedy}"
+            refusal = data if isinstance(data, dict) else {"message": answer.reason}
+            details = refusal.get("errors")
+            texts = [refusal.get("message"), *(details if isinstance(details, list) else ())]
+            texts = [text.get("message") if isinstance(text, dict) else text for text in texts]
+            reason = "; ".join(text for text in texts if isinstance(text, str) and text)
+            reason = quoted(reason.replace(self._token, "…"), 300)  # a server may repeat the token
+            if 300 <= answer.status < 400:
+                reason += "; redirects are not followed: check the API's address"
+            text = f"{where}: {answer.status} {reason}"
             raise ForgeError(text, answer.status, asks_to_wait=answer.asks_to_wait)
         if data is _NO_JSON:
             raise ForgeError(f"{where}: the answer is not JSON; check the API's address")
@@ -136,6 +125,7 @@ class Forge(ABC):
 
     def _read(self, data: Any) -> PullRequest:  # noqa: ANN401
         try:
+            # a merged pull request has the state "closed" too
             closed: PullRequestState = "merged" if self._is_merged(data) else "closed"
             state = "open" if closed == "closed" and data["state"] == "open" else closed
             link = str(data["html_url"])
@@ -160,8 +150,7 @@ class GitHub(Forge):
     EXISTS = 422
 
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the newest pull request from a branch to ``target``, open or not, or None."""
-        query = {
+        query = {  # the newest of them
             "head": f"{self._owner}:{branch}",
             "base": target,
             "state": "all",
@@ -184,16 +173,11 @@ class Gitea(Forge):
     EXISTS = 409
 
     def find(self, branch: str, target: str) -> PullRequest | None:
-        """Return the pull request from a branch to ``target``, open or not, or None.
-
-        The result is None too if the token may not see the project, because Gitea answers both with
-        status 404.
-        """
         try:  # the branch ends the path, so its slash stays unquoted
             path = f"{self._pulls}/{quote(target, safe='')}/{quote(branch, safe='/')}"
             return self._read(self._call("GET", path))
         except ForgeError as error:
-            if error.status == _NOT_FOUND:
+            if error.status == 404:  # or the token may not see the project
                 return None
             raise
 
@@ -202,49 +186,26 @@ class Gitea(Forge):
 
 
 def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
-    """Return the GitHub or Gitea that ``demandops.yaml`` names; None if it names neither.
-
-    Each call of this function reads the token from its file, so that a person can replace the token
-    while the generator runs.
-
-    Raises:
-        ForgeError: if there is no file with a token, or the file cannot be read or holds no token.
-    """
+    """Return the GitHub or Gitea that ``demandops.yaml`` names; None if it names neither."""
     if proposals.forge not in ("github", "gitea") or proposals.url is None:
         return None
+    if token_file is None:
+        raise ForgeError(
+            f"proposals.forge is {proposals.forge}, but there is no token for it; set "
+            "DEMANDOPS_FORGE_TOKEN_FILE to a file that holds the token, then start the generator "
+            "again"
+        )
+    try:
+        # read at each call, so that a person can replace the token while the generator runs
+        token = read_secret(token_file).decode("latin-1").strip()
+    except InvalidInput as error:
+        raise ForgeError(f"the token file {error}") from None
+    if not token.isascii() or not token.isprintable():
+        raise ForgeError(f"the token file {token_file} must hold a token: one line of plain text")
     owner, name = proposals.project
-    token = _token(token_file, proposals.forge)
     if proposals.forge == "gitea":
         root = proposals.url.strip("/").rsplit("/", 2)[0]
         return Gitea(proposals.api or f"{root}/api/v1", token, owner, name)
     scheme, host, *_ = urlsplit(proposals.url)
     public = "https://api.github.com" if host == "github.com" else f"{scheme}://{host}/api/v3"
     return GitHub(proposals.api or public, token, owner, name)
-
-
-def _token(file: Path | None, forge: str) -> str:
-    if file is None:
-        raise ForgeError(
-            f"proposals.forge is {forge}, but there is no token for it; set "
-            "DEMANDOPS_FORGE_TOKEN_FILE to a file that holds the token, then start the generator "
-            "again"
-        )
-    try:
-        token = read_secret(file).decode("latin-1").strip()
-    except InvalidInput as error:
-        raise ForgeError(f"the token file {error}") from None
-    if not token.isascii() or not token.isprintable():
-        raise ForgeError(f"the token file {file} must hold a token: one line of plain text")
-    return token
-
-
-def _reason(answer: Mapping[str, Any], token: str) -> str:
-    """Return a forge's reason for a refusal: its ``message`` and the messages in ``errors``.
-
-    A server may repeat what it got, so the token is left out.
-    """
-    details = answer.get("errors")
-    texts = [answer.get("message"), *(details if isinstance(details, list) else ())]
-    texts = [text.get("message") if isinstance(text, dict) else text for text in texts]
-    reason = "; ".join(text for text in texts if isinstance(text, str) and text)
-    return quoted(reason.replace(token, "…"), 300)

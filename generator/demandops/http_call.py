@@ -24,15 +24,14 @@ if TYPE_CHECKING:
     import httpx
 
 _MOST_BYTES = 4_000_000
-_TOO_MANY_REQUESTS = 429
 _INVALID = "the URL, a header or the proxy's address is not valid; check them"
+# The reason for each type of httpx error whose own text may echo the request
 _CAUSES = {
     "LocalProtocolError": _INVALID,
     "UnsupportedProtocol": _INVALID,
     "RemoteProtocolError": "the answer is not HTTP, or not complete; check the URL and the server",
     "ProxyError": "the proxy refuses the connection; check HTTPS_PROXY and ALL_PROXY",
 }
-"""The reason for each type of httpx error whose own text may echo the request."""
 
 for _name in ("httpx", "httpcore"):  # they log URLs and headers
     logging.getLogger(_name).setLevel(logging.WARNING)
@@ -47,8 +46,7 @@ class HttpAnswer:
     """An answer: its status, the status in words, and the body.
 
     ``asks_to_wait`` says whether the service asks to call again later, mostly because it got too
-    many calls. Some services then answer with status 429, others (GitHub) with another error and
-    with headers that say so.
+    many calls.
     """
 
     status: int
@@ -58,13 +56,7 @@ class HttpAnswer:
 
     @property
     def is_success(self) -> bool:
-        """Whether the service accepted the call."""
         return 200 <= self.status < 300
-
-    @property
-    def is_redirect(self) -> bool:
-        """Whether the service redirects the caller."""
-        return 300 <= self.status < 400
 
 
 def call(
@@ -72,22 +64,21 @@ def call(
 ) -> HttpAnswer:
     """Send a request and return the answer, whatever its status.
 
-    Args:
-        method, url, headers, body: the request.
-        timeout: how many seconds it may take to connect, to send, and to receive each part of the
-            answer. An answer that is not complete within twice this time is refused.
-
-    Raises:
-        NoAnswer: if the request cannot be sent, if there is no answer, or if the answer is not
-            HTTP, too long or too slow.
+    ``timeout`` is how many seconds it may take to connect, to send, and to receive each part of the
+    answer. An answer that is not complete within twice this time is refused.
     """
     import httpx  # noqa: PLC0415 - slow (a tenth of a second), so only on use
 
+    # identity, because iter_raw decodes nothing: a short compressed answer may decode to a long one
     headers = {"User-Agent": f"demandops/{__version__}", "Accept-Encoding": "identity", **headers}
+    if url.startswith("http://"):  # needs no certificates, which are slow to load
+        trust = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    else:
+        trust = ssl.create_default_context()
     end = REAL.monotonic() + 2 * timeout
     try:
-        with (
-            httpx.Client(verify=_trust(url), timeout=timeout) as client,
+        with (  # httpx follows no redirect by itself, and so takes no token to another host
+            httpx.Client(verify=trust, timeout=timeout) as client,
             client.stream(method, url, headers=headers, content=body) as answer,
         ):
             content = b""
@@ -103,7 +94,8 @@ def call(
                 answer.status_code,
                 answer.reason_phrase,
                 content,
-                answer.status_code == _TOO_MANY_REQUESTS
+                # GitHub answers too many calls with 403 and one of these headers
+                answer.status_code == 429
                 or (answer.is_error and "retry-after" in answer.headers)
                 or (answer.is_error and answer.headers.get("x-ratelimit-remaining") == "0"),
             )
@@ -117,22 +109,13 @@ def call(
         raise NoAnswer("a SOCKS proxy is set, but only HTTP proxies can be used") from None
 
 
-def _trust(url: str) -> ssl.SSLContext:
-    """Return the certificates that a call trusts; none for plain HTTP, because loading is slow."""
-    if url.startswith("http://"):
-        return ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
-    return ssl.create_default_context()
-
-
 def _too_slow(timeout: float) -> str:
     return f"no complete answer within {timeout:g} s; check that the server runs and can be reached"
 
 
 def _cause(error: httpx.TransportError) -> str:
-    """Return the reason why there is no answer; it contains no part of the request but the host."""
-    known = _CAUSES.get(type(error).__name__)
-    if known:
-        return known
+    if cause := _CAUSES.get(type(error).__name__):
+        return cause
     text = one_line(str(error) or type(error).__name__)
     if "CERTIFICATE_VERIFY_FAILED" in text:
         if "mismatch" in text:

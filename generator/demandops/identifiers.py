@@ -7,34 +7,29 @@ import unicodedata
 
 from demandops.quoting import is_visible, quoted
 
+# The maximum length of an id, in characters. A file or an object that is named after a long id has
+# a shortened name with a hash.
 MAX_ID = 1024
-"""The maximum length of an id, in characters.
 
-A file or an object that is named after a long id has a shortened name with a hash.
-"""
-
+# The maximum length of a topic name, in characters: ROS 2's `RMW_TOPIC_MAX_NAME_LENGTH`
 MAX_TOPIC = 247
-"""The maximum length of a topic name, in characters: ROS 2's ``RMW_TOPIC_MAX_NAME_LENGTH``."""
 
 _TOPIC = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _MESSAGE_TYPE = re.compile(r"[A-Za-z][A-Za-z0-9_]*/msg/[A-Za-z][A-Za-z0-9_]*")
+# Unicode's categories of control characters, of halves of characters, and of line separators
 _UNSEEN = frozenset({"Cc", "Cs", "Zl", "Zp"})
+# characters that change the direction of the text after them
 _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
 def absolute_topic(topic: str) -> str:
-    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``.
-
-    An empty name and a private name (``~…``) stay unchanged, so :func:`topic_problem` refuses them.
-    """
+    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``."""
+    # an empty or private name (`~…`) stays as it is, so that `topic_problem` refuses it
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
 
 def control_character(text: str) -> str:
-    """Return the name of a text's first control character, like ``U+202E``, or an empty text.
-
-    Line separators, lone surrogates and characters that change the text's direction count too.
-    """
+    """Return the name of a text's first control character, like ``U+202E``, or an empty text."""
     if text.isprintable():  # Python calls no such character printable
         return ""
     for char in text:
@@ -44,11 +39,7 @@ def control_character(text: str) -> str:
 
 
 def id_problem(value: str) -> str:
-    """Return what is wrong with an id, or an empty string.
-
-    An id may be nearly any text of up to :data:`MAX_ID` characters. It must not contain invisible
-    characters or ``..``, and must not start or end with white space.
-    """
+    """Return what is wrong with an id, or an empty string."""
     if not value:
         return "is empty; give an id"
     if len(value) > MAX_ID:
@@ -83,10 +74,7 @@ def topic_problem(name: str) -> str:
 
 
 def message_type_problem(name: str) -> str:
-    """Return what is wrong with the name of a ROS 2 message type, or an empty string.
-
-    The name must include the package.
-    """
+    """Return what is wrong with the name of a ROS 2 message type, or an empty string."""
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
     return f"{quoted(name)} is not a message type; write it like std_msgs/msg/String"
@@ -95,6 +83,7 @@ def message_type_problem(name: str) -> str:
 _LOWER = "lower-case letters, digits"
 _ANY = "letters, digits"
 
+# For each regular expression of a field: the texts that match it, in words for messages
 PATTERN_WORDS = {
     r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$": f"{_LOWER} and '-' between them, such as c-its",
     r"^[a-z][a-z0-9_-]*$": f"{_LOWER}, '_' and '-', with a letter first, for example road-station",
@@ -142,4 +131,3 @@ PATTERN_WORDS = {
         "and '_', no digit first, and at most one {instance}"
     ),
 }
-"""For each regular expression of a field: the texts that match it, in words for messages."""

@@ -9,11 +9,7 @@ from demandops.errors import InvalidInput
 
 
 def read_input(file: str | Path) -> tuple[str, str]:
-    """Return a file's name, as messages give it, and its text. ``-`` is standard input.
-
-    Raises:
-        InvalidInput: if the file cannot be read or is not UTF-8.
-    """
+    """Return a file's name, as messages give it, and its text. ``-`` is standard input."""
     name = "standard input" if file == "-" else str(file)
     try:
         data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
@@ -26,20 +22,14 @@ def read_input(file: str | Path) -> tuple[str, str]:
 
 
 def read_secret(path: Path, *, private: bool = False) -> bytes:
-    """Return the secret in a file, without the line ends at its end.
-
-    Args:
-        path: the file.
-        private: whether to refuse a file on which everybody has a right; its group may have rights.
-
-    Raises:
-        InvalidInput: if the file holds no secret, cannot be read, or is not private enough.
-    """
+    """Return the secret in a file; ``private`` refuses a file on which everybody has a right."""
     secret = b""
     try:
+        # the group may have rights: a Secret's volume in Kubernetes gives the file to fsGroup
         if private and path.stat().st_mode & 0o007:
             problem = "is open to everybody on this machine; run chmod o= on it"
         else:
+            # editors and `echo` end a file with a line break, which is no part of the secret
             secret = path.read_bytes().rstrip(b"\r\n")
             problem = "is empty; write the secret into this file"
     except (OSError, ValueError) as error:  # a ValueError if the path has the character NUL

@@ -15,69 +15,61 @@ import json
 import re
 from functools import lru_cache
 
-MAX_NAME = 53
+MAX_NAME = 53  # Helm's limit for a release name
+# 48 bits: a longer hash would only raise the price of a search, and people read names
 _HASH = 12
 
-_LABEL = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
+# a name that ends like a hash gets a hash of its own, or another id could be shortened to it
 _LOOKS_HASHED = re.compile(rf"(^|.*[-_])[0-9a-f]{{{_HASH}}}")
+_LABEL = re.compile(r"[a-z0-9]+(-[a-z0-9]+)*")
 _TOPIC_TOKEN = re.compile(r"(?=_*[A-Za-z0-9])[A-Za-z_][A-Za-z0-9_]*")
-_MAX_TOKEN = 120
+_MAX_TOKEN = 120  # ROS 2 takes 247 characters for a whole topic name, which has further parts
 
 # tests set it lower, so that ids that nobody crafted have the same hash
 MOST_DIGITS = 64
 
 
 def hash_of(exact: str, digits: int) -> str:
-    """Return the first hexadecimal digits of the SHA-256 of a text."""
     # only a trailer of a forged commit may have half a character
     data = exact.encode(errors="surrogatepass")
     return hashlib.sha256(data).hexdigest()[: min(digits, MOST_DIGITS)]
 
 
 def slug_with_hash(words: str, exact: str, digits: int) -> str:
-    """Return up to 40 characters of ``words``, safe in a path or branch, and a hash of ``exact``.
-
-    If ``words`` has no ASCII letter or digit, only the hash is returned.
-    """
+    """Return up to 40 characters of ``words``, safe in a path or branch, and a hash."""
     slug = re.sub(r"[^a-z0-9]+", "-", words.lower()).strip("-")[:40].rstrip("-")
     return f"{slug}-{hash_of(exact, digits)}" if slug else hash_of(exact, digits)
 
 
 def digest(*ids: str) -> str:
-    """Return a hash of a list of ids; the lists ``a-b, c`` and ``a, b-c`` have different hashes."""
+    # JSON keeps the ids apart: the lists `a-b, c` and `a, b-c` have different hashes
     return hash_of(json.dumps(ids, ensure_ascii=True), _HASH)
 
 
 def object_name(prefix: str, *ids: str) -> str:
-    """Return the name of a Kubernetes object for ``ids``.
-
-    ``od``, ``edge``, ``vehicle00`` gives ``od-edge-vehicle00``. A hash is appended in each of these
-    cases: an id is not a valid label; there are several ids and one has a dash, so that other ids
-    could give the same name; the name ends like a hash; the name is too long.
-    """
-    plain = "-".join((prefix, *ids)) if prefix else "-".join(ids)
+    """Return the name of a Kubernetes object: ``od``, ``edge``, ``v0`` gives ``od-edge-v0``."""
+    head = (prefix,) if prefix else ()
+    plain = "-".join((*head, *ids))
     exact = all(_LABEL.fullmatch(part) for part in ids)
-    if len(ids) > 1:
+    if len(ids) > 1:  # with a dash in an id, other ids could give the same name
         exact = exact and not any("-" in part for part in ids)
     if exact and len(plain) <= MAX_NAME and not _LOOKS_HASHED.fullmatch(plain):
         return plain
-    readable = "-".join(
-        (prefix, *(_slug(part) for part in ids)) if prefix else (_slug(part) for part in ids)
-    )
-    readable = re.sub(r"-{2,}", "-", readable).strip("-")[: MAX_NAME - _HASH - 1].rstrip("-")
+    slugs = [re.sub(r"[^a-z0-9]+", "-", part.lower()).strip("-") or "x" for part in ids]
+    readable = re.sub(r"-{2,}", "-", "-".join((*head, *slugs))).strip("-")
+    readable = readable[: MAX_NAME - _HASH - 1].rstrip("-")
     return f"{readable}-{digest(prefix, *ids)}" if readable else digest(prefix, *ids)
 
 
-@lru_cache(maxsize=65_536)
+@lru_cache(maxsize=65_536)  # each release asks for the names of all its inputs
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name: ``edge/lane-view`` gives ``edge_lane_view``.
 
-    If an id gives no valid name in this way, or is long, a hash is appended. ``extra``
-    distinguishes names that are made from the same id, for example for two point clouds of one
-    source. With ``extra``, the name also contains a slug of ``extra`` and a hash. Results are
-    cached, because each release asks for the names of all its inputs.
+    ``extra`` distinguishes names that are made from the same id, for example for two point clouds
+    of one source; such a name has a hash.
     """
     plain = re.sub("[-/]", "_", id)
+    # exactly the reference's name, so that subscribers of a fleet that moves over still hear it
     if not extra and len(id) <= _MAX_TOKEN and _TOPIC_TOKEN.fullmatch(plain):
         return plain
     words = re.sub(r"[^A-Za-z0-9]+", "_", f"{id}_{extra}" if extra else id).strip("_")[:80]
@@ -87,9 +79,4 @@ def topic_part(id: str, extra: str = "") -> str:
 
 
 def ros_name(release: str) -> str:
-    """Return a ROS node name for a release. ROS forbids dashes in names."""
-    return release.replace("-", "_")
-
-
-def _slug(id: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", id.lower()).strip("-") or "x"
+    return release.replace("-", "_")  # ROS forbids dashes in the names of nodes

@@ -12,13 +12,12 @@ import logging
 import re
 from typing import Any
 
+# The longest line of text from outside, in characters; the rest is cut off
 LONGEST_LINE = 4000
-"""The longest line of text from outside, in characters; the rest is cut off."""
 
 _INVISIBLE = "\u034f\u115f-\u1160\u17b4-\u17b5\u180b-\u180f\u2800\u3164\ufe00-\ufe0f\uffa0"
+# Matches characters that are displayed as nothing, although Python calls them printable
 _HIDDEN = re.compile(f"[{_INVISIBLE}\U0001d159\U000e0100-\U000e01ef]")
-"""Matches characters that are displayed as nothing, although Python calls them printable."""
-_BMP = 0xFFFF
 
 
 def is_visible(text: str) -> bool:
@@ -27,10 +26,7 @@ def is_visible(text: str) -> bool:
 
 
 def escaped(text: str, kept: str = "") -> str:
-    """Return text with an escape like ``\\u202e`` for each character that is not visible.
-
-    ``kept`` are characters that stay as they are.
-    """
+    """Return text with an escape like ``\\u202e`` for what is neither visible nor ``kept``."""
     if is_visible(text):
         return text
     return "".join(
@@ -39,6 +35,8 @@ def escaped(text: str, kept: str = "") -> str:
     )
 
 
+# Matches text that ends in the character at which a forge, or a pipeline, takes it for an order.
+# The last line is for an issue elsewhere, `Closes ABC-1`.
 _TRIGGER = re.compile(
     r"""
     (?<![A-Za-z0-9_])@(?=[A-Za-z0-9_])       # @name, @org/team
@@ -51,65 +49,54 @@ _TRIGGER = re.compile(
     """,
     re.IGNORECASE | re.VERBOSE,
 )
-"""Matches text that ends in the character at which a forge, or a pipeline, takes it for an order.
-
-The last line is for an issue elsewhere, ``Closes ABC-1``.
-"""
 
 
 def harmless(text: str) -> str:
-    """Return text that no forge acts on, with an escape like ``\\x40`` in the place of ``@``.
-
-    Forges look into commit messages, titles and texts of pull requests: ``[skip ci]`` stops a
-    pipeline, ``Fixes #1`` closes an issue, ``@name`` calls a person.
-    """
-    return _TRIGGER.sub(lambda found: f"{found[0][:-1]}\\x{ord(found[0][-1]):02x}", text)
+    """Return text that no forge acts on, with an escape like ``\\x40`` in the place of ``@``."""
+    # Forges look into commit messages, titles and texts of pull requests: `[skip ci]` stops a
+    # pipeline, `Fixes #1` closes an issue, `@name` calls a person.
+    return _TRIGGER.sub(lambda match: f"{match[0][:-1]}\\x{ord(match[0][-1]):02x}", text)
 
 
 def clipped(text: str, most: int) -> str:
-    """Return text of at most ``most`` characters, with ``…`` if it was longer."""
     return text if len(text) <= most else text[: most - 1].rstrip() + "…"
 
 
 def one_line(text: str, most: int = LONGEST_LINE) -> str:
-    """Return text on one line: escaped, and cut to at most ``most`` characters."""
+    # cut before the escape too, because a text of megabytes would be escaped character by character
     return clipped(escaped(text[: most + 1]), most)
 
 
 def lines(text: str) -> str:
-    """Return text of several lines, escaped except for line breaks and tabs."""
+    """Return text, escaped except for line breaks and tabs."""
     return escaped(text, kept="\n\t")
 
 
 def quoted(value: str, most: int = 80) -> str:
-    """Return a value on one line, cut to at most ``most`` characters and then put in quotes."""
     return f"'{one_line(value, most)}'"
 
 
 def json_escaped(text: str) -> str:
-    """Return JSON text with each invisible character replaced by JSON's escape for it.
-
-    Line breaks stay. The result parses to the same data.
-    """
+    """Return JSON text of the same data, with JSON's escape for each invisible character."""
     if is_visible(text.replace("\n", "")):
         return text
-    return "".join(
-        char if char == "\n" or is_visible(char) else _json_escape(char) for char in text
-    )
 
+    def escape(char: str) -> str:
+        if char == "\n" or is_visible(char):
+            return char
+        # json.dumps knows the two escapes beyond 16 bits, but leaves DEL as it is
+        return json.dumps(char)[1:-1] if ord(char) > 0xFFFF else f"\\u{ord(char):04x}"
 
-def _json_escape(char: str) -> str:
-    return json.dumps(char)[1:-1] if ord(char) > _BMP else f"\\u{ord(char):04x}"
+    return "".join(map(escape, text))
 
 
 class OneLineFormatter(logging.Formatter):
     """Formats a log record as one line. A traceback follows on lines of its own."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        """Return the record's line: the lines of its message are joined by ``; ``."""
         record.message = one_line("; ".join(record.message.splitlines()))
         return super().formatMessage(record)
 
     def formatException(self, info: Any) -> str:  # noqa: ANN401 - as the base class has it
-        """Return a traceback, indented, so that none of its lines looks like a log record."""
+        # indented, so that no line of it looks like a log record
         return lines(super().formatException(info)).replace("\n", "\n  ")

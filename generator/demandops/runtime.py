@@ -25,8 +25,8 @@ log = logging.getLogger("demandops")
 Thread = threading.Thread
 
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 1.0, 60.0
+# A thread counts as recovered if its last failure is at least this many seconds ago
 _STEADY_S = 2 * _LONGEST_PAUSE_S
-"""A thread counts as recovered if its last failure is at least this many seconds ago."""
 _LONGEST_REASON = 300
 
 
@@ -43,46 +43,39 @@ class Runtime:
         self.when_unsound: Callable[[], object] = lambda: None
 
     def now(self) -> datetime:
-        """Return the time in UTC. It may jump, because a person may set the clock."""
+        # it may jump, because a person may set the clock
         return datetime.now(timezone.utc)
 
     def monotonic(self) -> float:
-        """Return the seconds of a clock that nobody can set; only differences have a meaning."""
+        # nobody can set this clock, so only its differences have a meaning
         return time.monotonic()
 
     def processor_s(self) -> float:
-        """Return the seconds of processor time that the calling thread has used so far."""
+        # of the calling thread only
         return time.thread_time()
 
     def sleep(self, seconds: float) -> None:
-        """Block the calling thread."""
         time.sleep(seconds)
 
     def uniform(self, low: float, high: float) -> float:
-        """Return a random number in a range. It is not random enough for secrets."""
-        return random.uniform(low, high)  # noqa: S311 - see above
+        return random.uniform(low, high)  # noqa: S311 - for pauses, not for secrets
 
     def fresh_id(self) -> str:
-        """Return a unique id."""
         return str(uuid.uuid4())
 
+    # whoever takes a lock must hold it briefly, and not wait while holding it
     def lock(self) -> threading.Lock:
-        """Return a new lock. The caller must hold it briefly, and not wait while holding it."""
         return threading.Lock()
 
     def event(self) -> threading.Event:
-        """Return an event that threads wait for."""
         return threading.Event()
 
     def condition(self) -> threading.Condition:
-        """Return a new condition variable; a wait for it may end without a notification."""
+        # a wait for it may end without a notification
         return threading.Condition()
 
     def start_thread(self, name: str, target: Callable[[], object]) -> Thread:
-        """Start a thread that runs ``target``, and return the thread.
-
-        The thread ends with the process at the latest.
-        """
+        # a daemon ends with the process: no thread of ours must keep it from ending
         thread = Thread(target=target, name=f"demandops-{name}", daemon=True)
         thread.start()
         return thread
@@ -91,20 +84,14 @@ class Runtime:
 
     @property
     def failures(self) -> dict[str, str]:
-        """The last failure of each thread that has not recovered since, by the thread's name.
-
-        A failure is over if :meth:`recovered` is called, or after two minutes.
-        """
+        """The last failure of each thread that has not recovered since, by the thread's name."""
         now = self.monotonic()
-        known = sorted(self._failures.items())
-        return {name: text for name, (text, at) in known if now - at < _STEADY_S}
+        failures = sorted(self._failures.items())
+        return {name: text for name, (text, at) in failures if now - at < _STEADY_S}
 
     def failed(self, name: str, error: Exception) -> None:
-        """Record that the work of a thread failed, and log the error.
-
-        If the thread's last failure was the same and is not over yet (:attr:`failures`), the error
-        is logged at the level DEBUG only.
-        """
+        """Record and log that the work of a thread failed."""
+        # a fault that lasts, such as a host that is down, must not fill the log
         is_known = self.failures.get(name) == _reason(error)
         self._failures[name] = (_reason(error), self.monotonic())
         if is_known:
@@ -115,38 +102,36 @@ class Runtime:
             log.error("internal error in %s: %s", name, _reason(error), exc_info=error)
 
     def recovered(self, name: str) -> None:
-        """Record that the work of a thread succeeded."""
         if self._failures.pop(name, None):
             log.info("%s works again", name)
 
     def keep_running(self, name: str, target: Callable[[], object]) -> Thread:
-        """Start a thread that runs ``target``, and return the thread.
+        """Start a thread that runs ``target``, again after each error until ``target`` returns.
 
-        If ``target`` raises an error, the thread pauses and runs ``target`` again. The pause grows
-        with each error, up to a minute. The thread ends if ``target`` returns. It also ends after
-        :class:`Unsound`, because the process must end.
+        The thread also ends after :class:`Unsound`, because the process must end.
         """
-        return self.start_thread(name, lambda: self._supervise(name, target))
 
-    def _supervise(self, name: str, target: Callable[[], object]) -> None:
-        pause = _FIRST_PAUSE_S
-        while True:
-            began = self.monotonic()
-            try:
-                target()
-            except Unsound as error:
-                log.critical("%s; the process ends", error)
-                self.unsound = error
-                self.when_unsound()
-                return
-            except Exception as error:
-                self.failed(name, error)
-            else:
-                return
-            if self.monotonic() - began > _STEADY_S:
-                pause = _FIRST_PAUSE_S
-            self.sleep(pause)
-            pause = min(2 * pause, _LONGEST_PAUSE_S)
+        def supervise() -> None:
+            pause = _FIRST_PAUSE_S
+            while True:
+                began = self.monotonic()
+                try:
+                    target()
+                except Unsound as error:
+                    log.critical("%s; the process ends", error)
+                    self.unsound = error
+                    self.when_unsound()
+                    return
+                except Exception as error:
+                    self.failed(name, error)
+                else:
+                    return
+                if self.monotonic() - began > _STEADY_S:  # not the same fault again and again
+                    pause = _FIRST_PAUSE_S
+                self.sleep(pause)
+                pause = min(2 * pause, _LONGEST_PAUSE_S)
+
+        return self.start_thread(name, supervise)
 
 
 def _reason(error: Exception) -> str:

@@ -11,47 +11,41 @@ import os
 from pathlib import Path
 from typing import Final
 
+# `apiVersion` of every configuration file
 API_VERSION: Final = "demandops/v1"
-"""``apiVersion`` of every configuration file."""
 
+# `apiVersion` of every claim file
 LEDGER_API_VERSION = "demandops.ledger/v2"
-"""``apiVersion`` of every claim file."""
 
+# The version of rendering. It is increased whenever the same ledger and configuration render to
+# other bytes than before.
 RENDER_VERSION = 2
-"""The version of rendering.
 
-It is increased whenever the same ledger and configuration render to other bytes than before.
-"""
-
+# The branch that Flux and Argo CD read and the generator writes
 MAIN_BRANCH = "main"
-"""The branch that Flux and Argo CD read and the generator writes."""
 
+# The action that the reference's clients send goals to (robotkube's event detector)
 DEFAULT_ACTION_NAME = "/event_detector_operator_plugin/operator_plugin/deployment_request"
-"""The action that the reference's clients send goals to (robotkube's event detector)."""
 
+# The action that our own clients send goals to
 DEFAULT_DEMAND_ACTION_NAME = "/demandops/demand"
-"""The action that our own clients send goals to."""
 
+# How many demands may be queued; a further demand is rejected
 QUEUE_LIMIT = 10_000
-"""How many demands may be queued; a further demand is rejected."""
 
+# How many demands of one requester may have no answer yet; a further demand is rejected. Demands
+# that await approval do not count.
 REQUESTER_QUEUE_LIMIT = 1_000
-"""How many demands of one requester may have no answer yet; a further demand is rejected.
 
-Demands that await approval do not count.
-"""
-
+# How many proposals of one requester may await approval. A demand that needs a further proposal is
+# refused.
 PROPOSAL_LIMIT = 100
-"""How many proposals of one requester may await approval.
 
-A demand that needs a further proposal is refused.
-"""
-
+# The top-level folders whose files are all rendered from ledger and configuration
 GENERATED_ROOTS = ("bootstrap", "clusters")
-"""The top-level folders whose files are all rendered from ledger and configuration."""
 
+# The folder for JSON Schemas in each state repo; editors read the schemas
 SCHEMAS_ROOT = "schemas"
-"""The folder for JSON Schemas in each state repo; editors read the schemas."""
 
 
 def modeline(path: str, schema: str) -> str:
@@ -60,60 +54,47 @@ def modeline(path: str, schema: str) -> str:
     return f"# yaml-language-server: $schema={up}{SCHEMAS_ROOT}/{schema}.json\n"
 
 
+# The top-level folder with the generator's reports to people. No decision depends on the reports.
 NOTES_ROOT = ".demandops"
-"""The top-level folder with the generator's reports to people. No decision depends on the reports.
-"""
 
 _PACKAGE = Path(__file__).parent
 _CHECKOUT = _PACKAGE.parents[1]
 
 
 def data_folder(name: str) -> Path:
-    """Return the folder of packaged data: ``templates``, ``appdefs`` or ``skeleton``.
-
-    An installed wheel has these folders inside the package. In a checkout or an editable install
-    they are the repository's own top-level folders.
-    """
+    """Return the folder of packaged data: ``templates``, ``appdefs`` or ``skeleton``."""
     packaged = _PACKAGE / "_data" / name
-    if packaged.is_dir():
+    if packaged.is_dir():  # in an installed wheel
         return packaged
+    # in a checkout, or in an editable install of one
     return _CHECKOUT / {"skeleton": "state-repo-skeleton"}.get(name, name)
 
 
 def documentation() -> Path | None:
-    """Return the folder of the documentation's site, or None if it was not built.
-
-    The wheel of a published version contains the site. In a checkout, ``make docs`` builds it.
-    """
+    """Return the folder of the documentation's site, or None if it was not built."""
+    # the wheel of a published version contains the site; in a checkout, `make docs` builds it
     folders = (_PACKAGE / "_data" / "docs", _CHECKOUT / "build" / "site")
     return next((folder for folder in folders if (folder / "index.html").is_file()), None)
 
 
 def forge_token_file() -> Path | None:
-    """Return the file of the forge's token, which ``DEMANDOPS_FORGE_TOKEN_FILE`` names, or None."""
     named = os.environ.get("DEMANDOPS_FORGE_TOKEN_FILE")
     return Path(named).expanduser() if named else None
 
 
 def alive_file() -> Path | None:
-    """Return the file that ``DEMANDOPS_ALIVE_FILE`` names, or None; a generator touches it."""
+    """Return the file that a generator touches as long as it works, or None."""
     named = os.environ.get("DEMANDOPS_ALIVE_FILE")
     return Path(named).expanduser() if named else None
 
 
 def data_home(state_repo: str) -> Path:
-    """Return the folder of the generator's journal and clone for one state repo.
-
-    It is inside ``DEMANDOPS_DATA_HOME`` or, if that is not set, ``$XDG_STATE_HOME/demandops``
-    (``~/.local/state/demandops``). Its name is a digest of the state repo's address, because the
-    address may contain a password.
-    """
+    """Return the folder of the generator's journal and clone for one state repo."""
     if Path(state_repo).exists():  # all spellings of a path give the same folder
         state_repo = str(Path(state_repo).resolve())
-    root = os.environ.get("DEMANDOPS_DATA_HOME")
-    if root:
-        base = Path(root)
-    else:
-        state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-        base = Path(state) / "demandops"
-    return base / hashlib.sha256(state_repo.encode()).hexdigest()[:16]
+    root: str | Path | None = os.environ.get("DEMANDOPS_DATA_HOME")
+    if not root:
+        state = os.environ.get("XDG_STATE_HOME") or Path.home() / ".local" / "state"
+        root = Path(state) / "demandops"
+    # a digest, because the address may contain a password
+    return Path(root) / hashlib.sha256(state_repo.encode()).hexdigest()[:16]

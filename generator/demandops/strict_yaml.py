@@ -21,28 +21,27 @@ import yaml
 
 from demandops.errors import Fault, InvalidInput
 
+# libyaml, which not every build of PyYAML has, reads and writes several times as fast
 LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
 _Dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
 
+# Finds texts that every parser reads as text without quotes, except for a few words
 _PLAIN = re.compile(r"[A-Za-z/][A-Za-z0-9_./-]*(?:[:@=][A-Za-z0-9_./-]+)*")
 _WORDS = frozenset(
     ["y", "n", "yes", "no", "on", "off", "true", "false", "null", "nan", "inf", "infinity", "none"]
 )  # some parsers do not read these words as text
 
+# How many characters a file may have; an inventory of 20,000 nodes has fewer
 MAX_LENGTH = 4_000_000
-"""How many characters a file may have; an inventory of 20,000 nodes has fewer."""
 MAX_DEPTH = 100
+# How many bits a whole number may have. Python prints at most 4,300 digits.
 _MAX_BITS = 14_000
-"""How many bits a whole number may have. Python prints at most 4,300 digits."""
+# what PyYAML raises, beside its own errors, for texts that do not fit a tag, such as `!!int x`
 _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
-_MISFIT = "not valid YAML: it has a tag, number or character that cannot be read"
 
+# Finds the digits before the `e` of a JSON number like `1e-09`. YAML 1.1 would read such a number
+# as text. The pattern matches quoted texts as a whole, so that no digits inside them are found.
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
-"""Finds the digits before the ``e`` of a JSON number like ``1e-09``.
-
-YAML 1.1 would read such a number as text. The pattern matches quoted texts as a whole, so that no
-digits inside them are found.
-"""
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
 
@@ -57,17 +56,15 @@ _LONGEST_WORD = 1_000
 
 
 def _cached(function: Callable[[str], _Result]) -> Callable[[str], _Result]:
-    """Cache the results for short texts, because words repeat often.
-
-    Long ones, which requesters may send again and again, would fill the memory.
-    """
+    # Words repeat often. Long texts, which requesters may send again and again, would fill the
+    # memory.
     of_words = lru_cache(16_384)(function)
     return lambda text: (of_words if len(text) <= _LONGEST_WORD else function)(text)
 
 
 @_cached
 def _tag_of(text: str) -> str:
-    """Return the tag of a scalar without quotes."""
+    # (True, False): the scalar has no quotes
     return str(_RESOLVER.resolve(yaml.ScalarNode, text, (True, False)))  # type: ignore[no-untyped-call]
 
 
@@ -78,6 +75,7 @@ def _integer(node: yaml.ScalarNode) -> int:
     return number
 
 
+# The function that makes the value of a date, number, truth value or null, by YAML tag
 _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}timestamp": _CONSTRUCTOR.construct_scalar,  # dates stay text
     f"{_TAG}int": _integer,
@@ -85,7 +83,6 @@ _CONSTRUCT: Mapping[str, Callable[[yaml.ScalarNode], Any]] = {
     f"{_TAG}bool": _CONSTRUCTOR.construct_yaml_bool,
     f"{_TAG}null": _CONSTRUCTOR.construct_yaml_null,
 }
-"""The function that makes the value of a date, number, truth value or null, by YAML tag."""
 
 
 def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event or a node
@@ -93,15 +90,14 @@ def _problem(what: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401 - an event o
 
 
 class _Misread(Exception):
-    """Raised if stand-ins (:data:`_STAND_IN`) cannot replace the lists of a text."""
+    # stand-ins (_STAND_IN) cannot replace the lists of a text
+    pass
 
 
 class _Parser:
     """Builds the values of a text in one pass over PyYAML's events.
 
-    Deep nesting is refused, because recursive code that reads the values could fail. Some lists of
-    the text may have been cut out and replaced by placeholders (:data:`_STAND_IN`); ``lists`` maps
-    each placeholder to its list.
+    ``lists`` maps each placeholder (:data:`_STAND_IN`) in the text to the list that it replaces.
     """
 
     def __init__(self, text: str, lists: Mapping[str, list[str]] = MappingProxyType({})) -> None:
@@ -120,22 +116,36 @@ class _Parser:
     def _value(self, event: Any, depth: int) -> Any:  # noqa: ANN401
         kind = type(event)
         if kind is yaml.AliasEvent or event.anchor:
+            # a few lines of aliases of aliases would grow to more than the memory holds
             where = f"line {event.start_mark.line + 1}"
             message = "anchors and aliases (& and *) are not allowed; write the value out"
             raise InvalidInput.at(where, message)
+        if kind is yaml.ScalarEvent and event.value in self._lists:
+            if event.tag or not event.implicit[0] or depth > MAX_DEPTH:
+                raise _Misread
+            return self._lists.pop(event.value)
         if kind is yaml.ScalarEvent:
-            return self._list(event, depth) if event.value in self._lists else self._scalar(event)
+            return self._scalar(event)
+        # recursive code that later reads the values could exceed Python's limit
         if depth > MAX_DEPTH:
             raise InvalidInput.at("", f"is nested deeper than {MAX_DEPTH} levels; make it flatter")
         name = "seq" if kind is yaml.SequenceStartEvent else "map"
         if event.tag not in (None, "!", f"{_TAG}{name}"):
             raise _refused_tag(event.tag, event)
-        return self._sequence(depth) if name == "seq" else self._mapping(depth)
-
-    def _list(self, event: Any, depth: int) -> list[str]:  # noqa: ANN401
-        if event.tag or not event.implicit[0] or depth > MAX_DEPTH:
-            raise _Misread
-        return self._lists.pop(event.value)
+        if name == "seq":
+            items = []
+            while type(event := self._next()) is not yaml.SequenceEndEvent:
+                items.append(self._value(event, depth + 1))
+            return items
+        mapping: dict[str, Any] = {}
+        while type(event := self._next()) is not yaml.MappingEndEvent:
+            key = self._value(event, depth + 1)
+            if not isinstance(key, str):  # YAML 1.1 reads the key `on` as true
+                raise _problem(f"the key {short_repr(key)} must be text; put it in quotes", event)
+            if key in mapping:  # parsers differ in which of the two counts
+                raise _problem(f"the key {key!r} appears twice; remove one", event)
+            mapping[key] = self._value(self._next(), depth + 1)
+        return mapping
 
     def _scalar(self, event: Any) -> Any:  # noqa: ANN401
         tag = event.tag
@@ -146,23 +156,6 @@ class _Parser:
         if tag not in _CONSTRUCT:
             raise _refused_tag(tag, event)
         return _CONSTRUCT[tag](yaml.ScalarNode(tag, event.value, event.start_mark))
-
-    def _sequence(self, depth: int) -> list[Any]:
-        items = []
-        while type(event := self._next()) is not yaml.SequenceEndEvent:
-            items.append(self._value(event, depth + 1))
-        return items
-
-    def _mapping(self, depth: int) -> dict[str, Any]:
-        seen: dict[str, Any] = {}
-        while type(event := self._next()) is not yaml.MappingEndEvent:
-            key = self._value(event, depth + 1)
-            if not isinstance(key, str):
-                raise _problem(f"the key {short_repr(key)} must be text; put it in quotes", event)
-            if key in seen:
-                raise _problem(f"the key {key!r} appears twice; remove one", event)
-            seen[key] = self._value(self._next(), depth + 1)
-        return seen
 
 
 def _refused_tag(tag: str, at: Any) -> yaml.YAMLError:  # noqa: ANN401
@@ -176,10 +169,7 @@ _SEQUENCE = yaml.SequenceStartEvent(None, None, True, flow_style=False), yaml.Se
 
 
 def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
-    """Yield PyYAML's events that write a value.
-
-    A part that occurs twice in the value is written twice, without an anchor.
-    """
+    # PyYAML's own dumper would write an anchor for a part that occurs twice, and `load` takes none
     if isinstance(value, str):
         yield _text(value)
     elif isinstance(value, list | tuple):
@@ -198,7 +188,6 @@ def _events(value: Any) -> Iterator[yaml.Event]:  # noqa: ANN401
 
 
 def _number(value: object) -> str:
-    """Return the text of a number, a truth value or null."""
     return str(_REPRESENTER.represent_data(value).value)
 
 
@@ -207,23 +196,20 @@ def _text(text: str) -> yaml.ScalarEvent:
     """Return PyYAML's event that writes a text, in quotes if a parser could misread the text."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
         return yaml.ScalarEvent(None, None, (True, False), text)
-    style = "|" if _readable_block(text) else '"'
-    return yaml.ScalarEvent(None, None, (False, True), text, style=style)
-
-
-def _readable_block(text: str) -> bool:
-    """Return whether to write a text of several lines as a literal block (``|``)."""
-    return (
+    # a literal block has no escapes, and with another begin or end it would need an indicator
+    is_block = (
         text.endswith("\n")
         and not text.endswith("\n\n")
         and not text.startswith((" ", "\n"))
         and text.count("\n") > 1
         and not re.search(r"[ \t]\n|[^\x20-\x7e\n]", text)
     )
+    style = "|" if is_block else '"'
+    return yaml.ScalarEvent(None, None, (False, True), text, style=style)
 
 
 def short_repr(value: object) -> str:
-    """Return a short form of any value for a message: ``'text'``, ``5``, ``true`` or ``null``."""
+    """Return a short form of any value for a message, as YAML or Python writes it."""
     if value is None or isinstance(value, bool):
         return json.dumps(value)
     try:
@@ -243,7 +229,8 @@ def _strict(file: str) -> Iterator[None]:
         message = f"not valid YAML: {problem or str(error).splitlines()[0]}"
         raise InvalidInput.at(where, message, file=file) from error
     except _MISFITS as error:
-        raise InvalidInput.at("", _MISFIT, file=file) from error
+        message = "not valid YAML: it has a tag, number or character that cannot be read"
+        raise InvalidInput.at("", message, file=file) from error
     except InvalidInput as error:
         raise InvalidInput(faults_in(error, file)) from None
 
@@ -251,9 +238,7 @@ def _strict(file: str) -> Iterator[None]:
 def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]:
     """Yield the documents of ``text``; more than ``most`` are an error.
 
-    Raises:
-        InvalidInput: if ``text`` is not strict YAML, maybe only after some documents; the fault
-            names ``file``.
+    The error may come only after some documents.
     """
     if len(text) > MAX_LENGTH:
         message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
@@ -262,25 +247,39 @@ def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]
         yield from _Parser(text).documents(most)
 
 
+# Matches a field with a list of plain texts, as `to_json` writes it
 _LISTED = re.compile(
     r'^( *[A-Za-z][\w-]*: )(\["[ !#-\[\]-~]*"(?:, "[ !#-\[\]-~]*")*\])$', re.MULTILINE
 )
-"""Matches a field with a list of plain texts, as :func:`to_json` writes it."""
+# Lists of at least this many characters are read by the json module. It is 20 times faster than
+# PyYAML.
 _LONG = 200
-"""Lists of at least this many characters are read by the json module.
-
-It is 20 times faster than PyYAML.
-"""
+# The prefix of the stand-ins: words that replace long lists while PyYAML reads the other text
 _STAND_IN = "demandops-list"
-"""The prefix of the stand-ins: words that replace long lists while PyYAML reads the other text."""
 
 
-def _load_around_lists(text: str) -> list[Any]:
-    """Read a document with PyYAML, but its long lists with the json module.
+# How many characters a text may have for its value to be cached
+_MOST_CACHED = 10_000
 
-    Return a list with the document as its only item. Return an empty list if the text has no long
-    lists, or cannot be read in this way.
-    """
+
+def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which models then parse
+    """Return the only document of ``text``, or ``None`` if ``text`` has no document."""
+    try:
+        if len(text) > _MOST_CACHED:
+            return _only_document(text)
+        return marshal.loads(_document_as_bytes(text))  # noqa: S302 - bytes of this process
+    except InvalidInput as error:
+        raise InvalidInput(faults_in(error, file)) from error.__cause__
+
+
+# Most files are unchanged when a configuration is loaded again. To read the bytes takes a fiftieth
+# of the time of parsing, and gives each caller a copy of its own.
+@lru_cache(1024)
+def _document_as_bytes(text: str) -> bytes:
+    return marshal.dumps(_only_document(text))
+
+
+def _only_document(text: str) -> Any:  # noqa: ANN401
     lists: dict[str, list[str]] = {}
 
     def stand_in(match: re.Match[str]) -> str:
@@ -290,50 +289,19 @@ def _load_around_lists(text: str) -> list[Any]:
         lists[name] = json.loads(match[2])
         return match[1] + name
 
-    if not _LONG <= len(text) <= MAX_LENGTH or _STAND_IN in text:
-        return []
-    short = _LISTED.sub(stand_in, text)
-    with suppress(_Misread, yaml.YAMLError, InvalidInput, *_MISFITS):
-        return list(_Parser(short, lists).documents(1)) if lists else []
-    return []
-
-
-def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which models then parse
-    """Return the only document of ``text``, or ``None`` if ``text`` has no document.
-
-    Raises:
-        InvalidInput: if ``text`` is not strict YAML or has several documents; the fault names
-            ``file``.
-    """
-    try:
-        if len(text) > _MOST_KEPT:
-            return _only_document(text)
-        return marshal.loads(_kept(text))  # noqa: S302 - bytes of this process
-    except InvalidInput as error:
-        raise InvalidInput(faults_in(error, file)) from error.__cause__
-
-
-_MOST_KEPT = 10_000
-"""How many characters a text may have for its value to be cached."""
-
-
-@lru_cache(1024)
-def _kept(text: str) -> bytes:
-    """Return the parsed value of a YAML text, serialized with marshal; results are cached.
-
-    Each caller deserializes the bytes, and so gets a copy of its own. Most files are unchanged when
-    a configuration is loaded again, and deserializing takes a fiftieth of the time of parsing.
-    """
-    return marshal.dumps(_only_document(text))
-
-
-def _only_document(text: str) -> Any:  # noqa: ANN401
-    documents = _load_around_lists(text) or list(load_all(text, most=1))
+    if _LONG <= len(text) <= MAX_LENGTH and _STAND_IN not in text:
+        short = _LISTED.sub(stand_in, text)
+        if lists:
+            # a text that cannot be read in this way is read as it is, for the right fault and line
+            with suppress(_Misread, yaml.YAMLError, InvalidInput, *_MISFITS):
+                if documents := list(_Parser(short, lists).documents(1)):
+                    return documents[0]
+    documents = list(load_all(text, most=1))
     return documents[0] if documents else None
 
 
 def dump(data: Mapping[str, Any]) -> str:
-    """Return ``data`` as block YAML in the given order, with a newline at the end."""
+    """Return ``data`` as block YAML, in its order."""
     try:
         return _block(data, "").lstrip("\n ") + "\n"
     except _NotSimple:
@@ -342,46 +310,39 @@ def dump(data: Mapping[str, Any]) -> str:
 
 
 class _NotSimple(Exception):
-    """Raised for a text that only PyYAML writes: with escapes, of several lines, or long."""
+    # only PyYAML writes such a text: with escapes, of several lines, or long
+    pass
 
 
+# Matches a text that fits in double quotes on one line, without escapes
 _SIMPLE = re.compile(r"[ !#-\[\]-~]{0,1000}")
-"""Matches a text that fits in double quotes on one line, without escapes."""
-_MOST_OF_KEY = 100
+_LONGEST_KEY = 100  # PyYAML writes longer ones (128) on a line of their own, after `?`
 
 
 def _block(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Write a value as YAML: return the text that follows ``key:`` or ``-``.
-
-    Further lines begin with ``indent``. PyYAML writes the same text, but takes ten times as long.
-    """
+    """Return the YAML text that follows ``key:`` or ``-``; further lines begin with ``indent``."""
+    # PyYAML writes the same text, but takes ten times as long
     if isinstance(value, str):
-        return f" {_scalar(value)}"
+        return f" {_simple_text(value)}"
+    inner = f"{indent}  "
     if isinstance(value, list | tuple):
-        before = f"\n{indent}-"
-        return "".join([before + _item(item, indent) for item in value]) or " []"
+        # the first line of an item's block is beside its dash
+        items = [_block(item, inner).replace(f"\n{inner}", " ", 1) for item in value]
+        return "".join([f"\n{indent}-{item}" for item in items]) or " []"
     if isinstance(value, Mapping):
-        return "".join([_field(key, item, indent) for key, item in value.items()]) or " {}"
+        fields = []
+        for key, item in value.items():
+            if len(key) > _LONGEST_KEY:
+                raise _NotSimple
+            # a list below a key is not indented further, as PyYAML has it
+            block = _block(item, indent if isinstance(item, list | tuple) else inner)
+            fields.append(f"\n{indent}{_simple_text(key)}:{block}")
+        return "".join(fields) or " {}"
     return f" {_number(value)}"
 
 
-def _item(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Write a list's item as YAML: return the text that follows the item's dash."""
-    if isinstance(value, str):
-        return f" {_scalar(value)}"
-    inner = f"{indent}  "
-    return _block(value, inner).replace(f"\n{inner}", " ", 1)
-
-
-def _field(key: str, value: Any, indent: str) -> str:  # noqa: ANN401
-    if len(key) > _MOST_OF_KEY:
-        raise _NotSimple
-    inner = indent if isinstance(value, list | tuple) else f"{indent}  "
-    return f"\n{indent}{_scalar(key)}:{_block(value, inner)}"
-
-
 @_cached
-def _scalar(text: str) -> str:
+def _simple_text(text: str) -> str:
     style = _text(text).style
     if not style:
         return text
@@ -393,11 +354,8 @@ def _scalar(text: str) -> str:
 def set_key(text: str, key: str, value: object) -> str:
     """Return a file's text with one top-level key set; the rest stays, including comments.
 
-    A text, number, truth value or null is replaced in place. A missing key is added at the end.
-
-    Raises:
-        InvalidInput: if the text is not valid YAML, or if its form does not permit the change. A
-            list or a mapping, for example, cannot be replaced.
+    A text, number, truth value or null is replaced in place. A missing key is added at the end. A
+    form that does not permit this, such as a list, is a fault.
     """
     with _strict(""):
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -409,8 +367,9 @@ def set_key(text: str, key: str, value: object) -> str:
     else:
         newline = "" if text.endswith("\n") else "\n"
         added = f"{newline}\n{dump({key: value})}"
+        # a file from Windows keeps its line ends
         changed = text + (added.replace("\n", "\r\n") if "\r\n" in text else added)
-    try:
+    try:  # the text may have other forms than those above, such as flow style
         succeeded = load(changed) == {**load(text), key: value}
     except (InvalidInput, TypeError):
         succeeded = False
@@ -423,11 +382,8 @@ def set_key(text: str, key: str, value: object) -> str:
 def to_json(value: object) -> str:
     """Return ``value`` as JSON that is also valid YAML. ``{{ … }}`` in a template writes this text.
 
-    Characters that YAML cannot print become ``\\uXXXX``; the others stay readable.
-
-    Raises:
-        TypeError: if a part of ``value`` cannot be JSON, for example a method.
-        ValueError: if a number in ``value`` is infinite or not a number.
+    Raises TypeError for a part that is no data, for example a method, and ValueError for a number
+    that is infinite or not a number.
     """
     text = _JSON.encode(value)
     if "e-" in text or "e+" in text:
@@ -454,5 +410,4 @@ _JSON = json.JSONEncoder(ensure_ascii=False, allow_nan=False, default=_unknown)
 
 
 def faults_in(error: InvalidInput, file: str) -> list[Fault]:
-    """Return the faults of ``error``, located in ``file``."""
     return [fault.within(file) for fault in error.faults]

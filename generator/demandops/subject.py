@@ -6,28 +6,22 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import TypeAlias
 
+# The identity of a topic within its subject. In an application, that is role, topic and source; an
+# application without inputs has one empty key. In a connection, that is the topic's name on the
+# source node.
 TopicKey: TypeAlias = "tuple[str, ...]"
-"""The identity of a topic within its subject.
-
-In an application, that is role, topic and source; an application without inputs has one empty key.
-In a connection, that is the topic's name on the source node.
-"""
 
 
 class SubjectKind(Enum):
-    """The kinds of subjects; the values are the ledger's folder names."""
-
+    # the values are the names of folders in ledger/
     APPLICATION = "applications"
     CONNECTION = "connections"
 
 
 @dataclass(frozen=True, slots=True)
 class Subject:
-    """An application or a connection, by its exact id."""
-
     kind: SubjectKind
     id: str
 
     def __str__(self) -> str:
-        """Return the kind and the id, for example ``application 'edge/fusion'``."""
         return f"{self.kind.value[:-1]} '{self.id}'"

@@ -54,32 +54,23 @@ class Dependency:
 
 
 def dependencies(folder: str, files: Mapping[str, str]) -> tuple[Dependency, ...]:
-    """Return the dependencies of a chart; empty if its ``Chart.yaml`` cannot be read.
-
-    A dependency with a name that Helm does not allow is left out; :func:`faults` has a fault for
-    it.
-    """
+    """Return the dependencies of a chart, without those for which :func:`faults` has a fault."""
     return _metadata(folder, files.get(f"{folder}/Chart.yaml", ""))[0]
 
 
 def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the folders of a chart and of the libraries that it needs, directly or indirectly.
-
-    Only libraries with a :attr:`Dependency.folder` are included, even if the folder is missing.
-    """
-    found, waiting = {folder: None}, [folder]
-    for one in waiting:
-        needed = (each.folder for each in dependencies(one, files))
-        new = [each for each in dict.fromkeys(needed) if each and each not in found]
-        found |= dict.fromkeys(new)
-        waiting += new
-        if len(found) > _MOST_LIBRARIES:  # with_libraries refuses such a chart
+    """Return the folders of a chart and of the libraries that it needs, missing or not."""
+    needed = [folder]
+    for chart in needed:  # which grows meanwhile
+        libraries = dict.fromkeys(each.folder for each in dependencies(chart, files))
+        needed += [library for library in libraries if library and library not in needed]
+        if len(needed) > _MOST_LIBRARIES:  # with_libraries refuses such a chart
             break
-    return tuple(found)
+    return tuple(needed)
 
 
 def below(folder: str, paths: Sequence[str]) -> Sequence[str]:
-    """Return those of the sorted ``paths`` that are in a folder."""
+    # "0" is the character after "/"
     return paths[bisect_left(paths, f"{folder}/") : bisect_left(paths, f"{folder}0")]
 
 
@@ -88,30 +79,21 @@ def with_libraries(
 ) -> tuple[dict[str, str], str]:
     """Return the files of a chart, with the files of its libraries in ``charts/``.
 
-    Args:
-        folder: the folder of the chart.
-        files: the files of the state repo, as path → text.
-        paths: the sorted paths of ``files``.
-
-    Returns:
-        The files as path in the chart → path in the state repo, and the name of a dependency that
-        is neither in the state repo nor in ``charts/``, or an empty text.
-
-    Raises:
-        InvalidInput: if libraries depend on each other in a circle, if the copies of libraries are
-            too many or too large, or if there is an archive in ``charts/``.
+    The first result maps paths in the chart to paths in the state repo; ``paths`` are the sorted
+    paths of ``files``. The second is the name of a dependency that is neither in the state repo nor
+    in ``charts/``, or empty.
     """
-    found, missing, characters = dict[str, str](), "", 0
+    origins, missing, characters = dict[str, str](), "", 0
     waiting: list[tuple[str, tuple[str, ...]]] = [("", (folder,))]
     for prefix, line in waiting:  # line: the chart, and libraries that each need the next
         here = line[-1]
         for path in below(here, paths):
-            found[prefix + path[len(here) + 1 :]] = path
+            origins[prefix + path[len(here) + 1 :]] = path
             characters += len(files[path])
-        libraries = {one.name: one for one in dependencies(here, files) if one.folder}
+        libraries = {each.name: each for each in dependencies(here, files) if each.folder}
         if (
             len(waiting) + len(libraries) > _MOST_LIBRARIES
-            or len(found) > _MOST_FILES
+            or len(origins) > _MOST_FILES
             or characters > _MOST_CHARACTERS
         ):
             message = (
@@ -122,39 +104,33 @@ def with_libraries(
             raise InvalidInput.at("dependencies", message, file=f"{folder}/Chart.yaml")
         for name, library in libraries.items():
             place = f"{prefix}charts/{name}/"
-            found = {path: of for path, of in found.items() if not f"{path}/".startswith(place)}
+            origins = {at: path for at, path in origins.items() if not f"{at}/".startswith(place)}
             if library.folder in line:
                 circle = " → ".join((*line[line.index(library.folder) :], library.folder))
                 message = f"these charts need each other: {circle}; remove one of the dependencies"
                 where = f"dependencies[{library.index}]"
                 raise InvalidInput.at(where, message, file=f"{here}/Chart.yaml")
             waiting.append((place, (*line, str(library.folder))))
-        for one in dependencies(here, files):
-            if not one.folder and f"{prefix}charts/{one.name}/Chart.yaml" not in found:
-                missing = missing or one.name
+        for dependency in dependencies(here, files):
+            copy = f"{prefix}charts/{dependency.name}/Chart.yaml"
+            if not dependency.folder and copy not in origins:
+                missing = missing or dependency.name
     archives = [
         fault(
             "",
             "is an archive, which hides what the chart has; unpack it (`tar -xzf`) into a folder "
             "of charts/, and remove it",
         ).within(path)
-        for place, path in found.items()
+        for place, path in origins.items()
         if _ARCHIVE.search(place)
     ]
     if archives:
         raise InvalidInput(archives)
-    return found, missing
+    return origins, missing
 
 
 def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
-    """Return the default values of a chart.
-
-    These are the chart's own values, merged by Helm's rules over the values that it imports by name
-    from libraries in the state repo. A missing ``values.yaml`` has no values.
-
-    Raises:
-        InvalidInput: if a ``values.yaml`` is not valid YAML.
-    """
+    """Return a chart's own values, merged over those that it imports by name from libraries."""
     imported: dict[str, Any] = {}
     for dependency in dependencies(folder, files):
         if dependency.folder and dependency.imports:
@@ -167,11 +143,7 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values ``above`` merged over the values ``below`` by Helm's rules.
-
-    Mappings are merged key by key. A null in ``above`` removes the key. Any other value in
-    ``above`` replaces the value in ``below``.
-    """
+    """Return the values ``above`` merged over the values ``below`` by Helm's rules."""
     result = dict(below)
     for key, value in above.items():
         if value is None:
@@ -197,41 +169,30 @@ def merge_patch(target: Any, patch: Any) -> Any:  # noqa: ANN401 - any JSON
 
 
 def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield the faults in the metadata of a chart or library.
-
-    Such a fault is a name that Helm does not allow; a library that is not in the folder which
-    ``file://…`` names for it; and an exact version that is not the library's. Libraries with
-    another kind of ``repository`` are not checked.
-    """
     path = f"{folder}/Chart.yaml"
     for place, name in _metadata(folder, files.get(path, ""))[1]:
         message = f"{name} is not a name that Helm allows; use letters, digits, '-', '_' and '.'"
         yield fault(place, message).within(path)
-    for one in dependencies(folder, files):
-        if not one.repository.startswith(_LOCAL):
+    for dependency in dependencies(folder, files):
+        if not dependency.repository.startswith(_LOCAL):
             continue
-        place = f"dependencies[{one.index}]"
-        text = files.get(f"{one.folder}/Chart.yaml") if one.folder else None
+        library, place = dependency.folder, f"dependencies[{dependency.index}]"
+        text = files.get(f"{library}/Chart.yaml") if library else None
         if text is None:
-            wrong = (
-                f"'{one.folder}/Chart.yaml' does not exist"
-                if one.folder
-                else "that folder is not in appdefs/"
-            )
+            wrong = "that folder is not in appdefs/"
+            if library:
+                wrong = f"'{library}/Chart.yaml' does not exist"
             message = (
-                f"{quoted(one.repository)}: {wrong}; correct the path, which is relative to "
+                f"{quoted(dependency.repository)}: {wrong}; correct the path, which is relative to "
                 "the chart's folder and must not lead out of appdefs/"
             )
-            yield fault(f"{place}.repository", message).within(f"{folder}/Chart.yaml")
+            yield fault(f"{place}.repository", message).within(path)
             continue
         version = _mapping(text).get("version")
-        if _EXACT.fullmatch(one.version) and one.version != version:
+        if _EXACT.fullmatch(dependency.version) and dependency.version != version:
             has = f"is version {version}" if version else "has no readable version"
-            message = (
-                f"requires {one.version}, but the library in {one.folder} {has}; make the versions "
-                "equal"
-            )
-            yield fault(f"{place}.version", message).within(f"{folder}/Chart.yaml")
+            message = f"requires {dependency.version}, but the library in {library} {has}; make "
+            yield fault(f"{place}.version", f"{message}the versions equal").within(path)
 
 
 @lru_cache(maxsize=4096)
@@ -239,52 +200,40 @@ def _metadata(folder: str, text: str) -> tuple[tuple[Dependency, ...], tuple[tup
     """Return the dependencies in a ``Chart.yaml``, and field and value of each wrong name."""
     metadata = _mapping(text)
     listed = metadata.get("dependencies")
-    found, wrong = list[Dependency](), list[tuple[str, str]]()
+    valid, wrong = list[Dependency](), list[tuple[str, str]]()
     if not _is_name(metadata.get("name", "unnamed")):
         wrong.append(("name", quoted(str(metadata["name"]))))
-    for index, one in enumerate(listed if isinstance(listed, list) else ()):
-        if not isinstance(one, dict):
+    for index, entry in enumerate(listed if isinstance(listed, list) else ()):
+        if not isinstance(entry, dict):
             continue
-        name, alias = one.get("name"), one.get("alias") or one.get("name")
+        name, alias = entry.get("name"), entry.get("alias") or entry.get("name")
         names = {"name": name, "alias": alias}
         bad = [field for field, value in names.items() if not _is_name(value)]
         if bad:
             value = quoted(str(names[bad[0]]))
             wrong.append((f"dependencies[{index}].{bad[0]}", value))
             continue
-        repository = str(one.get("repository") or "")
-        found.append(
+        repository, imports = str(entry.get("repository") or ""), entry.get("import-values")
+        path = posixpath.normpath(posixpath.join(folder, repository.removeprefix(_LOCAL)))
+        # Flux fetches charts only from appdefs/
+        is_fetched = repository.startswith(_LOCAL) and path.startswith("appdefs/")
+        valid.append(
             Dependency(
                 index,
                 str(name),
                 str(alias),
-                str(one.get("version")),
+                str(entry.get("version")),
                 repository,
-                _local_folder(folder, repository),
-                _imports(one.get("import-values")),
-                bool(one.get("condition") or one.get("tags")),
+                path if is_fetched else None,
+                tuple(map(str, imports)) if isinstance(imports, list) else (),
+                bool(entry.get("condition") or entry.get("tags")),
             )
         )
-    return tuple(found), tuple(wrong)
+    return tuple(valid), tuple(wrong)
 
 
 def _is_name(value: object) -> bool:
     return isinstance(value, str) and _NAME.fullmatch(value) is not None
-
-
-def _imports(listed: object) -> tuple[str, ...]:
-    return tuple(map(str, listed)) if isinstance(listed, list) else ()
-
-
-def _local_folder(folder: str, repository: str) -> str | None:
-    """Return the folder of a library in the state repo; None if it is not in ``appdefs/``.
-
-    Flux fetches charts only from ``appdefs/``.
-    """
-    if not repository.startswith(_LOCAL):
-        return None
-    path = posixpath.normpath(posixpath.join(folder, repository.removeprefix(_LOCAL)))
-    return path if path.startswith("appdefs/") else None
 
 
 def _values(folder: str, files: Mapping[str, str]) -> dict[str, Any]:

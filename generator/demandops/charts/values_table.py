@@ -18,58 +18,54 @@ _HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------
 
 
 def descriptions(text: str) -> dict[str, str]:
-    """Return the description of each value in the text of a ``values.yaml`` that has one.
-
-    The keys are paths like ``image.tag``. A description is the comment ``# --`` before a value.
-    """
-    found: dict[str, str] = {}
+    """Return the descriptions in a ``values.yaml``, by paths like ``image.tag``."""
+    described: dict[str, str] = {}
     path: list[tuple[int, str]] = []
-    said: list[str] = []
+    words: list[str] = []
     for line in text.splitlines():
         comment = line.strip()
         if comment.startswith("# -- "):
-            said = [comment.removeprefix("# -- ")]
-        elif comment.startswith("# ") and said:
-            said.append(comment.removeprefix("# "))
+            words = [comment.removeprefix("# -- ")]
+        elif comment.startswith("# ") and words:
+            words.append(comment.removeprefix("# "))
         elif key := _KEY.match(line):
             indent = len(key[1])
-            path = [*(one for one in path if one[0] < indent), (indent, key[2])]
-            if said:
-                found[".".join(name for _, name in path)] = " ".join(said)
-            said = []
+            path = [*(step for step in path if step[0] < indent), (indent, key[2])]
+            if words:
+                described[".".join(name for _, name in path)] = " ".join(words)
+            words = []
         else:
-            said = []
-    return found
+            words = []
+    return described
 
 
 def table(text: str, root: str = "") -> str:
     """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``.
 
-    The table has each value with a description. A value without one is in the table if no keys are
-    below it and no mapping around it has a description. Callers pass a ``root`` that exists, and
-    values that are not null.
+    Callers pass a ``root`` that exists, and values that are not null.
     """
     values: Any = strict_yaml.load(text)
     prefix = f"{root}." if root else ""
-    told = {
-        path.removeprefix(prefix): said
-        for path, said in descriptions(text).items()
+    words = {
+        path.removeprefix(prefix): description
+        for path, description in descriptions(text).items()
         if path.startswith(prefix)
     }
     for step in root.split(".") if root else ():
         values = values[step]
-    rows = sorted(_rows(values, "", told, True), key=lambda row: row[0].lower())
+    rows = sorted(_rows(values, "", words, True), key=lambda row: row[0].lower())
     return _HEAD + "".join(f"| {' | '.join(row)} |\n" for row in rows)
 
 
 def _rows(
-    values: Mapping[str, Any], prefix: str, told: Mapping[str, str], leaves: bool
+    values: Mapping[str, Any], prefix: str, words: Mapping[str, str], leaves: bool
 ) -> Iterator[tuple[str, str, str, str]]:
     for name, value in values.items():
         path = f"{prefix}{name}"
         nested = isinstance(value, dict) and bool(value)
-        if path in told or (leaves and not nested):
+        if path in words or (leaves and not nested):
             default = json.dumps(value, ensure_ascii=False, sort_keys=True, separators=(",", ":"))
-            yield path, _TYPES[type(value)], f"`{default}`", told.get(path, "")
+            yield path, _TYPES[type(value)], f"`{default}`", words.get(path, "")
         if nested:
-            yield from _rows(value, f"{path}.", told, leaves and path not in told)
+            # below a mapping with a description, only values with one of their own are listed
+            yield from _rows(value, f"{path}.", words, leaves and path not in words)

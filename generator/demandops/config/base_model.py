@@ -28,19 +28,18 @@ from demandops.quoting import quoted
 Model = TypeVar("Model", bound=BaseModel)
 Item = TypeVar("Item")
 
+# A list in a file. The model has the items as a tuple.
 Items = Annotated[tuple[Item, ...], Field(strict=False)]
-"""A list in a file. The model has the items as a tuple."""
 
 Positive = Annotated[int, Field(ge=1)]
-"""A whole number above zero."""
 
+# A name that is valid in Kubernetes (RFC 1123 label)
 DnsLabel = Annotated[
     str, StringConstraints(pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$", max_length=63)
 ]
-"""A name that is valid in Kubernetes (RFC 1123 label)."""
 
+# A short name in a configuration file, such as that of a role, a channel or a capability
 Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
-"""A short name in a configuration file, such as that of a role, a channel or a capability."""
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
@@ -56,10 +55,7 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 def readable_by(parse: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that rejects a text for which ``parse`` raises a ValueError.
-
-    The validator leaves a valid text unchanged.
-    """
+    """Return a validator that rejects a value for which ``parse`` raises a ValueError."""
 
     def check(value: str) -> str:
         parse(value)
@@ -73,17 +69,14 @@ def _hidden(value: str) -> str:
     return control and f"{quoted(value)} has the control character {control}; remove it"
 
 
+# A validator that rejects control characters, and characters that reorder text. Line breaks and
+# tabs are valid.
 Visible = without(_hidden)
-"""A validator that rejects control characters, and characters that reorder text.
 
-Line breaks and tabs are valid.
-"""
-
+# Any text that `Visible` accepts
 Text = Annotated[str, Visible]
-"""Any text that :data:`Visible` accepts."""
 
 Approval = Literal["none", "required"]
-"""Whether a demand needs a person's approval."""
 
 
 class FrozenModel(BaseModel):
@@ -115,21 +108,16 @@ def faults_of(
 
     ``place`` is the path to the validated value in the file, ``()`` for the whole file.
     """
-    return [
-        fault(field_path((*place, *item["loc"])), _message(dict(item), model)).within(file)
-        for item in error.errors(include_url=False)[:most]
-        if not _is_wrongly_short(dict(item))
-    ]
-
-
-def _is_wrongly_short(item: dict[str, Any]) -> bool:
-    """Return whether an error says that a list is too short, although it has enough items.
-
-    Pydantic counts only valid items. The error can be left out, because the faulty items have
-    faults of their own.
-    """
-    is_short = item["type"] == "too_short" and isinstance(item.get("input"), list)
-    return is_short and len(item["input"]) >= item["ctx"]["min_length"]
+    faults = []
+    for item in error.errors(include_url=False)[:most]:
+        value = item.get("input")
+        is_short = item["type"] == "too_short" and isinstance(value, list)
+        # pydantic counts only valid items, and the invalid ones have faults of their own
+        if is_short and len(value) >= item["ctx"]["min_length"]:
+            continue
+        path = field_path((*place, *item["loc"]))
+        faults.append(fault(path, _message(dict(item), model)).within(file))
+    return faults
 
 
 _EXPECTED = {
@@ -148,15 +136,15 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     if kind == "missing":
         return "is missing; add it"
     if kind == "extra_forbidden":
-        name = str(item["loc"][-1])
-        known = _fields(model) if len(item["loc"]) == 1 else []
-        return "is not a field here; remove it or correct its spelling" + (
-            suggestion(name, known) if known else ""
-        )
+        message = "is not a field here; remove it or correct its spelling"
+        if len(item["loc"]) == 1:  # deeper, the field belongs to a model that is not known here
+            fields = [field.alias or name for name, field in model.model_fields.items()]
+            message += suggestion(str(item["loc"][-1]), fields)
+        return message
     if kind == "string_type" and isinstance(value, int | float):
         return f"must be text, not {strict_yaml.short_repr(value)}; put it in quotes"
     if kind == "literal_error":
-        expected = str(item["ctx"]["expected"]).replace("True", "true")
+        expected = str(item["ctx"]["expected"]).replace("True", "true")  # as YAML has it
         return f"is {strict_yaml.short_repr(value)}, but must be {expected}"
     if kind == "string_pattern_mismatch":
         pattern = item["ctx"]["pattern"]
@@ -171,16 +159,10 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     return f"{expected}, not {strict_yaml.short_repr(value)}"
 
 
-def _fields(model: type[BaseModel]) -> list[str]:
-    return [field.alias or name for name, field in model.model_fields.items()]
-
-
 def parse(model: type[Model], data: object, file: str = "") -> Model:
     """Validate plain data, and return it as an instance of ``model``.
 
-    Raises:
-        InvalidInput: with the faults of all fields; each names ``file``. Rules about several fields
-            are checked only if each field is valid.
+    Rules about several fields are checked only if each field is valid.
     """
     try:
         return model.model_validate(data)
@@ -189,11 +171,7 @@ def parse(model: type[Model], data: object, file: str = "") -> Model:
 
 
 def parse_file(model: type[Model], text: str, file: str) -> Model:
-    """Parse the text of a YAML file, and return its content as an instance of ``model``.
-
-    Raises:
-        InvalidInput: if the text is not strict YAML, is not a mapping, or does not fit ``model``.
-    """
+    """Parse the text of a YAML file, and return its content as an instance of ``model``."""
     data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
         message, version = "must be a mapping", model.model_fields.get("apiVersion")

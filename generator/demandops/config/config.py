@@ -33,6 +33,9 @@ IMAGES_FILE = "registry/images.yaml"
 CLIENTS_FILE = "registry/clients.yaml"
 VERSIONS_FILE = "registry/versions.yaml"
 
+# The collections of entries, each named by the file that usually lists its entries. Files in the
+# folder `inventory/nodes/` may list further entries of the collection `inventory/nodes.yaml`, and
+# likewise for the others (`collection_of`).
 COLLECTIONS = (
     CLUSTERS_FILE,
     NODES_FILE,
@@ -43,33 +46,25 @@ COLLECTIONS = (
     CLIENTS_FILE,
     VERSIONS_FILE,
 )
-"""The collections of entries, each named by the file that usually lists its entries.
 
-Files in the folder ``inventory/nodes/`` may list further entries of the collection
-``inventory/nodes.yaml``, and likewise for the others (:func:`collection_of`).
-"""
-
+# The top-level entries of a state repo that hold the configuration, which people write
 CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
-"""The top-level entries of a state repo that hold the configuration, which people write."""
 
 
 def collection_of(path: str) -> str | None:
-    """Return the collection to which the entries of a file belong.
+    """Return the collection to which the entries of a file belong, if any.
 
     ``inventory/nodes.yaml`` and ``inventory/nodes/berlin.yaml`` have entries of the collection
-    ``inventory/nodes.yaml``. Return ``None`` if a file does not belong to a collection.
+    ``inventory/nodes.yaml``.
     """
     folder, _, name = path.rpartition("/")
     if name.startswith(".") or not name.endswith(".yaml"):
         return None
-    return next((one for one in (path, f"{folder}.yaml") if one in COLLECTIONS), None)
+    return next((file for file in (path, f"{folder}.yaml") if file in COLLECTIONS), None)
 
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
-    """Return the text for a collection's files: ``inventory/nodes.yaml or inventory/nodes/``.
-
-    ``files`` are the files that have entries of the collection.
-    """
+    """Return the text for a collection's files: ``inventory/nodes.yaml or inventory/nodes/``."""
     used = {*files} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
     return " or ".join([collection] * (collection in used) + folder)
@@ -91,105 +86,98 @@ class Config:
     images: Mapping[str, Image]
     appdefs: Mapping[str, ApplicationDefinition]
     definitions: Mapping[str, ServiceDefinition]
+    # For each appdef, its own services and those of `definitions` that it uses
     services: Mapping[str, Services]
-    """For each appdef, its own services and those of ``definitions`` that it uses."""
     domain_of: Mapping[str, AccessDomain]
-    """The access domain of each node that is in one."""
+    # The text of each file below `appdefs/`, such as a template or a chart, by path
     files: Mapping[str, str]
-    """The text of each file below ``appdefs/``, such as a template or a chart, by path."""
+    # For each node in a further access domain (`edge@city`), the inventory's id (`edge`)
     hosts: Mapping[str, str] = field(default_factory=dict)
-    """For each node in a further access domain (``edge@city``), the inventory's id (``edge``)."""
+    # Every override; `demandops.ledger.world.World` knows which of them have ended
     overrides: Mapping[str, Override] = field(default_factory=dict)
-    """Every override; :class:`demandops.ledger.world.World` knows which of them have ended."""
     clients: ClientsFile = DEFAULT_SETTINGS
     versions: Mapping[str, VersionList] = field(default_factory=dict)
+    # For each collection, a map from each entry to the file that has the entry
     entry_files: Mapping[str, Mapping[str, str]] = field(
         default_factory=dict, compare=False, repr=False
     )
-    """For each collection, a map from each entry to the file that has the entry."""
+    # A map from each `topic_part(id)` to the ids of the nodes that have this topic part
     nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """A map from each ``topic_part(id)`` to the ids of the nodes that have this topic part."""
+    # For each role, the nodes with this `type`, sorted by id. The empty role has all nodes.
     nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
-    """For each role, the nodes with this ``type``, sorted by id. The empty role has all nodes."""
+    # For each `(capability,)` or `(label key, value)`, the nodes with it, sorted by id
     nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
         init=False, compare=False, repr=False
     )
-    """For each ``(capability,)`` or ``(label key, value)``, the nodes with it, sorted by id."""
+    # For each property, the type of its value on most nodes, and the first node with this type
     property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
-    """For each property, the type of its value on most nodes, and the first node with this type."""
     drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    """The nodes that are drained, sorted."""
     limits_capacity: bool = field(init=False, compare=False, repr=False)
-    """Whether any node declares a capacity."""
+    # The input roles, sorted, that are the `root` of a service in at least one appdef
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    """The input roles, sorted, that are the ``root`` of a service in at least one appdef."""
+    # The names of the services whose scaling has `downAfter`, in at least one appdef
     services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
-    """The names of the services whose scaling has ``downAfter``, in at least one appdef."""
+    # For each appdef, a map from names of versions and channels to versions. The empty name stands
+    # for the default version.
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
         init=False, compare=False, repr=False
     )
-    """For each appdef, a map from names of versions and channels to versions.
-
-    The empty name stands for the default version.
-    """
 
     def __post_init__(self) -> None:
-        found: dict[str, tuple[str, ...]] = {}
-        for id in self.nodes:
+        by_topic_part: dict[str, tuple[str, ...]] = {}
+        by_kind: dict[str, dict[Kind, list[str]]] = {}
+        for id, node in self.nodes.items():
             part = naming.topic_part(id)
-            found[part] = (*found.get(part, ()), id)
-        object.__setattr__(self, "nodes_by_topic_part", found)
+            by_topic_part[part] = (*by_topic_part.get(part, ()), id)
+            for name, value in node.properties.items():
+                ids_by_kind = by_kind.setdefault(name, {})
+                ids_by_kind.setdefault(kind_of(value) or "text", []).append(id)
+        kinds = {
+            name: max(ids_by_kind.items(), key=lambda kind_and_ids: len(kind_and_ids[1]))
+            for name, ids_by_kind in by_kind.items()
+        }
         by_role: dict[str, list[Node]] = {}
+        by_trait: dict[tuple[str, ...], list[Node]] = {}
         for _, node in sorted(self.nodes.items()):
             for role in ("", node.type):
                 by_role.setdefault(role, []).append(node)
-        by_role_sorted = {role: tuple(nodes) for role, nodes in by_role.items()}
-        object.__setattr__(self, "nodes_by_role", by_role_sorted)
-        with_trait: dict[tuple[str, ...], list[Node]] = {}
-        for _, node in sorted(self.nodes.items()):
             for trait in {*((name,) for name in node.capabilities), *node.labels().items()}:
-                with_trait.setdefault(trait, []).append(node)
-        found_with = {trait: tuple(nodes) for trait, nodes in with_trait.items()}
-        object.__setattr__(self, "nodes_with", found_with)
-        having: dict[str, dict[Kind, list[str]]] = {}
-        for id, node in self.nodes.items():
-            for name, value in node.properties.items():
-                kind = kind_of(value) or "text"
-                having.setdefault(name, {}).setdefault(kind, []).append(id)
-        most = {name: max(of.items(), key=lambda one: len(one[1])) for name, of in having.items()}
-        kinds = {name: (kind, ids[0]) for name, (kind, ids) in most.items()}
-        object.__setattr__(self, "property_kinds", kinds)
-        drained = tuple(sorted(id for id, node in self.nodes.items() if node.drained))
-        object.__setattr__(self, "drained_nodes", drained)
-        limited = any(node.capacity is not None for node in self.nodes.values())
-        object.__setattr__(self, "limits_capacity", limited)
-        services = [one for services in self.services.values() for one in services.values()]
-        kept = frozenset(one.name for one in services if one.scaling.down_after)
-        object.__setattr__(self, "services_with_down_after", kept)
-        roles = tuple(sorted({one.root for one in services if one.root}))
-        object.__setattr__(self, "roles_with_services", roles)
-        versions = {name: self._versions(name) for name in self.services}
-        object.__setattr__(self, "application_versions", versions)
+                by_trait.setdefault(trait, []).append(node)
+        services = [s for services in self.services.values() for s in services.values()]
+        indexes = {
+            "nodes_by_topic_part": by_topic_part,
+            "nodes_by_role": {role: tuple(nodes) for role, nodes in by_role.items()},
+            "nodes_with": {trait: tuple(nodes) for trait, nodes in by_trait.items()},
+            "property_kinds": {name: (kind, ids[0]) for name, (kind, ids) in kinds.items()},
+            "drained_nodes": tuple(sorted(id for id, node in self.nodes.items() if node.drained)),
+            "limits_capacity": any(node.capacity is not None for node in self.nodes.values()),
+            "services_with_down_after": frozenset(s.name for s in services if s.scaling.down_after),
+            "roles_with_services": tuple(sorted({s.root for s in services if s.root})),
+            "application_versions": {name: self._versions(name) for name in self.services},
+        }
+        for name, index in indexes.items():
+            object.__setattr__(self, name, index)  # the class is frozen
 
     def _versions(self, appdef: str) -> dict[str, ApplicationVersion]:
         used = {service.chart for service in self.services[appdef].values()}
         charts = {name: chart for name, chart in self.charts.items() if name in used}
 
-        def made(
-            name: str, wanted: Mapping[str, str], images: Mapping[str, ImagePin]
+        def version(
+            name: str, by_chart: Mapping[str, str], images: Mapping[str, ImagePin]
         ) -> ApplicationVersion:
-            sources = {name: c.at(wanted.get(name, "")) or c for name, c in charts.items()}
+            sources = {name: c.at(by_chart.get(name, "")) or c for name, c in charts.items()}
             return ApplicationVersion(appdef, name, sources, images)
 
         listed = self.versions.get(appdef)
         if listed is None:
             words = {"", *(word for chart in charts.values() for word in chart.versions())}
-            return {word: made("", dict.fromkeys(charts, word), {}) for word in words}
-        known = {name: made(name, one.charts, one.images) for name, one in listed.versions.items()}
-        named = {"": listed.default, **listed.channels}
-        return known | {word: known[version] for word, version in named.items()}
+            # a chart that lacks a version or channel of another chart has its default
+            return {word: version("", dict.fromkeys(charts, word), {}) for word in words}
+        versions = {name: version(name, v.charts, v.images) for name, v in listed.versions.items()}
+        channels = {"": listed.default, **listed.channels}
+        return versions | {channel: versions[name] for channel, name in channels.items()}
 
     def host_of(self, node: str) -> str:
         """Return the inventory's name of a node: ``edge`` for ``edge@city``."""
@@ -197,9 +185,9 @@ class Config:
 
     def nodes_of(self, host: str) -> tuple[str, ...]:
         """Return a node's name in each of its access domains: ``edge``, then ``edge@city``."""
-        known = self.nodes.get(host)
-        further = known.access_domains if known else ()
-        return host, *(id_in_domain(host, one.name) for one in further)
+        node = self.nodes.get(host)
+        domains = node.access_domains if node else ()
+        return host, *(id_in_domain(host, domain.name) for domain in domains)
 
     def file_of(self, collection: str, name: str) -> str:
         """Return the file that has an entry; for an unknown entry, the collection's usual file."""
@@ -210,13 +198,8 @@ class Config:
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
-        """Return a node and its access domain.
-
-        Raises:
-            Refused: if the node is not in the inventory, or not in any access domain.
-        """
         node, domain = self.nodes.get(id), self.domain_of.get(id)
-        if node is None or domain is None:
+        if node is None or domain is None:  # a person removed it while claims name it
             missing = self.place_of(NODES_FILE) if node is None else "any access domain"
             message = (
                 f"'{id}' is in use, but not in {missing}; restore it there, or release all that "
@@ -234,7 +217,6 @@ class Config:
         return None
 
     def versions_of(self, appdef: str) -> list[str]:
-        """Return the channels and versions that a demand for this appdef may request."""
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
@@ -244,11 +226,9 @@ class Config:
         return self.place_of(CHARTS_FILE)
 
     def users_of(self, service: str) -> list[str]:
-        """Return the application definitions that have a service of this name."""
         return [appdef for appdef, services in self.services.items() if service in services]
 
     def parameters_of(self, appdef: str) -> set[str]:
-        """Return the parameters that a demand for this appdef may set."""
         services = self.services[appdef].values()
         return {
             *self.appdefs[appdef].parameters,
@@ -256,5 +236,4 @@ class Config:
         }
 
     def values_template(self, service: Service) -> str:
-        """Return the path of the template of a service's Helm values."""
         return f"appdefs/{service.folder}/{service.values}"

@@ -34,15 +34,11 @@ class ConfigReader:
         self._heads: dict[str, BaseModel] = {}
 
     def add_fault(self, file: str, field: str, message: str) -> None:
-        """Add a fault to :attr:`faults`."""
         self._counts[file] += 1
         self.faults.append(fault(field, message).within(file))
 
     def read_file(self, file: str, model: type[Model]) -> Model | None:
-        """Return a file as an instance of ``model``.
-
-        If the file is missing or invalid, add its faults and return ``None``.
-        """
+        """Return a file as an instance of ``model``, or ``None`` after adding its faults."""
         text = self.files.get(file)
         if text is None:
             self.add_fault(file, "", "is missing; `demandops init` creates an example")
@@ -62,21 +58,30 @@ class ConfigReader:
     ) -> dict[str, Model]:
         """Return the valid items of a collection, by name; collect the faults of invalid ones.
 
-        Args:
-            collection: one of :data:`demandops.config.config.COLLECTIONS`.
-            whole: the model of the collection's files.
-            field: the field of these files that has the items, a list or a mapping.
-            item: the model of an item.
-            key: the field with an item's name; empty if ``field`` is a mapping.
+        ``whole`` is the model of the collection's files, and ``field`` their field with the items:
+        a list if ``key`` names the field with an item's name, else a mapping.
         """
         items: dict[str, Model] = {}
         places = self._places[collection] = {}
+        kind: type[Any] = list if key else dict
         for file in self.files_of(collection) or [collection]:
-            raw = self._items(file, whole, field, list if key else dict)
-            if raw is None:
+            entries: Any = None
+            try:
+                data = strict_yaml.load(self.files.get(file, ""), file)
+                raw = data.get(field) if isinstance(data, dict) else None
+                if isinstance(raw, kind):
+                    entries = raw
+                    # without the items, each of which is parsed below, so that an invalid item
+                    # hides neither the others nor the faults of the file's other fields
+                    self._heads[file] = parse(whole, {**data, field: kind()}, file)
+                else:
+                    self.read_file(file, whole)
+            except InvalidInput as error:
+                self.faults += error.faults
+            if entries is None:
                 self._incomplete.add(collection)
                 continue
-            for place, entry in enumerate(raw) if key else raw.items():
+            for place, entry in enumerate(entries) if key else entries.items():
                 name: Any = place
                 if key:
                     name = entry.get(key) if isinstance(entry, dict) else None
@@ -95,36 +100,25 @@ class ConfigReader:
     def add_duplicate(
         self, name: str, first: tuple[str, str], second: tuple[str, str], key: str = ""
     ) -> None:
-        """Add the faults of an entry that is at two places, ``first`` and ``second``.
-
-        A place is (file, field). If the places are in two files, both files get a fault. So the
-        changed file is quarantined, no matter which of the two a person changed.
-        """
+        """Add the faults of an entry that is at two places; a place is (file, field)."""
         dot_key = f".{key}" if key else ""
         if first[0] == second[0]:
             self.add_fault(
                 second[0], f"{second[1]}{dot_key}", f"'{name}' appears twice; remove one"
             )
             return
+        # both files, so that the changed one is quarantined, whichever of them a person changed
         for (file, field), (other, _) in ((first, second), (second, first)):
             self.add_fault(file, f"{field}{dot_key}", f"'{name}' is in {other} too; remove one")
 
     def entry_files(self) -> dict[str, dict[str, str]]:
-        """Return each entry's file, by collection and entry.
-
-        The result has the collections that :meth:`read_items` has read.
-        """
         return {
             collection: {name: file for name, (file, _) in places.items()}
             for collection, places in self._places.items()
         }
 
     def head(self, file: str, model: type[Model]) -> Model | None:
-        """Return a file without its items, as an instance of ``model``.
-
-        :meth:`read_items` must have read the file. Return ``None`` if the file has no items, or if
-        its other fields are not valid.
-        """
+        """Return a file that :meth:`read_items` has read, without its items, if it is valid."""
         head = self._heads.get(file)
         return head if isinstance(head, model) else None
 
@@ -133,29 +127,24 @@ class ConfigReader:
         return self._places[collection][name]
 
     def add_alias(self, collection: str, name: str, item: str) -> None:
-        """Register ``name`` as a further name of ``item``."""
         self._places[collection][name] = self._places[collection][item]
 
     def is_complete(self, collection: str) -> bool:
-        """Return whether every item of a collection, and every file with items, is valid."""
         return collection not in self._incomplete
 
     def is_missing(self, collection: str, name: str) -> bool:
-        """Return whether a collection lacks an item.
-
-        Return False if an item of the collection is invalid, because it may be the missing item.
-        """
+        # an invalid item may be the missing one, and has faults of its own
         return self.is_complete(collection) and name not in self._places[collection]
 
-    def check_reference(self, file: str, field: str, name: str, known_in: str) -> None:
-        """Add a fault if the collection ``known_in`` has no item ``name`` (:meth:`is_missing`)."""
-        if self.is_missing(known_in, name):
-            where = place_of_collection(known_in, self.files_of(known_in))
+    def check_reference(self, file: str, field: str, name: str, collection: str) -> None:
+        """Add a fault if the item ``name`` is missing in the collection."""
+        if self.is_missing(collection, name):
+            where = place_of_collection(collection, self.files_of(collection))
             where = where.replace("inventory/", "")
             # thousands of names may be unknown, and only the first faults of a file are listed
             is_listed = self._counts[file] < MOST_FAULTS
-            known = suggestion(name, self._places[known_in]) if is_listed else ""
-            self.add_fault(file, field, f"'{name}' is not in {where}{known}")
+            hint = suggestion(name, self._places[collection]) if is_listed else ""
+            self.add_fault(file, field, f"'{name}' is not in {where}{hint}")
 
     def _valid(
         self,
@@ -170,21 +159,3 @@ class ConfigReader:
         except ValidationError as error:
             self.faults += faults_of(error, model, file, place)
             return None
-
-    def _items(self, file: str, whole: type[BaseModel], field: str, kind: type[Any]) -> Any:  # noqa: ANN401 - raw data of the kind
-        """Return the unchecked items of a file: the value of ``field``.
-
-        Check the other fields of the file, and add their faults. Return ``None`` if the file cannot
-        be read as YAML, or if ``field`` is missing or not of the type ``kind``.
-        """
-        raw = None
-        try:
-            data = strict_yaml.load(self.files.get(file, ""), file)
-            raw = data.get(field) if isinstance(data, dict) else None
-            if not isinstance(raw, kind):
-                self.read_file(file, whole)
-                return None
-            self._heads[file] = parse(whole, {**data, field: kind()}, file)
-        except InvalidInput as error:
-            self.faults += error.faults
-        return raw

@@ -10,15 +10,10 @@ from demandops.quoting import quoted
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
 _UNITS = ((86_400, "d"), (3_600, "h"), (60, "m"), (1, "s"))
 _YEAR_S = 366 * 86_400
-_TWO_PARTS = 10
 
 
 def seconds_of(text: str) -> int:
-    """Return the seconds of a duration like ``1h30m``.
-
-    Raises:
-        ValueError: if the text is not a duration, or is one of more than a year.
-    """
+    """Return the seconds of a duration like ``1h30m``; a ValueError says what is wrong with it."""
     match = _DURATION.fullmatch(text)
     if not text or match is None:
         raise ValueError(f"{quoted(text)} is not a duration; write one like 90s, 10m, 1h30m or 2d")
@@ -30,10 +25,7 @@ def seconds_of(text: str) -> int:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration, rounded to seconds, as text like ``1h30m``.
-
-    The duration must not be negative. :func:`seconds_of` reads the text if it is at most a year.
-    """
+    """Return a duration, which is not negative, as text like ``1h30m``, rounded to seconds."""
     text, left = "", round(seconds)
     for size, name in _UNITS:
         whole, left = divmod(left, size)
@@ -42,20 +34,16 @@ def duration_text(seconds: float) -> str:
 
 
 def span(seconds: float) -> str:
-    """Return a duration, rounded down, in one or two units, like ``12d`` or ``3h20m``.
-
-    The sign is left out. The second unit is given only if the number of the first unit has one
-    digit.
-    """
+    """Return a duration without its sign, rounded down, in one or two units: ``12d``, ``3h20m``."""
     left = int(abs(seconds))
     for place, (size, unit) in enumerate(_UNITS):
         if left >= size or size == 1:
-            whole, rest = divmod(left, size)
-            part = f"{whole}{unit}"
-            if whole < _TWO_PARTS and size > 1:
+            whole, remainder = divmod(left, size)
+            text = f"{whole}{unit}"
+            if whole < 10 and size > 1:  # beside two digits, the next unit says nothing
                 smaller, name = _UNITS[place + 1]
-                part += f"{rest // smaller}{name}" if rest >= smaller else ""
-            return part
+                text += f"{remainder // smaller}{name}" if remainder >= smaller else ""
+            return text
     raise AssertionError("the smallest unit is one second")
 
 

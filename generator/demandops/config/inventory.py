@@ -29,14 +29,13 @@ from demandops.identifiers import id_problem, message_type_problem, topic_proble
 from demandops.quoting import quoted
 
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
-"""A host name or an IP address."""
 
+# A key in a Kubernetes Secret; in the pod, the key is a file's name
 SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]*$")]
-"""A key in a Kubernetes Secret; in the pod, the key is a file's name."""
 
 _ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
+# A Zenoh endpoint whose protocol needs no certificates, like `tcp/host:7447`
 Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), Visible]
-"""A Zenoh endpoint whose protocol needs no certificates, like ``tcp/host:7447``."""
 
 
 class Tls(CamelModel):
@@ -112,16 +111,14 @@ _FACTORS = {"m": 1, "": 1000} | {
 def amount_of(text: str) -> int:
     """Return a quantity of a resource in thousandths: 500 for ``500m``, 2000 for ``2``.
 
-    Raises:
-        ValueError: if the text is not a plain quantity (``2``, ``1.5``, ``16Gi``), or is finer than
-            a thousandth. Of Kubernetes' notations, exponents and the units above Ti are refused.
+    Of Kubernetes' notations, exponents and the units above Ti are refused, with a ValueError.
     """
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise ValueError(f"{quoted(text)} is not a quantity; write one like 2, 500m, 1.5 or 16Gi")
     whole, decimals, unit = match.groups(default="")
-    amount, rest = divmod(int(whole + decimals.ljust(3, "0")) * int(_FACTORS[unit]), 1000)
-    if rest:
+    amount, remainder = divmod(int(whole + decimals.ljust(3, "0")) * int(_FACTORS[unit]), 1000)
+    if remainder:
         raise ValueError(f"{quoted(text)} is finer than a thousandth; round it")
     return amount
 
@@ -132,8 +129,8 @@ def amount_text(amount: int, resource: str) -> str:
         for unit in ("Ti", "Gi", "Mi", "Ki"):
             if amount and amount % _FACTORS[unit] == 0:
                 return f"{amount // _FACTORS[unit]}{unit}"
-    whole, rest = divmod(amount, 1000)
-    return f"{whole}.{rest:03}".rstrip("0") if rest else str(whole)
+    whole, decimals = divmod(amount, 1000)
+    return f"{whole}.{decimals:03}".rstrip("0") if decimals else str(whole)
 
 
 def _plain_number(value: object) -> object:
@@ -141,27 +138,27 @@ def _plain_number(value: object) -> object:
     return str(value) if is_number else value
 
 
+# A quantity as Kubernetes writes it, like `500m`. A plain number needs no quotes.
 Quantity = Annotated[
     str,
     BeforeValidator(_plain_number, json_schema_input_type=str | int | float),
     readable_by(amount_of),
 ]
-"""A quantity as Kubernetes writes it, like ``500m``. A plain number needs no quotes."""
 
+# A name of a resource: `cpu`, `memory`, `gpu`, `nvidia.com/gpu`
 ResourceName = Annotated[
     str, StringConstraints(pattern=r"^([a-z0-9.-]+/)?[a-z][a-z0-9_.-]*$", max_length=120)
 ]
-"""A name of a resource: ``cpu``, ``memory``, ``gpu``, ``nvidia.com/gpu``."""
 
+# How much of each resource a node has, or a service requests
 Resources = dict[ResourceName, Quantity]
-"""How much of each resource a node has, or a service requests."""
 
 NodeId = Annotated[str, without(id_problem)]
 Topic = Annotated[str, without(topic_problem)]
 MessageType = Annotated[str, without(message_type_problem)]
 
+# The label that selects a node by its id, as in the reference
 NODE_LABEL = "node_id"
-"""The label that selects a node by its id, as in the reference."""
 
 LabelKey = Annotated[
     str,
@@ -197,10 +194,11 @@ class Toleration(CamelModel):
         return self
 
 
+# A middleware of ROS. The word `image` stands for the middleware of the container's image.
 Rmw = Literal["rmw_cyclonedds_cpp", "rmw_fastrtps_cpp", "rmw_connextdds", "rmw_zenoh_cpp", "image"]
-"""A middleware of ROS. The word ``image`` stands for the middleware of the container's image."""
 
 
+# DDS computes its ports from the number; with a higher one they would be above 65535
 RosDomainId = Annotated[int, Field(ge=0, le=232)]
 
 
@@ -241,46 +239,37 @@ class Node(CamelModel):
     """
 
     id: NodeId
+    # The role of the node; any word
     type: Word
-    """The role of the node; any word."""
     cluster: DnsLabel
+    # By default `{node_id: <id>}`, the label that the reference uses
     selector: dict[LabelKey, LabelValue] | None = None
-    """By default ``{node_id: <id>}``, the label that the reference uses."""
+    # The node's usual topic for each input role. The names of releases and derived topics contain
+    # the node's id. For a further topic of the node, these names also contain the topic.
     topics: dict[Word, Topic] = Field(default_factory=dict)
-    """The node's usual topic for each input role.
-
-    The names of releases and derived topics contain the node's id. For a further topic of the node,
-    these names also contain the topic.
-    """
     tolerations: Items[Toleration] = ()
     image_pull_secrets: Items[DnsLabel] = ()
     host_network: bool = True
+    # A ROS domain of the access domain replaces the ROS domain that is given here
     ros: Ros = Ros()
-    """A ROS domain of the access domain replaces the ROS domain that is given here."""
     zenoh: Zenoh | None = None
+    # The address at which ROS connections reach the node
     wan: Wan | None = None
-    """The address at which ROS connections reach the node."""
+    # The message types of topics, for requests that give no type
     types: dict[Topic, MessageType] = Field(default_factory=dict)
-    """The message types of topics, for requests that give no type."""
+    # For each other node, the topics that the initial deployment already carries to that node. The
+    # topics keep their names. Connections skip these topics.
     bridged: dict[NodeId, Items[Topic]] = Field(default_factory=dict)
-    """For each other node, the topics that the initial deployment already carries to that node.
-
-    The topics keep their names. Connections skip these topics.
-    """
     capabilities: Items[Word] = ()
-    """Words for what the node has."""
     properties: dict[PropertyName, PropertyValue] = Field(default_factory=dict)
-    """The value of each property: a number, text, true or false."""
     position: Position | None = None
+    # The generator chooses no drained node, and moves away what it placed there
     drained: bool = False
-    """The generator chooses no drained node, and moves away what it placed there."""
+    # What all services on the node may request together (`demandops.plan.nodes.capacity`)
     capacity: Resources | None = None
-    """What all services on the node may request together (:mod:`demandops.plan.nodes.capacity`)."""
+    # The node's further domains. For each further domain, the configuration has a node
+    # `<id>@<domain>` (`in_domain`).
     access_domains: Items[FurtherDomain] = ()
-    """The node's further domains.
-
-    For each further domain, the configuration has a node ``<id>@<domain>`` (:meth:`in_domain`).
-    """
 
     @model_validator(mode="after")
     def _findable(self) -> Node:
@@ -293,11 +282,10 @@ class Node(CamelModel):
         return self
 
     def labels(self) -> dict[str, str]:
-        """Return the node selector: the labels that select the node in its cluster."""
         return dict(self.selector) if self.selector is not None else {NODE_LABEL: self.id}
 
     def in_domain(self, further: FurtherDomain) -> Node:
-        """Return the node as it is in a further access domain."""
+        # `zenoh` and `wan` are not the node's own, because two programs cannot listen on one port
         return self.model_copy(
             update={
                 "id": id_in_domain(self.id, further.name),
@@ -310,21 +298,16 @@ class Node(CamelModel):
         )
 
     def most(self, resource: str) -> int | None:
-        """Return the node's capacity of a resource in thousandths; ``None`` means no limit.
-
-        A node without ``capacity`` limits no resource. A ``capacity`` without cpu or memory does
-        not limit cpu or memory. Of any other resource that ``capacity`` leaves out, the node has 0.
-        """
+        """Return the node's capacity of a resource in thousandths; ``None`` means no limit."""
         if self.capacity is None:
             return None
-        listed = self.capacity.get(resource)
-        if listed is not None:
-            return amount_of(listed)
+        if resource in self.capacity:
+            return amount_of(self.capacity[resource])
+        # every node has cpu and memory, but a resource such as a GPU only if it is listed
         return None if resource in ("cpu", "memory") else 0
 
 
 def id_in_domain(node: str, domain: str) -> str:
-    """Return the name of a node in a further access domain: ``<node>@<domain>``."""
     return f"{node}@{domain}"
 
 

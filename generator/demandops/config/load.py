@@ -73,14 +73,7 @@ _ANY = RepoSettings(
 
 
 def load(files: Mapping[str, str]) -> Config:
-    """Return the configuration of a state repo.
-
-    Args:
-        files: path in the state repo → text; files outside of the configuration are ignored.
-
-    Raises:
-        InvalidInput: with every fault of every file.
-    """
+    """Return the configuration of a state repo; files outside of the configuration are ignored."""
     reader = ConfigReader(files)
     repository = reader.read_file(ROOT_FILE, RepoSettings)
     if repository and repository.render_version > RENDER_VERSION:
@@ -103,21 +96,34 @@ def load(files: Mapping[str, str]) -> Config:
     domains = reader.read_items(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
     appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
     definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
-    services = {name: _resolve(appdef, definitions, reader) for name, appdef in appdefs.items()}
-    services = {name: _with_runs_at(own, nodes.values()) for name, own in services.items()}
+    services = {
+        name: _services_of(appdef, definitions, nodes.values(), reader)
+        for name, appdef in appdefs.items()
+    }
     clients, client_files = _read_clients(reader)
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
+    clusters = reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name")
+    brokers = reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node")
+    charts = reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart)
+    images = reader.read_items(IMAGES_FILE, ImagesFile, "images", Image)
+    for name, image in images.items():
+        head = reader.head(reader.place_of(IMAGES_FILE, name)[0], ImagesFile)
+        if head is not None and head.registry is not None:
+            images[name] = image.pulled_from(head.registry)
+    versions: Mapping[str, VersionList] = {}
+    if reader.files_of(VERSIONS_FILE):  # unlike the other collections, this one may have no file
+        versions = reader.read_items(VERSIONS_FILE, VersionsFile, "applications", VersionList)
     config = Config(
         repo_settings=repository or _ANY,
-        clusters=reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name"),
+        clusters=clusters,
         nodes={id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()},
-        brokers=reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node"),
+        brokers=brokers,
         domains=domains,
-        charts=reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart),
-        images=_read_images(reader),
+        charts=charts,
+        images=images,
         clients=clients,
-        versions=_read_versions(reader),
+        versions=versions,
         appdefs=appdefs,
         definitions=definitions,
         services=MappingProxyType(services),
@@ -133,108 +139,83 @@ def load(files: Mapping[str, str]) -> Config:
     return config
 
 
-def _with_runs_at(services: Services, nodes: Iterable[Node]) -> Services:
-    """Return the services. Those that run once for each cluster get :attr:`Service.runs_at`."""
-    found = dict(services)
-    for name, service in services.items():
-        if service.nodes:
-            at = ((node, service.nodes.get(node.cluster)) for node in nodes)
-            by_node = {
-                id: there
-                for node, there in at
-                if there
-                for id in (node.id, *(id_in_domain(node.id, d.name) for d in node.access_domains))
-            }
-            found[name] = service.model_copy(update={"runs_at": by_node})
-    return found
-
-
-def _read_images(reader: ConfigReader) -> Mapping[str, Image]:
-    images = reader.read_items(IMAGES_FILE, ImagesFile, "images", Image)
-    for name, image in images.items():
-        head = reader.head(reader.place_of(IMAGES_FILE, name)[0], ImagesFile)
-        if head is not None and head.registry is not None:
-            images[name] = image.pulled_from(head.registry)
-    return images
-
-
 def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
     """Return the settings of all connection types, and for each type the file with its settings."""
-    found, files = DEFAULT_SETTINGS, dict[str, str]()
+    clients, files = DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of(CLIENTS_FILE):
         part = reader.read_file(file, ClientsFile)
-        for word in part.connection_types if part else ():
+        words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
+        for word in sorted(words):
             first = files.setdefault(word, file)
             if first != file:
                 reader.add_duplicate(word, (first, word), (file, word))
-            found = found.model_copy(update={word: getattr(part, word)})
-    return found, files
+            clients = clients.model_copy(update={word: getattr(part, word)})
+    return clients, files
 
 
 def _refuse_unread(reader: ConfigReader) -> None:
-    """Add a fault for each file that looks like configuration but is not read."""
+    # whoever mistypes a file's name must not believe that its entries are in force
     folders = {collection.partition("/")[0] for collection in COLLECTIONS}
     for path in sorted(reader.files):
-        folder, *rest = path.split("/")
+        folder, *names = path.split("/")
         if folder not in folders or not path.endswith((".yaml", ".yml")):
             continue
-        if collection_of(path) is None and not any(part.startswith(".") for part in rest):
-            known = [PurePosixPath(one).stem for one in COLLECTIONS if one.startswith(folder)]
+        if collection_of(path) is None and not any(name.startswith(".") for name in names):
+            stems = [PurePosixPath(file).stem for file in COLLECTIONS if file.startswith(folder)]
             reader.add_fault(
                 path,
                 "",
                 f"is not read; only <name>.yaml and <name>/*.yaml in {folder}/ are read, where "
-                f"<name> is one of {', '.join(sorted(known))}; rename the file, or remove it",
+                f"<name> is one of {', '.join(sorted(stems))}; rename the file, or remove it",
             )
-
-
-def _read_versions(reader: ConfigReader) -> Mapping[str, VersionList]:
-    if not reader.files_of(VERSIONS_FILE):
-        return {}
-    return reader.read_items(VERSIONS_FILE, VersionsFile, "applications", VersionList)
 
 
 def _read_definitions(
     reader: ConfigReader, file: str, model: type[Definition]
 ) -> Mapping[str, Definition]:
     """Return the definitions in all valid files ``appdefs/<folder>/{file}``, by folder."""
-    found = {}
+    definitions = {}
     for path in sorted(reader.files):
         parts = path.split("/")
         if len(parts) != 3 or parts[0] != "appdefs" or parts[2] != file:
             continue
-        one = reader.read_file(path, model)
-        if one is None:
+        folder, definition = parts[1], reader.read_file(path, model)
+        if definition is None:
             continue
-        if one.name != parts[1]:
-            reader.add_fault(
-                path, "name", f"is '{one.name}', but the folder is '{parts[1]}'; make them equal"
-            )
-            one = one.model_copy(update={"name": parts[1]})
-        found[one.name] = one
-    return MappingProxyType(found)
+        if definition.name != folder:
+            message = f"is '{definition.name}', but the folder is '{folder}'; make them equal"
+            reader.add_fault(path, "name", message)
+            # go on with the folder's name, so that others who use it get no fault
+            definition = definition.model_copy(update={"name": folder})
+        definitions[folder] = definition
+    return MappingProxyType(definitions)
 
 
-def _resolve(
+def _services_of(
     appdef: ApplicationDefinition,
     definitions: Mapping[str, ServiceDefinition],
+    nodes: Iterable[Node],
     reader: ConfigReader,
 ) -> Services:
-    """Return the services of an appdef, and add their faults to ``reader``.
-
-    Return no services if the appdef, or a definition that it uses, is invalid.
-    """
     files = {f"appdefs/{name}/service.yaml" for name in appdef.uses.keys() - definitions.keys()}
-    if files & reader.files.keys():
+    if files & reader.files.keys():  # an invalid definition, which has faults of its own
         return {}
-    services, problems = resolved_services(appdef, definitions)
+    resolved, problems = resolved_services(appdef, definitions)
     for where, problem in problems:
         reader.add_fault(f"appdefs/{appdef.name}/appdef.yaml", where, problem)
+    services = dict(resolved)
+    for name, service in resolved.items():
+        if service.nodes:
+            runs_at = {}
+            for node in nodes:
+                if service_node := service.nodes.get(node.cluster):
+                    further = (id_in_domain(node.id, d.name) for d in node.access_domains)
+                    runs_at.update(dict.fromkeys((node.id, *further), service_node))
+            services[name] = service.model_copy(update={"runs_at": runs_at})
     return services
 
 
 def is_override_name(name: str) -> bool:
-    """Return whether a file ``overrides/<name>.yaml`` would be an override."""
     return _NAME.fullmatch(name) is not None
 
 
@@ -272,13 +253,12 @@ def _in_further_domains(
     domains: Mapping[str, AccessDomain],
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
-    """Return the nodes, with a node ``<id>@<domain>`` added for each further access domain.
-
-    Returns:
-        Three mappings: id → node, id → access domain, and ``<id>@<domain>`` → ``<id>``.
-    """
+    """Return nodes, domains and hosts, with a node ``<id>@<domain>`` for each further domain."""
+    # Everything follows from the node: namespace, rules, quotas, keys of releases. A domain beside
+    # each node would have to be asked for at each place, and a place that forgets it would mix the
+    # data of two domains.
     nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
-    for node in [one for one in nodes.values() if one.access_domains]:
+    for node in [node for node in nodes.values() if node.access_domains]:  # `nodes` grows
         file, place = reader.place_of(NODES_FILE, node.id)
         first = domain_of.get(node.id)
         ros = {_in_ros_domain(node, first).ros.domain_id: first.name} if first else {}
@@ -288,8 +268,8 @@ def _in_further_domains(
             reader.check_reference(file, f"{where}.name", further.name, DOMAINS_FILE)
             if first is None:
                 # the node may be in an invalid domain, or in several, which has a fault of its own
-                known = any(matches(node.id, one.nodes) for one in domains.values())
-                if not known and reader.is_complete(DOMAINS_FILE):
+                is_matched = any(matches(node.id, d.nodes) for d in domains.values())
+                if not is_matched and reader.is_complete(DOMAINS_FILE):
                     message = f"no access domain has '{node.id}' in its nodes; add it to one"
                     reader.add_fault(file, where, message)
             elif domain is first or id in nodes:
@@ -307,13 +287,14 @@ def _in_further_domains(
                         "'ros: {domainId: …}' in " + reader.place_of(DOMAINS_FILE, domain.name)[0]
                     )
                     reader.add_fault(file, f"{where}.name", message)
+                # the first domain keeps the plain name, so a further one changes nothing that runs
                 nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
                 reader.add_alias(NODES_FILE, id, node.id)
     return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
 
 
+# How many of the domains that match one node a message names
 _MOST_DOMAINS = 3
-"""How many of the domains that match one node a message names."""
 
 
 def _domains_of_nodes(
@@ -326,7 +307,7 @@ def _domains_of_nodes(
         for pattern in domain.nodes:
             by_start[re.split("[*?]", pattern)[0]].setdefault(name, []).append(pattern)
     for node in nodes:
-        known = (
+        matches_of_node = (
             (name, pattern)
             for end in range(len(node) + 1)
             for name, patterns in by_start.get(node[:end], {}).items()
@@ -334,11 +315,11 @@ def _domains_of_nodes(
             if matches(node, (pattern,))
         )
         matching: dict[str, str] = {}
-        for name, pattern in known:
+        for name, pattern in matches_of_node:
             matching.setdefault(name, pattern)
             if len(matching) > _MOST_DOMAINS:
                 break
-        if len(matching) > 1:
+        if len(matching) > 1:  # an overlap by accident must not move the node
             by = " and ".join(
                 f"'{name}' by {quoted(pattern)} in {reader.place_of(DOMAINS_FILE, name)[0]}"
                 for name, pattern in sorted(matching.items())[:_MOST_DOMAINS]

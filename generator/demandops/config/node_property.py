@@ -23,16 +23,14 @@ _TEXT = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._+:/-]{0,61}[A-Za-z0-9])?")
 _CONDITION = re.compile(rf"({_NAME})(>=|<=|=)(.+)")
 _BOUNDS = {"min": ">=", "max": "<="}
 
+# The name of a property; it includes the unit of the value, as in `memoryGiB`
 PropertyName = Annotated[str, StringConstraints(pattern=f"^{_NAME}$", max_length=63)]
-"""The name of a property; it includes the unit of the value, as in ``memoryGiB``."""
 
+# The type of a property's values, in words
 Kind = Literal["a number", "text", "true or false"]
-"""The type of a property's values, in words."""
 
 
 class PropertyCondition(NamedTuple):
-    """The name of a property, the sign of the comparison, and the value as text."""
-
     name: str
     sign: str
     value: str
@@ -81,11 +79,10 @@ _LIMITS: dict[str, Any] = {
     "minProperties": 1,
 }
 PropertyValue = Annotated[Any, AfterValidator(_value), WithJsonSchema({"anyOf": _PLAIN})]
-"""The value of a node's property."""
+# The value that a definition requires of a property; for a number also bounds: `{min: 8}`
 RequiredValue = Annotated[
     Any, AfterValidator(_required_value), WithJsonSchema({"anyOf": [*_PLAIN, _LIMITS]})
 ]
-"""The value that a definition requires of a property; for a number also bounds: ``{min: 8}``."""
 
 
 def condition_texts(properties: Mapping[str, object]) -> Iterator[str]:
@@ -98,28 +95,22 @@ def condition_texts(properties: Mapping[str, object]) -> Iterator[str]:
 
 
 def comparable_kind(value: object) -> Kind | None:
-    """Return the type that a property must have to be compared with a required value.
-
-    Return ``None`` if the required value is not valid.
-    """
+    """Return the type that a property needs to be compared with a required value."""
     return "a number" if isinstance(value, dict) else kind_of(value)
 
 
 @lru_cache(maxsize=1024)
 def read_condition(text: str) -> PropertyCondition | None:
-    """Return the condition that a text states, or ``None`` if the text is not a condition."""
     match = _CONDITION.fullmatch(text)
     condition = PropertyCondition(*match.groups()) if match else None
-    return (
-        None
-        if condition and condition.sign != "=" and _number(condition.value) is None
-        else condition
-    )
+    if condition and condition.sign != "=" and _number(condition.value) is None:
+        return None
+    return condition
 
 
 def condition_problem(condition: PropertyCondition, kind: Kind) -> str:
     """Return why a condition does not fit a property of the type ``kind``; empty if it fits."""
-    if _read(condition, kind) is not None:
+    if _value_as(kind, condition) is not None:
         return ""
     return f"{quoted(condition.name)} is {kind}; ask for {_EXAMPLES[kind].format(condition.name)}"
 
@@ -136,18 +127,18 @@ def meets_condition(properties: Mapping[str, object], text: str) -> bool:
     condition = read_condition(text)
     value = properties.get(condition.name) if condition else None
     kind = kind_of(value)
-    wanted = _read(condition, kind) if condition and kind else None
-    if wanted is None or condition is None:
+    required = _value_as(kind, condition) if condition and kind else None
+    if required is None or condition is None:
         return False
     match condition.sign:
         case ">=":
-            return bool(value >= wanted)  # type: ignore[operator]  # both are numbers
+            return bool(value >= required)  # type: ignore[operator]  # both are numbers
         case "<=":
-            return bool(value <= wanted)  # type: ignore[operator]
-    return value == wanted
+            return bool(value <= required)  # type: ignore[operator]
+    return value == required
 
 
-def _read(condition: PropertyCondition, kind: Kind) -> object:
+def _value_as(kind: Kind, condition: PropertyCondition) -> object:
     """Return a condition's value, read as ``kind``, or ``None`` if the value has another type."""
     if kind == "a number":
         return _number(condition.value)
@@ -163,4 +154,4 @@ def _number(value: str | float) -> float | None:
         number = float(value)
     except (ValueError, OverflowError):
         return None
-    return number if math.isfinite(number) else None
+    return number if math.isfinite(number) else None  # JSON, and so a chart, has no infinity

@@ -41,17 +41,13 @@ _MOMENT = re.compile(
     r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,6})\d*)?([Zz]|[+-]\d\d:\d\d)"
 )
 _SHAPING = ("values", "version", "images", "replicas", "node")
-_OF_SERVICES = ("version", "replicas", "node", "keep")
+_OF_SERVICES = ("version", "replicas", "node")
+# The effects of overrides, in the order in which messages list them
 EFFECTS = (*_SHAPING, "hold", "deny", "keep")
-"""The effects of overrides, in the order in which messages list them."""
 
 
 def parse_time(text: str) -> datetime:
-    """Parse an RFC 3339 time that has a time zone, and return it in UTC.
-
-    Raises:
-        ValueError: if the text is not such a time.
-    """
+    """Parse an RFC 3339 time that has a time zone, and return it in UTC, or raise ValueError."""
     match = _MOMENT.fullmatch(text)
     if match is None:
         raise ValueError(
@@ -90,11 +86,6 @@ def _finite(value: Any) -> None:  # noqa: ANN401 - Helm values are any data
         _finite(item)
 
 
-def _patch(value: dict[str, Any]) -> dict[str, Any]:
-    _finite(value)
-    return value
-
-
 def _not_empty(items: tuple[Any, ...]) -> tuple[Any, ...]:
     if not items or "" in items:
         raise ValueError("is empty or has an empty item; name what to select")
@@ -106,7 +97,7 @@ Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_lin
 
 
 def _filled_in(model: FrozenModel) -> None:
-    """Raise ValueError if a field is given without a value, because it would have no effect."""
+    # a field without a value would have no effect, and a person would wait for one
     empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
     if empty:
         raise ValueError(
@@ -143,7 +134,7 @@ class Selector(FrozenModel):
         return self
 
     def takes(self, service: str, appdef: str) -> bool:
-        """Return whether a service of an appdef matches ``services`` and ``appdefs``."""
+        """Return whether a service of an appdef fits ``services`` and ``appdefs``."""
         return (not self.services or matches(service, self.services)) and (
             not self.appdefs or matches(appdef, self.appdefs)
         )
@@ -160,7 +151,7 @@ class OverrideFile(FileModel):
     priority: Annotated[int, Field(ge=-1_000_000, le=1_000_000)] = 0
     expires: Annotated[str, readable_by(parse_time)] | None = None
     select: Annotated[Items[Selector], AfterValidator(_not_empty)]
-    values: Annotated[dict[str, Any], Field(min_length=1), AfterValidator(_patch)] | None = None
+    values: Annotated[dict[str, Any], Field(min_length=1), readable_by(_finite)] | None = None
     version: Annotated[str, StringConstraints(min_length=1, max_length=63), Visible] | None = None
     images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None
     replicas: Annotated[int, Field(ge=0, le=1000)] | None = None
@@ -172,25 +163,38 @@ class OverrideFile(FileModel):
     @model_validator(mode="after")
     def _consistent(self) -> OverrideFile:
         _filled_in(self)
-        problems = [*_contradictions(self.effects()), *self._misplaced()]
-        if problems:
+        if problems := [*self._problems()]:
             raise ValueError(sentences(problems))
         return self
 
-    def _misplaced(self) -> Iterable[str]:
-        """Yield the problems of selectors that do not fit the override's effects."""
+    def _problems(self) -> Iterable[str]:
         effects = self.effects()
-        if self.values is not None and self.selects_clients() and not self.patches_clients():
+        if not effects:
+            yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
+        if "deny" in effects and len(effects) > 1:
+            others = " and ".join(f"'{name}'" for name in effects if name != "deny")
+            yield (
+                f"with 'deny', nothing runs, so {others} cannot apply; remove 'deny', or remove "
+                f"{others}"
+            )
+        frozen = " and ".join(f"'{name}'" for name in effects if name in _SHAPING)
+        if "hold" in effects and frozen:
+            yield (
+                f"'hold' freezes the release, so {frozen} cannot apply; remove 'hold', or remove "
+                f"{frozen}"
+            )
+        selects_clients = any(selector.connections for selector in self.select)
+        if self.values is not None and selects_clients and not self.patches_clients():
             yield (
                 "select: selects both connections and services, but 'values' fits only connections "
                 "(settings of clients) or only services (Helm values); write two overrides"
             )
+        of_services = [name for name in effects if name in _OF_SERVICES]
         for index, selector in enumerate(self.select):
-            wrong = [name for name in effects if name in _OF_SERVICES and name != "keep"]
-            if selector.connections and wrong:
+            if selector.connections and of_services:
                 yield (
-                    f"select[{index}].connections: '{wrong[0]}' is for services, but this selector "
-                    f"selects connections; remove 'connections' or '{wrong[0]}'"
+                    f"select[{index}].connections: '{of_services[0]}' is for services, but this "
+                    f"selector selects connections; remove 'connections' or '{of_services[0]}'"
                 )
             if selector.requesters and "node" in effects:
                 yield (
@@ -204,24 +208,15 @@ class OverrideFile(FileModel):
                     "only; select those"
                 )
 
-    def selects_clients(self) -> bool:
-        """Return whether a selector has patterns for connections, and so selects only clients."""
-        return any(selector.connections for selector in self.select)
-
     def patches_clients(self) -> bool:
-        """Return whether ``values`` patches the settings of clients instead of Helm values.
-
-        So it is if every selector has patterns for connections.
-        """
+        """Return whether ``values`` patches the settings of clients instead of Helm values."""
         return all(selector.connections for selector in self.select)
 
     def effects(self) -> tuple[str, ...]:
-        """Return the names of this override's effects."""
         return tuple(name for name in EFFECTS if getattr(self, name) is not None)
 
     @property
     def end(self) -> datetime | None:
-        """The time at which the override ends, or ``None`` if it has no end."""
         return parse_time(self.expires) if self.expires else None
 
 
@@ -232,21 +227,18 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
     @classmethod
     def from_file(cls, name: str, file: OverrideFile) -> Override:
-        """Return the override in a parsed file; ``name`` is the override's name."""
         return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
 
     def __eq__(self, other: object) -> bool:
-        """Compare as JSON, because 1, True and 1.0 are equal in Python, but not for a chart."""
+        # as JSON, because 1, True and 1.0 are equal in Python, but not for a chart
         return isinstance(other, Override) and self.model_dump_json() == other.model_dump_json()
 
     @property
     def path(self) -> str:
-        """The path of the override's file."""
         return f"{OVERRIDES_ROOT}/{self.name}.yaml"
 
     @property
     def rank(self) -> tuple[int, str]:
-        """The rank among overrides; the higher rank wins."""
         return (self.priority, self.name)
 
 
@@ -260,10 +252,7 @@ class Shaping:
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, name: str, image: Image) -> Image:
-        """Return ``image`` as the overrides pin it, or unchanged if none pins it.
-
-        ``name`` is the image's name in the registry.
-        """
+        """Return ``image``, which the registry calls ``name``, as the overrides pin it."""
         for override, effects in self.by:
             if "images" in effects and override.images and name in override.images:
                 image = override.images[name].over(image)
@@ -280,12 +269,10 @@ class Shaping:
 
     @property
     def held(self) -> bool:
-        """Whether a ``hold`` keeps the release's file unchanged.
-
-        An override that applies later and changes the release cancels the ``hold``.
-        """
+        """Whether a ``hold`` keeps the release's file unchanged."""
         held = False
         for _, effects in self.by:
+            # one that applies later and changes the release cancels the hold
             held = "hold" in effects or (held and set(effects) <= {"keep"})
         return held
 
@@ -293,59 +280,33 @@ class Shaping:
 UNSHAPED = Shaping()
 
 
-def _contradictions(effects: tuple[str, ...]) -> Iterable[str]:
-    if not effects:
-        yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
-    if "deny" in effects and len(effects) > 1:
-        others = " and ".join(f"'{name}'" for name in effects if name != "deny")
-        yield (
-            f"with 'deny', nothing runs, so {others} cannot apply; remove 'deny', or remove "
-            f"{others}"
-        )
-    frozen = [name for name in effects if name in _SHAPING]
-    if "hold" in effects and frozen:
-        names = " and ".join(f"'{name}'" for name in frozen)
-        yield (
-            f"'hold' freezes the release, so {names} cannot apply; remove 'hold', or remove {names}"
-        )
-
-
 Settings = TypeVar("Settings", bound=ClientSettings)
 
 
 def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
-    """Return the settings of clients, patched by the ``values`` of an override.
-
-    Fields that only MQTT clients have are ignored for clients of other connection types.
-
-    Raises:
-        InvalidInput: if the result is not valid; the faults name the override's ``file``.
-    """
+    """Return the settings of clients, patched by the ``values`` of the override in ``file``."""
     data = merge_patch(settings.model_dump(by_alias=True), patch)
-    of_others = {*_fields(MqttClientSettings)} - {*_fields(type(settings))}
+    own, of_mqtt = (
+        {field.alias for field in model.model_fields.values()}
+        for model in (type(settings), MqttClientSettings)
+    )
     try:
-        return settings.model_validate({k: v for k, v in data.items() if k not in of_others})
+        # one override may select clients of several types, of which only MQTT has further fields
+        return settings.model_validate({k: v for k, v in data.items() if k not in of_mqtt - own})
     except ValidationError as error:
         raise InvalidInput(faults_of(error, type(settings), file, ("values",))) from None
 
 
-def _fields(model: type[ClientSettings]) -> list[str]:
-    return [str(field.alias) for field in model.model_fields.values()]
-
-
 def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
     """Return overrides in the order in which they apply; the last one wins."""
-    return tuple(sorted(overrides, key=lambda one: one.rank))
+    return tuple(sorted(overrides, key=lambda override: override.rank))
 
 
 def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
-    """Return the overrides that have not ended.
-
-    ``ended`` maps the name of an override to the expiry at which it ended. An override whose expiry
-    has changed since then is active again.
-    """
+    """Return the overrides that have not ended; ``ended`` maps names to the expiry that passed."""
     return [
-        one
-        for name, one in overrides.items()
-        if one.end is None or ended.get(name) != format_time(one.end)
+        override
+        for name, override in overrides.items()
+        # a person who extends an ended override gives it a new expiry, and so it is active again
+        if override.end is None or ended.get(name) != format_time(override.end)
     ]

@@ -39,9 +39,9 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
     return any(name == pattern or _compiled(pattern)(name) for pattern in patterns)
 
 
-@lru_cache(65_536)
+@lru_cache(65_536)  # a policy may have thousands, more than Python's own cache
 def _compiled(pattern: str) -> Callable[[str], object]:
-    """Return a function that matches one pattern; a policy may have thousands of them."""
+    # fnmatch has sets of characters, which begin with a bracket; here a bracket is only itself
     return re.compile(translate(pattern.replace("[", "[[]"))).match
 
 
@@ -115,6 +115,7 @@ class Kind(FrozenModel):
     resource: DnsLabel
 
 
+# The kinds of Kubernetes objects that a policy may name by one word
 KINDS = {
     kind: Kind(kind=kind, group=group, resource=resource)
     for group, kinds in {
@@ -138,16 +139,13 @@ KINDS = {
     }.items()
     for kind, resource in kinds.items()
 }
-"""The kinds of Kubernetes objects that a policy may name by one word."""
 
+# Kinds that are allowed only if a policy names them. A DaemonSet runs on all nodes of a cluster,
+# and not only on the demanded node.
 NOT_BY_DEFAULT = ("DaemonSet",)
-"""Kinds that are allowed only if a policy names them.
 
-A DaemonSet runs on all nodes of a cluster, and not only on the demanded node.
-"""
-
+# The kinds that every domain needs, for the clients of connections and for Helm's releases
 NEEDED_KINDS = ("ConfigMap", "Deployment", "Secret")
-"""The kinds that every domain needs, for the clients of connections and for Helm's releases."""
 
 _NETWORK_POLICY = "NetworkPolicy"
 
@@ -206,13 +204,10 @@ class AccessDomain(CamelModel):
 
     @property
     def allowed_kinds(self) -> tuple[Kind, ...]:
-        """The kinds of objects that the domain's charts may have; the cluster enforces them.
-
-        Without ``kinds``, these are the kinds of ordinary charts. With ``network: namespace`` they
-        do not include NetworkPolicy, because a chart could use it to open the closed namespace.
-        """
+        """The kinds of objects that the domain's charts may have; the cluster enforces them."""
         if self.kinds is not None:
             return self.kinds
+        # with a NetworkPolicy, a chart could open the closed namespace
         without = {*NOT_BY_DEFAULT, *([_NETWORK_POLICY] if self.network == "namespace" else [])}
         return tuple(kind for name, kind in KINDS.items() if name not in without)
 
@@ -230,31 +225,25 @@ class AccessDomain(CamelModel):
 
     @property
     def allowed_resources(self) -> dict[str, list[str]]:
-        """The resources of :attr:`allowed_kinds`, by API group."""
-        found: dict[str, list[str]] = {}
+        by_group: dict[str, list[str]] = {}
         for kind in self.allowed_kinds:
-            found.setdefault(kind.group, []).append(kind.resource)
-        return found
+            by_group.setdefault(kind.group, []).append(kind.resource)
+        return by_group
 
     @model_validator(mode="after")
-    def _kinds_fit(self) -> AccessDomain:
-        if self.kinds is None:
-            return self
-        missing = [name for name in NEEDED_KINDS if KINDS[name] not in self.kinds]
+    def _consistent(self) -> AccessDomain:
+        kinds = self.allowed_kinds
+        missing = [name for name in NEEDED_KINDS if KINDS[name] not in kinds]
         if missing:
             raise ValueError(
                 f"kinds: lacks {' and '.join(missing)}, but connections and Helm's releases need "
                 "them; add what is missing"
             )
-        if self.network == "namespace" and KINDS[_NETWORK_POLICY] in self.kinds:
+        if self.network == "namespace" and KINDS[_NETWORK_POLICY] in kinds:
             raise ValueError(
                 "kinds: NetworkPolicy lets a chart open what 'network: namespace' closes; remove "
                 "NetworkPolicy from 'kinds', or remove 'network'"
             )
-        return self
-
-    @model_validator(mode="after")
-    def _named_once(self) -> AccessDomain:
         names = [rule.name for rule in self.rules]
         for name in names:
             if names.count(name) > 1:

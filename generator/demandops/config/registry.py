@@ -84,14 +84,10 @@ class Chart(ChartSource):
         return self
 
     def sources(self) -> tuple[ChartSource, ...]:
-        """Return all versions of the chart, the default first."""
         return (self, *self.channels.values())
 
     def at(self, version: str) -> ChartSource | None:
-        """Return the source of a channel or version, or ``None`` if the name is unknown.
-
-        An empty name stands for the default version.
-        """
+        """Return the source of a channel or version, if known; an empty name is the default."""
         if not version:
             return self
         if version in self.channels:
@@ -99,7 +95,6 @@ class Chart(ChartSource):
         return next((source for source in self.sources() if source.version == version), None)
 
     def versions(self) -> tuple[str, ...]:
-        """Return the channels and versions that :meth:`at` accepts."""
         return (*self.channels, *(source.version for source in self.sources()))
 
 
@@ -117,13 +112,11 @@ class Image(FrozenModel):
         return self
 
     def pulled_from(self, registry: str) -> Image:
-        """Return this image with ``registry`` as the host in its name.
-
-        If the name has no host, ``registry`` is put before the name.
-        """
+        """Return this image with ``registry`` as the host in its name."""
         host, _, path = self.repository.partition("/")
-        named = path and ("." in host or ":" in host or host == "localhost")
-        repository = f"{registry}/{path if named else self.repository}"
+        # Docker's rule: only such a first part is a host
+        has_host = path and ("." in host or ":" in host or host == "localhost")
+        repository = f"{registry}/{path if has_host else self.repository}"
         return self.model_copy(update={"repository": repository})
 
     def parts(self) -> dict[str, str]:
@@ -131,7 +124,6 @@ class Image(FrozenModel):
         return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
 
     def reference(self) -> str:
-        """Return the image's reference, by digest if it has one."""
         return (
             f"{self.repository}@{self.digest}" if self.digest else f"{self.repository}:{self.tag}"
         )
@@ -173,16 +165,12 @@ class ImagePin(FrozenModel):
         return self
 
     def over(self, image: Image) -> Image:
-        """Return ``image`` with the fields of this pin in place of its own.
-
-        A pin with only a tag removes the image's digest. A pin with only a digest removes the
-        image's tag.
-        """
-        anew = self.tag or self.digest
+        # a digest would win over a new tag, and a tag would misname a new digest
+        pins_anew = self.tag or self.digest
         return Image(
             repository=self.repository or image.repository,
-            tag=self.tag if anew else image.tag,
-            digest=self.digest if anew else image.digest,
+            tag=self.tag if pins_anew else image.tag,
+            digest=self.digest if pins_anew else image.digest,
         )
 
 
@@ -254,14 +242,12 @@ class ApplicationVersion:
     @cached_property
     def rank(self) -> tuple[Precedence, ...]:
         """The key that sorts the versions of a definition; equal keys mean the same version."""
+        # without a list of versions, a version is that of the charts
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 
     def image(self, name: str, image: Image) -> Image:
-        """Return ``image`` as this version pins it, or unchanged if it does not pin the image.
-
-        ``name`` is the image's name in the registry.
-        """
+        """Return ``image``, which the registry calls ``name``, as this version pins it."""
         return self.images[name].over(image) if name in self.images else image
 
 
@@ -271,11 +257,9 @@ _Resource = Annotated[str, StringConstraints(pattern=r"^[a-z0-9./-]+$")]
 _LaunchFile = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]+$")]
 _Package = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*$")]
 
-_OF_NODES = ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION")
-
 
 def _free(env: dict[str, str]) -> dict[str, str]:
-    for name in _OF_NODES:
+    for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION"):
         if name in env:
             raise ValueError(
                 f"{name} follows from 'ros' of the node in the inventory; set 'ros' there, and "
@@ -328,15 +312,10 @@ class ClientsFile(FileModel):
     zenoh: ClientSettings = ClientSettings()
     ros: ClientSettings = ClientSettings()
 
-    @property
-    def connection_types(self) -> tuple[str, ...]:
-        """The connection types for which the file has settings, as words like ``mqtt``."""
-        return tuple(sorted(self.model_fields_set - {"apiVersion", "kind"}))
-
     def of(self, connection_type: str) -> ClientSettings:
         """Return the settings of a connection type, which is a word like ``mqtt``."""
-        known: ClientSettings = getattr(self, connection_type, ClientSettings())
-        return known
+        settings: ClientSettings = getattr(self, connection_type, ClientSettings())
+        return settings
 
 
 DEFAULT_SETTINGS = ClientsFile(apiVersion="demandops/v1", kind="Clients")

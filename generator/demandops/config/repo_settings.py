@@ -31,6 +31,8 @@ def as_git_url(text: str) -> str:
     return f"ssh://{scp['user']}@{scp['host']}/{scp['path']}" if scp else text
 
 
+# The address is in files of the repo and in the clusters, so it must not hold a password. Git's
+# short form `user@host:path` is refused, because the controllers read only URLs.
 def _git_url_problem(text: str) -> str:
     if _GIT_URL.fullmatch(text):
         return ""
@@ -69,6 +71,7 @@ class ArgoCd(FrozenModel):
     namespace: DnsLabel = "argocd"
 
 
+# A token is sent there, so plain HTTP is only for this machine
 _WEB_URL = re.compile(
     r"(https://[^\s:@/?#]+|http://(127\.0\.0\.1|localhost|\[::1\]))(:\d+)?(/[^\s?#]*)?"
 )

@@ -33,12 +33,11 @@ class Connection:
 
     @property
     def subject(self) -> Subject:
-        """The subject of a claim on this connection."""
         return Subject(SubjectKind.CONNECTION, self.id)
 
     @property
     def home(self) -> str:
-        """The target, whose access domain sets leases and quotas for the connection."""
+        """The target; its access domain sets leases and quotas for the connection."""
         return self.target
 
     @property
@@ -53,38 +52,24 @@ class Connection:
         return self.type
 
     def route(self, source: str) -> Route | None:
-        """Return the route of a source topic, or ``None`` if there is none.
-
-        The routes must be sorted, as the routes of a claim are.
-        """
+        """Return the route of a source topic; the routes must be sorted, as those of a claim."""
         place = bisect_left(self.topics, source, key=attrgetter("source"))
-        found = self.topics[place : place + 1]
-        return found[0] if found and found[0].source == source else None
+        candidate = self.topics[place : place + 1]
+        return candidate[0] if candidate and candidate[0].source == source else None
 
     def needs(self, node: str) -> bool:
-        """Return whether a node is an end of the connection or its broker."""
         return node in (self.source, self.target, self.broker)
 
     def booked(self) -> Connection:
-        """Return the connection in the form of a claim: routes sorted, without duplicates."""
         return replace(self, topics=merged_routes(self.topics))
 
     def extended(self, more: Connection) -> Connection:
-        """Return this connection and ``more`` as one connection.
-
-        The result has the topics of both, and the other fields of ``more``. If ``more`` names no
-        broker, the result has this connection's broker.
-        """
         topics, broker = (*self.topics, *more.topics), more.broker or self.broker
         return replace(more, topics=topics, broker=broker)
 
     def matches_listed(self, listed: object) -> bool:
-        """Return whether a shutdown that lists ``listed`` means this connection.
-
-        The caller has found that both have the same id. An empty source, target or type in
-        ``listed`` matches any value.
-        """
-        return (
+        """Return whether a shutdown that lists ``listed`` means this connection of the same id."""
+        return (  # what the shutdown leaves out matches any value
             isinstance(listed, Connection)
             and listed.source in ("", self.source)
             and listed.target in ("", self.target)
@@ -92,40 +77,28 @@ class Connection:
         )
 
     def distinguishing_values(self) -> tuple[str, ...]:
-        """Return the values by which a shutdown distinguishes connections with the same id."""
         return (self.source, self.target, self.known_type.word)
 
     def topic_keys(self) -> Iterator[TopicKey]:
-        """Yield the key of each topic: a tuple with the topic's name on the source node."""
         for route in self.topics:
             yield (route.source,)
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield (text, keys) for each topic that a shutdown lists in ``listed``.
-
-        The text names the topic in messages. There is one key, or none if this connection does not
-        carry the topic.
-        """
+        """Yield (words, keys of this connection) for each topic that a shutdown lists."""
         assert isinstance(listed, Connection)  # noqa: S101 - see matches_listed
-        known = {*self.topic_keys()}
+        carried = {*self.topic_keys()}
         for key in listed.topic_keys():
-            yield f"topic {key[0]}", [key] if key in known else []
+            yield f"topic {key[0]}", [key] if key in carried else []
 
     def without_topics(self, gone: Container[TopicKey]) -> Connection | None:
-        """Return the connection without these topics; ``None`` if no topic is left."""
         left = tuple(route for route in self.topics if (route.source,) not in gone)
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return what is left of the connection without ``node``.
-
-        If ``node`` is an end, return ``None``. If ``node`` is the broker's node, return the
-        connection without a broker.
-        """
+        """Return what is left of the connection without an end or without its broker."""
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the connection's entries in the ledger's index."""
         for end in self.nodes:
             yield ("link", str(self.type), end)
         if self.broker:

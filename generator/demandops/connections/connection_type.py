@@ -31,7 +31,7 @@ Side = Literal["source", "target"]
 
 @dataclass(frozen=True, slots=True)
 class ClientKey:
-    """The identity of a client.
+    """The identity of a client: of one end of a connection, or of all at a node.
 
     With a ``side``, ``id`` is the connection of which the client is one end. Without a side, ``id``
     is the node whose connections of this type share the client.
@@ -43,7 +43,6 @@ class ClientKey:
 
     @property
     def name(self) -> str:
-        """The name of the client's release."""
         return naming.object_name(self.type.word, self.id, *filter(None, [self.side]))
 
 
@@ -56,18 +55,16 @@ class Client(ABC):
     node: Node
     domain: AccessDomain
     connections: tuple[str, ...]
-    """The connections that the client carries."""
     shaping: Shaping = field(default=UNSHAPED, kw_only=True)
 
     @property
     def images(self) -> tuple[str, ...]:
-        """The names of the client's images in the registry."""
         return (self.type.image,)
 
     @property
     @abstractmethod
     def description(self) -> str:
-        """The client's description in commit messages."""
+        """The client in words, for commit messages."""
 
     @abstractmethod
     def facts(self) -> list[str]:
@@ -78,38 +75,25 @@ class Client(ABC):
         """Return the configuration that the client's program reads."""
 
     def written(self, configuration: Mapping[str, Any]) -> str:
-        """Return a configuration as text, in the format that the client's program reads."""
         return strict_yaml.dump(configuration)
 
     def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return the part of a configuration that the client's program reads only at its start.
-
-        If this part changes, the client restarts.
-        """
+        """Return the part of a configuration with whose change the client restarts."""
         return configuration
 
     def settings(self, config: Config) -> ClientSettings:
-        """Return the settings with which the client runs, patched by overrides.
-
-        Raises:
-            InvalidInput: if an override's patch gives no valid settings. The error names the
-                override.
-        """
-        found = config.clients.of(self.type.word)
+        settings = config.clients.of(self.type.word)
         for file, patch in self.shaping.patches:
-            found = patched_settings(found, patch, file)
-        return found
+            settings = patched_settings(settings, patch, file)
+        return settings
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
         """Return the environment variables that the program needs besides those of ``settings``."""
         return {}
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Yield (file, entry, what the entry decides) for entries that affect the client.
-
-        An entry is a part of a configuration file, such as a broker. The client's node, access
-        domain and images are left out, because they affect every release.
-        """
+        """Yield (file, entry, what the entry decides) for entries that affect the client."""
+        # without node, access domain and images, which affect every release
         file = config.entry_files.get(CLIENTS_FILE, {}).get(self.type.word)
         if file is not None:
             yield file, self.type.word, "how its container runs"
@@ -125,12 +109,10 @@ class End(Client):
 
     @property
     def description(self) -> str:
-        """The end's description: type, side, connection and node."""
         (connection,) = self.connections
         return f"{self.type.name} {self.side} of connection {connection} on {self.node.id}"
 
     def facts(self) -> list[str]:
-        """Return one line for each topic."""
         return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
@@ -139,17 +121,13 @@ class End(Client):
 
 
 def message_type(route: Route, sender: str, config: Config) -> str:
-    """Return the message type of a route whose messages come from the node ``sender``.
-
-    The route's own type comes first, then the type that the inventory lists for the topic at the
-    sender. The result is empty if neither is known.
-    """
-    known = config.nodes.get(sender)
-    return route.type or (known.types.get(route.read_topic, "") if known else "")
+    """Return the message type of a route whose messages come from ``sender``; empty if unknown."""
+    node = config.nodes.get(sender)
+    return route.type or (node.types.get(route.read_topic, "") if node else "")
 
 
+# The code of a fault if the inventory or the registry does not permit a connection's type
 UNSUPPORTED = "unsupported-connection-type"
-"""The code of a fault if the inventory or the registry does not permit a connection's type."""
 
 AnyEnd = TypeVar("AnyEnd", bound=End)
 
@@ -158,11 +136,7 @@ class Connections(Protocol):
     """The claimed connections of one type."""
 
     def get(self, id: str) -> Connection | None:
-        """Return the connection of this type with the id ``id``; ``None`` if no claim holds it.
-
-        Raises:
-            Refused: if the type cannot carry the connection.
-        """
+        """Return the claimed connection, if any; raise Refused if the type cannot carry it."""
 
     def at(self, node: str) -> Iterable[str]:
         """Return the ids of the connections that end at a node, sorted."""
@@ -171,32 +145,29 @@ class Connections(Protocol):
 class ConnectionType(ABC):
     """How clients carry a connection. Each subclass has one instance."""
 
+    # The type's name in messages; files, templates and clients use `word` instead
     name: ClassVar[str]
-    """The type's name in messages; files, templates and clients use ``word`` instead."""
+    # The type's number in `DeploymentRequest`
     number: ClassVar[int]
-    """The type's number in ``DeploymentRequest``."""
+    # The name of the clients' image in the registry
     image: ClassVar[str]
-    """The name of the clients' image in the registry."""
+    # The route options that this connection type supports. Message type and direction are not
+    # listed, because every type supports them.
     options: ClassVar[frozenset[str]]
-    """The route options that this connection type supports.
-
-    Message type and direction are not listed, because every type supports them.
-    """
+    # Whether a topic may have another name at the target than at the source
     renames: ClassVar[bool] = False
-    """Whether a topic may have another name at the target than at the source."""
+    # Whether a demand may name a broker
     takes_broker: ClassVar[bool] = False
-    """Whether a demand may name a broker."""
+    # Whether the clients speak DDS themselves, so that both nodes must run a DDS middleware
     speaks_dds: ClassVar[bool] = True
-    """Whether the clients speak DDS themselves, so that both nodes must run a DDS middleware."""
+    # Whether the clients must know the message type of each topic
     needs_types: ClassVar[bool] = False
-    """Whether the clients must know the message type of each topic."""
 
     def __repr__(self) -> str:
         return self.name
 
     @property
     def word(self) -> str:
-        """The type's name in small letters."""
         return self.name.lower()
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
@@ -204,14 +175,13 @@ class ConnectionType(ABC):
         return iter(())
 
     def shares_clients(self, config: Config) -> bool:
-        """Return whether a client may carry several connections."""
         return False
 
     @abstractmethod
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield a fault for each reason why the type cannot link the two nodes of a connection.
 
-        There is no fault for unknown nodes, because :mod:`demandops.demand.admission` reports them.
+        Unknown nodes are no fault here, because :mod:`demandops.demand.admission` reports them.
         """
 
     def route_faults(
@@ -219,20 +189,15 @@ class ConnectionType(ABC):
     ) -> Iterator[Fault]:
         """Yield those faults of a route that only this type can find.
 
-        Args:
-            where: the path of the route in the connection, such as ``topics[0]``.
-            route: the route.
-            sender: the node that the messages come from.
-            config: the configuration.
+        ``where`` is the route's path in the connection, such as ``topics[0]``. ``sender`` is the
+        node that the messages come from.
         """
         return iter(())
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        """Return the connection as clients will carry it, and a note.
+        """Return the connection as clients will carry it, and a note of how it differs, if it does.
 
-        The note says how the returned connection differs from the demanded one, and is empty if
-        there is no difference. The demanded connection may have faults, because the generator
-        checks the connection only after this call.
+        The generator checks the connection only after this call, so it may have faults.
         """
         return connection, ""
 
@@ -255,9 +220,8 @@ class ConnectionType(ABC):
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:
         """Return the client that ``key`` identifies, or ``None`` if the client carries no topic.
 
-        Raises:
-            Refused: if connections contradict each other, or the configuration no longer has what
-                the connections need.
+        Raises Refused if connections contradict each other, or the configuration no longer has what
+        they need.
         """
 
 
@@ -268,13 +232,7 @@ def make_end(
     config: Config,
     **more: Any,  # noqa: ANN401 - any field
 ) -> AnyEnd:
-    """Return one end of a connection as an instance of ``end``.
-
-    ``more`` has the fields that only the class ``end`` has.
-
-    Raises:
-        Refused: if the end's node is no longer in the inventory or in an access domain.
-    """
+    """Return one end of a connection; ``more`` has the fields that its own class adds."""
     own, peer = connection.source, connection.target
     if key.side == "target":
         own, peer = peer, own

@@ -18,28 +18,27 @@ from demandops.connections.zenoh import ZENOH
 from demandops.errors import Fault, fault, sentences
 from demandops.identifiers import topic_problem
 
+# All connection types, in the order of the automatic choice. The ledger records the choice, so a
+# later change of the inventory does not change the type of a connection.
 CONNECTION_TYPES: tuple[ConnectionType, ...] = (ZENOH, MQTT, ROS)
-"""All connection types, in the order of the automatic choice."""
 
 
 def type_numbered(number: int) -> ConnectionType | None:
-    """Return the type with this number in ``DeploymentRequest``, or ``None`` if no type has it."""
-    return next((known for known in CONNECTION_TYPES if known.number == number), None)
+    return next((kind for kind in CONNECTION_TYPES if kind.number == number), None)
 
 
 def type_named(word: str) -> ConnectionType:
     """Return the type that files call ``word``; raise ``KeyError`` if there is none."""
-    return {known.word: known for known in CONNECTION_TYPES}[word]
+    return {kind.word: kind for kind in CONNECTION_TYPES}[word]
 
 
 def listed(types: Iterable[ConnectionType]) -> str:
     """Return the names of types as text for a message: ``MQTT or ROS``."""
-    return " or ".join(known.name for known in types)
+    return " or ".join(kind.name for kind in types)
 
 
 def by_number() -> list[ConnectionType]:
-    """Return all types, sorted by number."""
-    return sorted(CONNECTION_TYPES, key=lambda known: known.number)
+    return sorted(CONNECTION_TYPES, key=lambda kind: kind.number)
 
 
 def type_word(*before: str, after: tuple[str, ...] = ()) -> PlainValidator:
@@ -48,18 +47,19 @@ def type_word(*before: str, after: tuple[str, ...] = ()) -> PlainValidator:
     Messages list the accepted words: first ``before``, then the words of the types, then ``after``.
     """
 
-    def words() -> tuple[str, ...]:
-        return (*before, *(known.word for known in by_number()), *after)
+    def words() -> tuple[str, ...]:  # of all types at the time of the check
+        return (*before, *(kind.word for kind in by_number()), *after)
 
-    def known_word(value: object) -> object:
+    def check(value: object) -> object:
         if value in words():
             return value
         *most, last = map(repr, words())
         raise PydanticKnownError("literal_error", {"expected": f"{', '.join(most)} or {last}"})
 
-    return PlainValidator(known_word, json_schema_input_type=Literal.__getitem__(words()))
+    return PlainValidator(check, json_schema_input_type=Literal.__getitem__(words()))
 
 
+# Every type supports these options
 _ALWAYS = ("type", "reverse")
 
 
@@ -72,10 +72,7 @@ def choose_type(connection: Connection, config: Config) -> ConnectionType | None
 
 
 def no_type_fault(connection: Connection, config: Config) -> Fault:
-    """Return a fault that says for each type one reason why it cannot carry a connection.
-
-    Call this only if no type can carry the connection (:func:`choose_type`).
-    """
+    """Return a fault with a reason for each type, if no type can carry a connection."""
     reasons = []
     for kind in CONNECTION_TYPES:
         reason = next(type_faults(kind, connection, config))
@@ -89,8 +86,7 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
     """Yield a fault for each reason why ``kind`` cannot carry a connection.
 
-    The field of a fault is a field of :class:`Connection`. There is no fault for nodes that are not
-    in the inventory, because :mod:`demandops.demand.admission` reports them.
+    Unknown nodes are no fault here, because :mod:`demandops.demand.admission` reports them.
     """
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:
@@ -98,13 +94,13 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
         message += config.place_of(IMAGES_FILE)
         yield fault("type", message, code=UNSUPPORTED)
     if connection.broker and not kind.takes_broker:
-        able = listed(known for known in CONNECTION_TYPES if known.takes_broker)
+        able = listed(other for other in CONNECTION_TYPES if other.takes_broker)
         message = f"a broker is for {able} only, but the type is {kind.name}; leave the broker out"
         yield fault("broker", message)
     if kind.speaks_dds and {*ends.values()} <= config.nodes.keys():
         for end, node in ends.items():
             if config.nodes[node].ros.rmw == "rmw_zenoh_cpp":
-                able = listed(known for known in CONNECTION_TYPES if not known.speaks_dds)
+                able = listed(other for other in CONNECTION_TYPES if not other.speaks_dds)
                 yield fault(
                     end,
                     f"'{node}' runs rmw_zenoh_cpp, but type {kind.name} needs DDS; use type "
@@ -118,9 +114,9 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
 def route_faults(
     kind: ConnectionType, topics: Iterable[Route], ends: tuple[str, str], config: Config
 ) -> Iterator[Fault]:
-    """Yield a fault for everything in a connection's routes that ``kind`` does not support.
+    """Yield a fault for everything in routes that ``kind`` does not support.
 
-    ``ends`` are the source and the target. Topics whose names are not valid are left out.
+    ``ends`` are the source and the target.
     """
     for index, route in enumerate(topics):
         if topic_problem(route.source) or topic_problem(route.target):
@@ -128,7 +124,7 @@ def route_faults(
         where = f"topics[{index}]"
         for name in route.options():
             if name not in _ALWAYS and name not in kind.options:
-                able = listed(known for known in CONNECTION_TYPES if name in known.options)
+                able = listed(other for other in CONNECTION_TYPES if name in other.options)
                 yield fault(
                     f"{where}.{name}",
                     f"{name} of '{route.source}' is not supported by {kind.name}; leave it out, or "
@@ -136,10 +132,9 @@ def route_faults(
                 )
         yield from kind.route_faults(where, route, route.sender_and_receiver(*ends)[0], config)
         if route.source != route.target and not kind.renames:
-            able = listed(known for known in CONNECTION_TYPES if known.renames)
+            able = listed(other for other in CONNECTION_TYPES if other.renames)
             yield fault(
                 f"{where}.target",
                 f"'{route.source}' cannot become '{route.target}', because {kind.name} keeps the "
-                f"name of a topic; use the same name at both ends, or use type "
-                f"{able}",
+                f"name of a topic; use the same name at both ends, or use type {able}",
             )

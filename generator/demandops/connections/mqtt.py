@@ -32,8 +32,8 @@ from demandops.connections.route import Route
 from demandops.errors import Fault, Refused, fault
 from demandops.quoting import quoted
 
+# The path at which the certificate of the CA that signs for the broker is mounted
 CA_FILE = "/tls/ca.crt"
-"""The path at which the certificate of the CA that signs for the broker is mounted."""
 
 _NO_BROKER = "no-broker"
 
@@ -50,19 +50,18 @@ class Mqtt(ConnectionType):
     speaks_dds = False
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield a fault if there is a broker, but no image for the clients."""
         if config.brokers and reader.is_missing(IMAGES_FILE, self.image):
             message = f"'{self.image}' is missing; add it, because MQTT connections run it"
             yield fault("images", message).within(IMAGES_FILE)
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault if :func:`choose_broker` finds no broker for the connection."""
         if not {connection.source, connection.target} <= config.nodes.keys():
             return
         if choose_broker(connection, config) is not None:
             return
-        known = ", ".join(sorted(config.brokers))
-        remedy = f"name one of: {known}" if known else f"add one to {config.place_of(BROKERS_FILE)}"
+        remedy = f"name one of: {', '.join(sorted(config.brokers))}"
+        if not config.brokers:
+            remedy = f"add one to {config.place_of(BROKERS_FILE)}"
         ends = f"'{connection.target}' or '{connection.source}'"
         message = f"no broker is given, and none runs on {ends}"
         if connection.broker:
@@ -72,11 +71,7 @@ class Mqtt(ConnectionType):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield a fault if ``mqtt.messages`` of the clients does not list the route's package.
-
-        Yield nothing if ``mqtt.messages`` is empty, the message type is unknown, or the message is
-        carried as a primitive type.
-        """
+        # the image of a client has the code of some packages' messages only
         package = message_type(route, sender, config).partition("/")[0]
         carried = config.clients.mqtt.messages
         if package and carried and package not in carried and not route.primitive:
@@ -89,11 +84,6 @@ class Mqtt(ConnectionType):
             )
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        """Return the connection, and a note if it gets another broker than it names.
-
-        A connection that names no broker stays as it is. In a connection that names one, the broker
-        that :func:`choose_broker` chooses replaces the named broker.
-        """
         broker = choose_broker(connection, config)
         if not connection.broker or broker is None or broker.node == connection.broker:
             return connection, ""
@@ -104,18 +94,15 @@ class Mqtt(ConnectionType):
         return replace(connection, broker=broker.node), note
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return the broker's node, which ``brokers`` in a policy's rule must allow."""
         broker = choose_broker(connection, config)
         return [("brokers", broker.node)] if broker else []
 
     def names(self, key: ClientKey) -> Iterator[tuple[str, str]]:
-        """Yield the names of :meth:`ConnectionType.names`, and the channel that both ends share."""
         yield from ConnectionType.names(self, key)
-        if key.side == "source":
+        if key.side == "source":  # both ends share the channel
             yield "MQTT channel", naming.object_name(self.word, key.id)
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> MqttEnd | None:
-        """Return the end that ``key`` identifies; ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
@@ -130,20 +117,15 @@ class Mqtt(ConnectionType):
         if broker.topic_prefix:
             channel = f"{broker.topic_prefix}/{channel}"
         end = make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
-        own = end.domain.broker_credentials.get(broker.node, broker.credentials)
-        return replace(end, broker=broker.model_copy(update={"credentials": own}))
+        credentials = end.domain.broker_credentials.get(broker.node, broker.credentials)
+        return replace(end, broker=broker.model_copy(update={"credentials": credentials}))
 
 
 MQTT = Mqtt()
 
 
 def choose_broker(connection: Connection, config: Config) -> Broker | None:
-    """Return the broker of a connection, or ``None`` if no broker fits.
-
-    The choice is that of the reference. If there is only one broker, it is chosen. If there are
-    several, the function looks for a broker on the node that the connection names, then on the
-    target, then on the source.
-    """
+    # as the reference chooses: the only broker, or else the named one, then that of an end
     if len(config.brokers) == 1:
         return next(iter(config.brokers.values()))
     for node in map(config.host_of, (connection.broker, connection.target, connection.source)):
@@ -157,15 +139,13 @@ class MqttEnd(End):
     """One end of an MQTT connection."""
 
     broker: Broker
+    # The prefix of this connection's MQTT topics, the same at both ends
     channel: str
-    """The prefix of this connection's MQTT topics, the same at both ends."""
 
     def facts(self) -> list[str]:
-        """Return one line for each topic, and one for the broker."""
         return [*End.facts(self), f"broker {self.broker.node}"]
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
-        """Yield the entries of :meth:`End.shaping_entries`, and the broker's entry."""
         yield from End.shaping_entries(self, config)
         broker = self.broker
         yield (
@@ -175,21 +155,15 @@ class MqttEnd(End):
         )
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
-        """Return the variables that set the ROS domain and the middleware.
-
-        If the middleware is ``image``, there is no variable for it, so the image chooses one.
-        """
-        ros = self.node.ros
-        rmw = (isinstance(settings, MqttClientSettings) and settings.rmw) or ros.rmw
-        chosen = {} if rmw == "image" else {"RMW_IMPLEMENTATION": rmw}
-        return {"ROS_DOMAIN_ID": str(ros.domain_id), **chosen}
+        variables = {"ROS_DOMAIN_ID": str(self.node.ros.domain_id)}
+        rmw = (isinstance(settings, MqttClientSettings) and settings.rmw) or self.node.ros.rmw
+        if rmw != "image":  # else the image chooses
+            variables["RMW_IMPLEMENTATION"] = rmw
+        return variables
 
     def configuration(self) -> dict[str, Any]:
-        """Return the content of one end's ROS parameter file.
-
-        Each ROS topic has one MQTT topic. The MQTT topic is named after the connection and the
-        source topic, because the name of the ROS topic may differ between the ends.
-        """
+        # An MQTT topic is named after the connection and the source topic, because the name of the
+        # ROS topic may differ between the ends.
         bridge: dict[str, Any] = {}
         read = {route.read_topic: route for route in self.topics if self.reads(route)}
         written = [route for route in self.topics if not self.reads(route)]
@@ -201,27 +175,22 @@ class MqttEnd(End):
                     **_options(route, retained=route.retained),
                 }
         if written:
-            bridge["mqtt2ros"] = {"mqtt_topics": [self.channel + one.source for one in written]}
+            mqtt_topics = [self.channel + route.source for route in written]
+            bridge["mqtt2ros"] = {"mqtt_topics": mqtt_topics}
             for route in written:
                 bridge["mqtt2ros"][self.channel + route.source] = {
                     "ros_topic": route.written_topic,
                     **_options(route),
                 }
-        parameters = {
-            "broker": _broker(self.broker),
-            "client": {"id": self.name},
-            "bridge": bridge,
-        }
+        broker: dict[str, Any] = {"host": self.broker.host, "port": self.broker.port}
+        if self.broker.tls:
+            broker["tls"] = {"enabled": True}
+            if self.broker.tls.ca_secret:
+                broker["tls"]["ca_certificate"] = CA_FILE
+        parameters = {"broker": broker, "client": {"id": self.name}, "bridge": bridge}
+        # ROS merges the entries of all wildcards: the init container adds user name and password
+        # under /**
         return {"/**/*": {"ros__parameters": parameters}}
-
-
-def _broker(broker: Broker) -> dict[str, Any]:
-    data: dict[str, Any] = {"host": broker.host, "port": broker.port}
-    if broker.tls:
-        data["tls"] = {"enabled": True}
-        if broker.tls.ca_secret:
-            data["tls"]["ca_certificate"] = CA_FILE
-    return data
 
 
 def _options(route: Route, *, retained: bool = False) -> dict[str, Any]:

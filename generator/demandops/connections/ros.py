@@ -41,9 +41,8 @@ class Ros(ConnectionType):
     needs_types = True
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault if neither end has a reachable address."""
-        known = {connection.source, connection.target} <= config.nodes.keys()
-        if known and _listener(connection, config) is None:
+        are_known = {connection.source, connection.target} <= config.nodes.keys()
+        if are_known and _listener(connection, config) is None:
             yield fault(
                 "type",
                 f"{self.name} needs an end with a reachable address; add 'wan: {{host: …}}' to "
@@ -54,7 +53,6 @@ class Ros(ConnectionType):
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield a fault for an unknown message type, and for durability without reliability."""
         if sender in config.nodes and not message_type(route, sender, config):
             yield fault(
                 f"{where}.type",
@@ -70,7 +68,6 @@ class Ros(ConnectionType):
             )
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> RosEnd | None:
-        """Return the end that ``key`` identifies; ``None`` if its connection carries no topic."""
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
@@ -88,8 +85,8 @@ class Ros(ConnectionType):
         for other in connections.at(listener.id):
             if other == key.id or _port(other, listener.wan) != port:
                 continue
-            found = connections.get(other)
-            if found is not None and _listener(found, config) is listener:
+            rival = connections.get(other)
+            if rival is not None and _listener(rival, config) is listener:
                 message = (
                     f"connection '{key.id}' would listen on port {port} of "
                     f"'{listener.id}', but connection '{other}' already does; use another "
@@ -107,10 +104,7 @@ ROS = Ros()
 
 
 def _listener(connection: Connection, config: Config) -> Node | None:
-    """Return the end that listens, or ``None`` if neither end has a wan address.
-
-    If both ends have a wan address, the target listens.
-    """
+    """Return the end that listens, the target if both can, or ``None`` if neither can."""
     for id in (connection.target, connection.source):
         node = config.nodes.get(id)
         if node is not None and node.wan is not None:
@@ -119,16 +113,12 @@ def _listener(connection: Connection, config: Config) -> Node | None:
 
 
 def _port(connection: str, wan: Wan) -> int:
-    """Return a connection's port, which depends only on the connection id and the port range."""
+    # only from the id and the range, so that no other connection changes it
     return wan.first_port + _number(connection) % (wan.last_port - wan.first_port + 1)
 
 
-@lru_cache(maxsize=65_536)
+@lru_cache(maxsize=65_536)  # the ports of all connections at a node are compared
 def _number(connection: str) -> int:
-    """Return a number that depends only on the connection id.
-
-    The result is cached, because the ports of all connections at a node are compared.
-    """
     return int(naming.digest("port", connection), 16)
 
 
@@ -136,30 +126,37 @@ def _number(connection: str) -> int:
 class RosEnd(End):
     """One end of a ROS connection. Each route in ``topics`` has its message type set."""
 
+    # The id of the node that listens; its address is `wan`, and its port is `port`
     listener: str
-    """The id of the node that listens; its address is ``wan``, and its port is ``port``."""
     wan: Wan
     port: int
 
     def facts(self) -> list[str]:
-        """Return the lines that describe this end: each topic, and the listening address."""
         return [*End.facts(self), f"address {self.wan.host}:{self.port}"]
 
     def configuration(self) -> dict[str, Any]:
-        """Return the configuration of one end's router.
-
-        Each topic passes in one direction only: the router at one end subscribes to it, and the
-        router at the other end publishes it. The key ``routes`` is for topics that come from the
-        source, as most do. A topic in the reverse direction needs an entry under ``topic-routes``,
-        and a new entry there restarts the router.
-        """
+        # Each topic passes in one direction only: the router at one end subscribes to it, and the
+        # router at the other end publishes it. The key `routes` is for topics that come from the
+        # source, as most do.
         inward, outward = _routes(_LOCAL, _WAN), _routes(_WAN, _LOCAL)
         topics, tuned, reverse = [], [], []
         for route in self.topics:
             reads = self.reads(route)
-            topic = {"name": f"rt{route.read_topic}", "type": dds_type(route.type)}
+            # the names that ROS gives a topic and its type in DDS
+            package, kind, name = route.type.split("/")
+            dds_type = f"{package}::{kind}::dds_::{name}_"
+            topic = {"name": f"rt{route.read_topic}", "type": dds_type}
             topics.append(topic)
-            if qos := _qos(route, reads=reads):
+            qos: dict[str, Any] = {}
+            if route.reliability:
+                qos["reliability"] = route.reliability == "reliable"
+            if route.durability:
+                qos["durability"] = route.durability == "transient_local"
+            if route.queue:
+                qos["history-depth"] = route.queue
+            if route.rate and reads:  # no surplus messages cross the link
+                qos["max-tx-rate"] = route.rate
+            if qos:
                 tuned.append({**topic, "qos": qos})
             if route.reverse:
                 reverse.append({**topic, "routes": inward if reads else outward})
@@ -186,41 +183,14 @@ class RosEnd(End):
         }
 
     def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return what a router reads only at its start: all but ``allowlist``.
-
-        So a new topic restarts the router only if it needs an entry in ``topics`` (QoS settings) or
-        ``topic-routes`` (reverse direction).
-        """
+        # So a new topic restarts the router only if it needs an entry in `topics` (QoS settings) or
+        # `topic-routes` (reverse direction).
         return {name: value for name, value in configuration.items() if name != "allowlist"}
-
-
-def dds_type(ros_type: str) -> str:
-    """Return the DDS name of a message type: ``std_msgs::msg::dds_::String_``."""
-    package, kind, name = ros_type.split("/")
-    return f"{package}::{kind}::dds_::{name}_"
 
 
 def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
     """Return the router's routes that let messages pass only from ``sender`` to ``receiver``."""
     return [{"src": sender, "dst": [receiver]}, {"src": receiver}]
-
-
-def _qos(route: Route, *, reads: bool) -> dict[str, Any]:
-    """Return a topic's QoS settings in the router's format.
-
-    ``reads`` says whether the router is at the end that reads the topic from ROS. Only that router
-    limits the rate, so that no surplus messages cross the link.
-    """
-    qos: dict[str, Any] = {}
-    if route.reliability:
-        qos["reliability"] = route.reliability == "reliable"
-    if route.durability:
-        qos["durability"] = route.durability == "transient_local"
-    if route.queue:
-        qos["history-depth"] = route.queue
-    if route.rate and reads:
-        qos["max-tx-rate"] = route.rate
-    return qos
 
 
 def _is_ip(host: str) -> bool:

@@ -10,9 +10,9 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, fields
 from typing import Annotated, Any, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import Field
 
-from demandops.config.base_model import FrozenModel
+from demandops.config.base_model import FrozenModel, without
 from demandops.errors import Fault, fault
 from demandops.identifiers import message_type_problem, topic_problem
 from demandops.quoting import quoted
@@ -46,7 +46,6 @@ class Route:
     rate: float = 0.0
 
     def options(self) -> dict[str, Any]:
-        """Return the options that differ from their defaults, as a map from option to value."""
         return {
             name: value for name, default in _DEFAULTS if (value := getattr(self, name)) != default
         }
@@ -70,10 +69,6 @@ class Route:
         return f"topic {self.source} {direction} {self.target}" + (f" ({listed})" if listed else "")
 
     def sender_and_receiver(self, source: str, target: str) -> tuple[str, str]:
-        """Return the node that sends the topic, and the node that receives it.
-
-        ``source`` and ``target`` are the nodes at the ends of the connection.
-        """
         return (target, source) if self.reverse else (source, target)
 
 
@@ -82,13 +77,7 @@ _DEFAULTS = tuple(
 )
 
 
-def _message_type(value: str) -> str:
-    if value and message_type_problem(value):
-        raise ValueError(message_type_problem(value))
-    return value
-
-
-MessageType = Annotated[str, AfterValidator(_message_type)]
+MessageType = Annotated[str, without(lambda value: message_type_problem(value) if value else "")]
 
 
 class RouteOptions(FrozenModel):
@@ -105,7 +94,6 @@ class RouteOptions(FrozenModel):
     rate: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False, strict=False)] = 0.0
 
     def route(self, source: str, target: str) -> Route:
-        """Return the route from ``source`` to ``target`` with these options."""
         return Route(source, target, **self.model_dump(include=set(RouteOptions.model_fields)))
 
 
@@ -140,13 +128,11 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
             )
 
 
-def contradictions(one: Route, other: Route) -> Iterator[tuple[str, object, object]]:
-    """Yield (option, first value, second value) for each contradiction between two routes.
-
-    An empty message type does not contradict another.
-    """
+def contradictions(route: Route, other: Route) -> Iterator[tuple[str, object, object]]:
+    """Yield (option, first value, second value) for each contradiction between two routes."""
     for name, _ in _DEFAULTS:
-        first, second = getattr(one, name), getattr(other, name)
+        first, second = getattr(route, name), getattr(other, name)
+        # an empty type leaves it to the other route, or to the inventory
         if first == second or (name == "type" and not (first and second)):
             continue
         yield name, _shown(first), _shown(second)
@@ -157,11 +143,7 @@ def _shown(value: object) -> str:
 
 
 def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
-    """Return one route for each source topic, sorted by source topic.
-
-    If several routes have the same source topic, the first route with a message type is kept. If
-    none of them has a message type, the first route is kept.
-    """
+    """Return one route for each source topic, sorted: the first, or the first with a type."""
     merged: dict[str, Route] = {}
     for route in routes:
         first = merged.get(route.source)

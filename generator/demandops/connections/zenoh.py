@@ -16,7 +16,6 @@ from typing import Any
 from demandops import naming
 from demandops.config.config import NODES_FILE, Config
 from demandops.config.config_reader import ConfigReader
-from demandops.config.inventory import Node
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
@@ -37,7 +36,7 @@ class Zenoh(ConnectionType):
     options = frozenset({"rate"})
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield a fault for each bridge that shares host and ROS domain with an earlier bridge."""
+        # two bridges on one host and ROS domain do not work
         hosts: dict[tuple[object, ...], str] = {}
         for node in config.nodes.values():
             host = (node.cluster, node.ros.domain_id, *sorted(node.labels().items()))
@@ -50,11 +49,9 @@ class Zenoh(ConnectionType):
                 ).within(file)
 
     def shares_clients(self, config: Config) -> bool:
-        """Return whether any node has a bridge: a bridge may carry several connections."""
         return any(node.zenoh for node in config.nodes.values())
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault if an end has no bridge, or if the two bridges cannot reach each other."""
         source, target = config.nodes.get(connection.source), config.nodes.get(connection.target)
         if source is None or target is None:
             return
@@ -80,14 +77,9 @@ class Zenoh(ConnectionType):
             )
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
-        """Return the keys of both nodes' bridges."""
         return ClientKey(self, source), ClientKey(self, target)
 
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Bridge | None:
-        """Return a node's bridge, the client of all its Zenoh connections.
-
-        Return ``None`` if they carry no topic.
-        """
         publishers: dict[str, tuple[float, str]] = {}
         subscribers: set[str] = set()
         peers: dict[str, str] = {}
@@ -112,6 +104,19 @@ class Zenoh(ConnectionType):
         if not peers:
             return None
         node, domain = config.node_and_domain(key.id)
+        if node.zenoh is None:
+            message = (
+                f"'{node.id}' carries Zenoh connections, but has no 'zenoh' in "
+                f"{config.file_of(NODES_FILE, node.id)} any longer; restore 'zenoh' there"
+            )
+            raise Refused.at("node", message, code=UNSUPPORTED)
+        endpoints = {*node.zenoh.connect}
+        for id in {*peers.values()}:
+            peer = config.nodes.get(id)
+            endpoint = peer.zenoh.endpoint if peer and peer.zenoh else None
+            # if both can reach the other, only the first connects, so that there is only one link
+            if endpoint and (not node.zenoh.endpoint or node.id < id):
+                endpoints.add(endpoint)
         return Bridge(
             type=self,
             name=key.name,
@@ -123,33 +128,12 @@ class Zenoh(ConnectionType):
             rates=MappingProxyType(
                 {t: rate for t, (rate, _) in sorted(publishers.items()) if rate}
             ),
-            connect=_connect(node, set(peers.values()), config),
-            listen=node.zenoh.listening() if node.zenoh else (),
+            connect=tuple(sorted(endpoints)),
+            listen=node.zenoh.listening(),
         )
 
 
 ZENOH = Zenoh()
-
-
-def _connect(node: Node, peers: set[str], config: Config) -> tuple[str, ...]:
-    """Return the endpoints that a bridge connects to: its routers, and some of its peers.
-
-    If two peers can reach each other, only the peer whose id sorts first connects to the other. So
-    there is only one link between the two.
-    """
-    if node.zenoh is None:
-        message = (
-            f"'{node.id}' carries Zenoh connections, but has no 'zenoh' in "
-            f"{config.file_of(NODES_FILE, node.id)} any longer; restore 'zenoh' there"
-        )
-        raise Refused.at("node", message, code=UNSUPPORTED)
-    endpoints = set(node.zenoh.connect)
-    for id in peers:
-        peer = config.nodes.get(id)
-        endpoint = peer.zenoh.endpoint if peer and peer.zenoh else None
-        if endpoint and (not node.zenoh.endpoint or node.id < id):
-            endpoints.add(endpoint)
-    return tuple(sorted(endpoints))
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,11 +153,9 @@ class Bridge(Client):
 
     @property
     def description(self) -> str:
-        """The bridge's description, which names the node."""
         return f"Zenoh bridge on {self.node.id}"
 
     def facts(self) -> list[str]:
-        """Return the bridge's connections, topics and rates, and the endpoints it connects to."""
         return [
             *(f"connection {id}" for id in self.connections),
             *(f"reads {topic}" for topic in self.publishers),
@@ -183,12 +165,7 @@ class Bridge(Client):
         ]
 
     def configuration(self) -> dict[str, Any]:
-        """Return the configuration of a node's bridge.
-
-        ``allow`` lists the topics that pass. If ``allow`` lacks ``publishers`` or ``subscribers``,
-        no topic of that kind passes. Multicast scouting is off, because the state repo defines
-        which bridges connect.
-        """
+        # if `allow` lacks `publishers` or `subscribers`, no topic of that kind passes
         lists = {"publishers": self.publishers, "subscribers": self.subscribers}
         ros: dict[str, Any] = {
             "nodename": naming.ros_name(self.name),
@@ -207,14 +184,14 @@ class Bridge(Client):
             "mode": "router",
             "connect": {"endpoints": list(self.connect)},
             "listen": {"endpoints": list(self.listen)},
+            # the state repo defines which bridges connect
             "scouting": {"multicast": {"enabled": False}},
             "plugins": {"ros2dds": ros},
         }
 
     def written(self, configuration: Mapping[str, Any]) -> str:
-        """Return a configuration as JSON."""
         return json.dumps(configuration, indent=2, ensure_ascii=False) + "\n"
 
 
 def _exactly(topic: str) -> str:
-    return f"^{re.escape(topic)}$"
+    return f"^{re.escape(topic)}$"  # the bridge takes regular expressions

@@ -21,7 +21,14 @@ from demandops.templating.values import SchemaTask, ValuesTask, evaluate
 
 def serve(memory_mib: int) -> None:
     """Answer the questions on standard input until it ends."""
-    _limit_memory(memory_mib)
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + memory_mib * 1024 * 1024
+    # if the machine lacks memory, the kernel ends this process rather than the generator
+    Path("/proc/self/oom_score_adj").write_text("1000")
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    # it writes no file, and leaves no core file when the kernel ends it
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     files: dict[str, str] = {}
     while first := sys.stdin.buffer.readline():
         start, second = json.loads(first), sys.stdin.buffer.readline()
@@ -33,9 +40,13 @@ def serve(memory_mib: int) -> None:
         began = _processor_time()
         # the kernel counts the time of all threads, also inside C and Rust, and then ends us
         signal.setitimer(signal.ITIMER_PROF, start["seconds"])
-        line = _line(_answer(files, second), began)
+        answer = _answer(files, second)
+        try:
+            line = json.dumps(answer | {"seconds": _processor_time() - began})
+        except (MemoryError, RecursionError):
+            sys.exit(1)
         signal.setitimer(signal.ITIMER_PROF, 0)
-        sys.stdout.buffer.write(line)
+        sys.stdout.buffer.write(line.encode("ascii") + b"\n")
         sys.stdout.buffer.flush()
 
 
@@ -52,24 +63,6 @@ def _answer(files: dict[str, str], question: bytes) -> dict[str, Any]:
         return {"error": repr(error)}
 
 
-def _line(answer: dict[str, Any], began: float) -> bytes:
-    try:
-        text = json.dumps(answer | {"seconds": _processor_time() - began})
-    except (MemoryError, RecursionError):
-        sys.exit(1)
-    return text.encode("ascii") + b"\n"
-
-
 def _processor_time() -> float:
     used = resource.getrusage(resource.RUSAGE_SELF)
     return used.ru_utime + used.ru_stime
-
-
-def _limit_memory(mib: int) -> None:
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + mib * 1024 * 1024
-    # if the machine lacks memory, the kernel ends this process rather than the generator
-    Path("/proc/self/oom_score_adj").write_text("1000")
-    resource.setrlimit(resource.RLIMIT_AS, (most, most))
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

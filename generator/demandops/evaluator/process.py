@@ -33,11 +33,9 @@ from demandops.templating.values import SchemaTask, ValuesTask
 
 log = logging.getLogger("demandops")
 
+# How many seconds of processor time the evaluations of one demand may take together. The values of
+# a service with 8,000 topics take half of it.
 DEMAND_S = 0.5
-"""How many seconds of processor time the evaluations of one demand may take together.
-
-The values of a service with 8,000 topics take half of it.
-"""
 MEMORY_MIB = 512
 _MOST_IDLE = 2  # the worker's and the page's
 _LONGEST_ANSWER = 64_000_000
@@ -51,10 +49,7 @@ _START = (
 
 @dataclass(slots=True)
 class _Limits:
-    """Seconds of processor time: for each evaluation, and left for all of them together.
-
-    ``meanwhile`` is called before each evaluation.
-    """
+    """Seconds of processor time: for each evaluation, and left for all of them together."""
 
     each: float
     left: float
@@ -80,26 +75,33 @@ def processor_time(
 
 
 class Evaluator:
-    """Evaluates in child processes; an instance is an ``Evaluate`` of the core.
-
-    Threads may call it at the same time; each call has a child of its own.
-    """
+    """Evaluates in child processes; threads may call it at the same time."""
 
     def __init__(self) -> None:
         self._idle: list[_Child] = []
 
     def __call__(self, files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:
-        """Return the values of a task (:data:`demandops.templating.values.Evaluate`)."""
         limits = _limits.get(None) or _Limits(2, inf)
         limits.meanwhile()
         seconds = min(limits.each, limits.left)
         if seconds <= 0:
             raise _over(task, "the evaluations before it took all the time of this demand")
-        try:
-            child, answer = self._answered(files, task, seconds)
-        except _Died as death:
-            limits.left -= seconds if death.is_late else 0
-            raise _over(task, str(death)) from None
+        while True:
+            try:
+                child, is_fresh = self._idle.pop(), False  # threads may share a list in CPython
+            except IndexError:
+                child, is_fresh = _Child(), True
+            try:
+                answer = child.answer(files, task, seconds)
+                break
+            except _Died as death:
+                # somebody may have ended an idle child, or it kept much of earlier evaluations
+                if is_fresh or death.is_late:
+                    limits.left -= seconds if death.is_late else 0
+                    raise _over(task, str(death)) from None
+            except BaseException:
+                child.kill()  # its answer was not read, so the next one would be taken for it
+                raise
         if len(self._idle) < _MOST_IDLE:
             self._idle.append(child)
         else:
@@ -112,26 +114,8 @@ class Evaluator:
         values: dict[str, Any] = answer["values"]
         return values
 
-    def _answered(
-        self, files: Mapping[str, str], task: ValuesTask | SchemaTask, seconds: float
-    ) -> tuple[_Child, dict[str, Any]]:
-        while True:
-            try:
-                child, is_fresh = self._idle.pop(), False  # threads may share a list in CPython
-            except IndexError:
-                child, is_fresh = _Child(), True
-            try:
-                return child, child.answer(files, task, seconds)
-            except _Died as death:
-                # somebody may have ended an idle child, or it kept much of earlier evaluations
-                if is_fresh or death.is_late:
-                    raise
-            except BaseException:
-                child.kill()  # its answer was not read, so the next one would be taken for it
-                raise
-
     def forget(self) -> None:
-        """Give up all children, without ending them: a forked process has its parent's."""
+        # without ending them, because a forked process has its parent's children here
         self._idle = []
 
 
@@ -143,10 +127,7 @@ def _over(task: ValuesTask | SchemaTask, reason: str) -> OverLimit:
 
 
 class _Died(Exception):
-    """Raised if a child ended, or was ended, before it answered. The text is the reason.
-
-    ``is_late``: it had no more time.
-    """
+    """Raised if a child ended, or was ended, before it answered, maybe for lack of time."""
 
     def __init__(self, reason: str, *, is_late: bool = False) -> None:
         super().__init__(reason)
@@ -154,8 +135,6 @@ class _Died(Exception):
 
 
 class _Child:
-    """A process that evaluates, and what this process knows of it."""
-
     def __init__(self) -> None:
         package = str(Path(__file__).parents[2])
         # -S leaves out what packages run at each start; the path has all that it would add
@@ -175,24 +154,39 @@ class _Child:
     def answer(
         self, files: Mapping[str, str], task: ValuesTask | SchemaTask, seconds: float
     ) -> dict[str, Any]:
-        """Return the child's answer to a task.
-
-        Raises _Died if it takes more than ``seconds`` of processor time, or the child ends.
-        """
+        """Return the child's answer; raise _Died if it ends or takes more than ``seconds``."""
         changed: dict[str, str | None] = {}
         if files is not self._files:
-            known, self._files = self._files, files
-            changed = {path: text for path, text in files.items() if known.get(path) != text}
-            changed |= dict.fromkeys(known.keys() - files.keys())
+            sent, self._files = self._files, files
+            changed = {path: text for path, text in files.items() if sent.get(path) != text}
+            changed |= dict.fromkeys(sent.keys() - files.keys())
         parts = {field.name: getattr(task, field.name) for field in fields(task)}
         question = _encoded({"files": changed, "seconds": seconds}) + _encoded(parts)
-        assert self._process.stdin is not None  # noqa: S101 - both are pipes
-        descriptor, left = self._process.stdin.fileno(), memoryview(question)
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None and stdout is not None  # noqa: S101 - both are pipes
+        unsent = memoryview(question)
         with suppress(BrokenPipeError):  # the child ended, as reading will show
-            while left:
-                self._wait(descriptor, select.POLLOUT, seconds)
-                left = left[os.write(descriptor, left) :]
-        return self._read(seconds)
+            while unsent:
+                self._wait(stdin.fileno(), select.POLLOUT, seconds)
+                unsent = unsent[os.write(stdin.fileno(), unsent) :]
+        pieces, length = list[bytes](), 0
+        while not pieces or not pieces[-1].endswith(b"\n"):
+            self._wait(stdout.fileno(), select.POLLIN, seconds)
+            piece = os.read(stdout.fileno(), 1_000_000)
+            length += len(piece)
+            if length > _LONGEST_ANSWER:
+                self.kill()
+                raise _Died(f"gives more than {_LONGEST_ANSWER} characters")
+            if not piece:
+                status = self._process.wait()
+                self._close()
+                if status == -signal.SIGPROF:  # the timer that the child sets
+                    reason = f"takes more than {seconds:.3g} s of processor time"
+                    raise _Died(reason, is_late=True)
+                raise _Died(f"takes more than {MEMORY_MIB} MiB of memory, or is nested too deeply")
+            pieces.append(piece)
+        answer: dict[str, Any] = json.loads(b"".join(pieces))
+        return answer
 
     def _wait(self, descriptor: int, event: int, seconds: float) -> None:
         waiting = select.poll()
@@ -200,30 +194,6 @@ class _Child:
         if not waiting.poll((_LONGEST_WAIT_S + 20 * seconds) * 1000):
             self.kill()
             raise _Died("gave no answer for a long time", is_late=True)
-
-    def _read(self, seconds: float) -> dict[str, Any]:
-        assert self._process.stdout is not None  # noqa: S101
-        descriptor = self._process.stdout.fileno()
-        pieces, length = list[bytes](), 0
-        while not pieces or not pieces[-1].endswith(b"\n"):
-            self._wait(descriptor, select.POLLIN, seconds)
-            piece = os.read(descriptor, 1_000_000)
-            length += len(piece)
-            if not piece or length > _LONGEST_ANSWER:
-                raise self._death(seconds, too_long=length > _LONGEST_ANSWER)
-            pieces.append(piece)
-        answer: dict[str, Any] = json.loads(b"".join(pieces))
-        return answer
-
-    def _death(self, seconds: float, too_long: bool) -> _Died:
-        if too_long:
-            self.kill()
-            return _Died(f"gives more than {_LONGEST_ANSWER} characters")
-        status = self._process.wait()
-        self._close()
-        if status == -signal.SIGPROF:
-            return _Died(f"takes more than {seconds:.3g} s of processor time", is_late=True)
-        return _Died(f"takes more than {MEMORY_MIB} MiB of memory, or is nested too deeply")
 
     def kill(self) -> None:
         self._process.kill()
@@ -238,16 +208,14 @@ class _Child:
 
 
 def _encoded(message: object) -> bytes:
+    def plain(value: object) -> object:
+        if isinstance(value, Mapping):
+            return dict(value)
+        raise TypeError(f"a {type(value).__name__} cannot be sent to a child")
+
     # ASCII has an escape for what UTF-8 cannot encode; there are no line breaks within JSON
-    return json.dumps(message, default=_plain).encode("ascii") + b"\n"
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, Mapping):
-        return dict(value)
-    raise TypeError(f"a {type(value).__name__} cannot be sent to a child")
+    return json.dumps(message, default=plain).encode("ascii") + b"\n"
 
 
 EVALUATE = Evaluator()
-"""The evaluator of this process."""
 os.register_at_fork(after_in_child=EVALUATE.forget)

@@ -27,21 +27,20 @@ class _Verbatim(str):
 
 
 class CompiledTemplates(BytecodeCache):
-    """Keeps compiled templates, so that a process seldom compiles a text twice."""
-
+    # each rendering has a sandbox of its own, with which Jinja's own cache of templates goes
     _LIMIT = 256
 
     def __init__(self) -> None:
-        self._kept: dict[tuple[str, str], CodeType] = {}
+        self._code: dict[tuple[str, str], CodeType] = {}
 
     def load_bytecode(self, bucket: Bucket) -> None:
-        bucket.code = self._kept.get((bucket.key, bucket.checksum))
+        bucket.code = self._code.get((bucket.key, bucket.checksum))
 
     def dump_bytecode(self, bucket: Bucket) -> None:
-        if len(self._kept) >= self._LIMIT:
-            self._kept.clear()
+        if len(self._code) >= self._LIMIT:
+            self._code.clear()
         if bucket.code:
-            self._kept[bucket.key, bucket.checksum] = bucket.code
+            self._code[bucket.key, bucket.checksum] = bucket.code
 
 
 def _finalize(value: object) -> object:
@@ -67,17 +66,12 @@ def _block(value: Mapping[str, Any], indent: int) -> _Verbatim:
 
 
 def _literal(value: str, indent: int) -> _Verbatim:
-    """Return ``value`` as the indented body of a YAML literal block (``|``)."""
     pad = " " * indent
     return _Verbatim("\n".join(pad + line for line in value.rstrip("\n").split("\n")))
 
 
 def _bare(value: str) -> _Verbatim:
-    """Return a path as text that a template writes, unquoted, into a comment.
-
-    Raises:
-        ValueError: if the path has characters that need quotes.
-    """
+    """Return a path as text that a template writes, unquoted, into a comment."""
     if not re.fullmatch(r"[A-Za-z0-9._/-]+", value):
         raise ValueError(f"'{value}' is not a plain path, so it cannot be written in a comment")
     return _Verbatim(value)
@@ -96,7 +90,7 @@ OPTIONS: dict[str, Any] = {
     "trim_blocks": True,
     "lstrip_blocks": True,
     "keep_trailing_newline": True,
-    "auto_reload": False,
+    "auto_reload": False,  # would read each file's time at each use
 }
 
 
@@ -113,8 +107,5 @@ def _own(folder: Path) -> Environment:
 
 
 def text(template: str, **context: object) -> str:
-    """Return the rendered text of one of the program's templates.
-
-    A template is named by its path in the ``templates`` folder, like ``flux/release.yaml.j2``.
-    """
+    """Return the rendered text of a template of the program, such as ``flux/release.yaml.j2``."""
     return _own(data_folder("templates")).get_template(template).render(**context)

@@ -9,14 +9,7 @@ is not the sandbox's matter: it runs in a process with limits (:mod:`demandops.e
 from __future__ import annotations
 
 import re
-from collections.abc import (
-    Callable,
-    ItemsView,
-    Iterator,
-    KeysView,
-    Mapping,
-    ValuesView,
-)
+from collections.abc import Callable, ItemsView, Iterator, KeysView, Mapping, ValuesView
 from functools import lru_cache, wraps
 from typing import Any
 
@@ -48,29 +41,28 @@ _METHODS: dict[type, list[str]] = {
 }
 _BUILT_IN = (str, int, float, bytes, dict, list, tuple, range)
 _VIEWS = (KeysView, ItemsView, ValuesView)
+# the text of StrictUndefined is an error of its own, which names what is missing
 _PLAIN = (str, int, float, type(None), range, Undefined)
 
 
 def _as_data(value: Any) -> Any:  # noqa: ANN401
     """Return a value, an iterator or view as a list; raise SecurityError if a part is no data."""
-    if isinstance(value, Iterator | KeysView | ItemsView | ValuesView):
+    if isinstance(value, (Iterator, *_VIEWS)):
         value = list(value)
     parts = [value]
     while parts:
         part = parts.pop()
-        if isinstance(part, list | tuple):
+        if isinstance(part, (list, tuple, *_VIEWS)):
             parts.extend(part)
         elif isinstance(part, Mapping):
             parts.extend(part)
             parts.extend(part.values())
-        elif isinstance(part, _VIEWS):
-            parts.extend(part)
         elif not isinstance(part, _PLAIN):
             raise SecurityError(not_writable(part))
     return value
 
 
-@lru_cache(maxsize=256)  # each configuration has a sandbox, but all have the same filters
+@lru_cache(maxsize=256)  # each rendering has a sandbox, but all have the same filters
 def _of_data(function: Callable[..., Any]) -> Callable[..., Any]:
     """Change a filter or format so that its arguments must be data."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
@@ -96,37 +88,23 @@ class _Concatenations(NodeTransformer):
     def visit_Concat(self, node: nodes.Concat) -> nodes.Filter:
         self.generic_visit(node)
         operands = nodes.List(node.nodes, lineno=node.lineno)
-        return nodes.Filter(
-            operands,
-            "_concatenated",
-            [],
-            [],
-            None,
-            None,
-            lineno=node.lineno,
-            environment=self._environment,
-        )
+        place = {"lineno": node.lineno, "environment": self._environment}
+        return nodes.Filter(operands, "_concatenated", [], [], None, None, **place)
 
 
 class Sandbox(ImmutableSandboxedEnvironment):
-    """Jinja's sandbox, with the filters and methods that this module lists."""
-
-    intercepted_binops = frozenset({"%"})
+    intercepted_binops = frozenset({"%"})  # the format `%s` would write anything as text
 
     def __init__(self, filters: Mapping[str, Callable[..., Any]], **options: Any) -> None:  # noqa: ANN401
-        """Create a sandbox whose templates may use ``filters``, besides Jinja's that are listed.
-
-        ``options`` are those of Jinja's environment.
-        """
         super().__init__(**options)
-        written = self.finalize
-        assert written is not None  # noqa: S101 - our own options
-        self.finalize = lambda value: written(_as_data(value))
-        kept = {name: self.filters[name] for name in _FILTERS}
-        named = {**kept, **filters, "_concatenated": _concatenated}
-        self.filters = {name: _of_data(function) for name, function in named.items()}
+        finalize = self.finalize
+        assert finalize is not None  # noqa: S101 - our own options
+        self.finalize = lambda value: finalize(_as_data(value))
+        listed = {name: self.filters[name] for name in _FILTERS}
+        allowed = {**listed, **filters, "_concatenated": _concatenated}
+        self.filters = {name: _of_data(function) for name, function in allowed.items()}
         del self.tests["sameas"]  # whether two values are one object is an accident
-        del self.globals["lipsum"]
+        del self.globals["lipsum"]  # writes random text
 
     def _parse(self, source: str, name: str | None, filename: str | None) -> nodes.Template:
         tree: nodes.Template = _Concatenations(self).visit(super()._parse(source, name, filename))

@@ -17,7 +17,7 @@ from functools import lru_cache
 from typing import Any
 
 import jsonschema_rs
-from jinja2 import BaseLoader, Environment, TemplateError
+from jinja2 import FunctionLoader, TemplateError
 from jinja2.exceptions import TemplateNotFound, TemplateSyntaxError
 
 from demandops import strict_yaml
@@ -25,7 +25,7 @@ from demandops.charts import chart_files
 from demandops.errors import Fault, InvalidInput, fault, field_path
 from demandops.quoting import quoted
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
-from demandops.templating.template_lines import TemplateLines
+from demandops.templating.template_lines import with_template_lines
 from demandops.templating.template_sandbox import Sandbox
 
 _MAX_LENGTH = 100_000  # characters of a values template
@@ -50,7 +50,7 @@ class ValuesTask:
 
     @property
     def file(self) -> str:
-        """The file that is named if the task takes too long."""
+        # named if the task takes too long
         return self.template
 
 
@@ -66,30 +66,26 @@ class SchemaTask:
     origin: str = ""
 
 
+# Returns the values of a task, given the files that it may need: path → text. Raises InvalidInput
+# with the faults of what people wrote, or OverLimit if that takes too long.
 Evaluate = Callable[[Mapping[str, str], ValuesTask | SchemaTask], dict[str, Any]]
-"""Returns the values of a task, given the files that it may need: path → text.
-
-Raises InvalidInput with the faults of what people wrote, or OverLimit if that takes too long.
-"""
 
 
 def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:
-    """Return the values of a task, computed in this process and without limits."""
     if isinstance(task, SchemaTask):
         validator(files[task.file], task.file)
         if task.values is not None:
             chart = task.file.rpartition("/")[0]
             _check(task.values, chart, files, task.origin, "the values")
         return {}
-    lines = None
+    text = _rendered(files, task)
     try:
-        text = _rendered(files, task)
-        lines = TemplateLines(files[task.template], text)
         values = _mapping(text, task.template)
         if task.chart:
             _check(values, task.chart, files, task.template, "the template")
     except InvalidInput as error:
-        raise InvalidInput(map(lines.located, error.faults) if lines else error.faults) from None
+        template = files[task.template]
+        raise InvalidInput(with_template_lines(error.faults, template, text)) from None
     for override, patch in task.patches:
         values = chart_files.merge_patch(values, patch)
         if task.chart:
@@ -100,27 +96,19 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
 # ---- the template ----
 
 
-class _FilesLoader(BaseLoader):
-    """Loads templates by their path in the state repo."""
-
-    def __init__(self, files: Mapping[str, str]) -> None:
-        self._files = files
-
-    def get_source(self, environment: Environment, template: str) -> tuple[str, str, Any]:
-        if template not in self._files:
-            raise TemplateNotFound(template)
-        text = self._files[template]
-        if len(text) > _MAX_LENGTH:
-            message = f"has {len(text)} characters; at most {_MAX_LENGTH} are allowed"
-            raise TemplateSyntaxError(message, 1)
-        return text, template, lambda: True
-
-
 _COMPILED = CompiledTemplates()
 
 
 def _rendered(files: Mapping[str, str], task: ValuesTask) -> str:
-    sandbox = Sandbox(FILTERS, loader=_FilesLoader(files), bytecode_cache=_COMPILED, **OPTIONS)
+    def load(path: str) -> tuple[str, str, Callable[[], bool]] | None:
+        text = files.get(path)
+        if text is not None and len(text) > _MAX_LENGTH:
+            message = f"has {len(text)} characters; at most {_MAX_LENGTH} are allowed"
+            raise TemplateSyntaxError(message, 1)
+        return None if text is None else (text, path, lambda: True)
+
+    loader = FunctionLoader(load)
+    sandbox = Sandbox(FILTERS, loader=loader, bytecode_cache=_COMPILED, **OPTIONS)
     try:
         text = sandbox.get_template(task.template).render(**task.context)
         if len(text) <= _MAX_RENDERED:
@@ -171,15 +159,12 @@ def _mapping(text: str, template: str) -> dict[str, Any]:
 def _check(
     values: Mapping[str, Any], chart: str, files: Mapping[str, str], origin: str, author: str
 ) -> None:
-    """Raise InvalidInput if values do not match a chart's schema.
-
-    Like Helm, first merge the values into the chart's defaults, because a schema may require a
-    value that has a default. The faults name the file ``origin``, which the values come from.
-    """
+    """Raise InvalidInput, for the file ``origin``, if values do not match a chart's schema."""
     path = f"{chart}/values.schema.json"
     if path not in files:
         return
     schema = validator(files[path], path)
+    # as Helm does, because a schema may require a value that has a default
     merged = chart_files.merged(chart_files.defaults(chart, files), values)
     faults = [
         fault(
@@ -194,18 +179,13 @@ def _check(
 
 @lru_cache(maxsize=256)
 def validator(text: str, file: str) -> Any:  # noqa: ANN401
-    """Return the validator for a schema, given the text and the path of the schema's file.
-
-    Its patterns are matched in linear time, so look-arounds and back references are faults.
-
-    Raises:
-        InvalidInput: if ``text`` is not a valid schema, or refers to another document.
-    """
+    """Return the validator for a schema; one that refers to another document is a fault."""
     try:
         schema = json.loads(text)
         draft = str(schema.get("$schema")) if isinstance(schema, dict) else ""
         faults = list(_foreign(schema, (), "id" if "draft-04" in draft else "$id"))
         if not faults:
+            # patterns in linear time, as Helm's Go has them, without look-arounds
             options = jsonschema_rs.RegexOptions()
             return jsonschema_rs.validator_for(schema, retriever=_refuse, pattern_options=options)
     except RecursionError:
@@ -223,10 +203,7 @@ def _refuse(uri: str) -> None:
 
 
 def _foreign(schema: object, place: tuple[int | str, ...], id: str) -> Iterator[Fault]:
-    """Yield a fault for each reference to another document, and for each ``id`` below the root.
-
-    Such an id would change what a reference with ``#`` means within its part.
-    """
+    """Yield a fault for each reference to another document, and for each ``id`` below the root."""
     if isinstance(schema, dict):
         for key, part in schema.items():
             if not isinstance(part, str):
@@ -237,7 +214,7 @@ def _foreign(schema: object, place: tuple[int | str, ...], id: str) -> Iterator[
                     "followed, so copy the definition here"
                 )
                 yield fault(field_path((*place, key)), message)
-            elif key == id and place:
+            elif key == id and place:  # it would change what a reference with # means in its part
                 message = "only the whole schema may have an id; remove it, and refer by '#/…'"
                 yield fault(field_path((*place, key)), message)
     elif isinstance(schema, list):

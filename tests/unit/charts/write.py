@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import yaml
 from demandops.charts import chart_schema, values_table
@@ -26,10 +27,27 @@ def schema(chart: Path) -> str:
     """Return the schema that a chart must have: its own properties and those of the library."""
     known = json.loads((chart / "values.schema.json").read_text())
     library = json.loads((LIBRARY / "values.schema.json").read_text())
-    own = chart_schema.own_properties(known, library)
+    library_properties = library["definitions"][chart_schema.EXPORT]["properties"]
+    of_library, of_chart = (
+        {name: without_descriptions(inner) for name, inner in properties.items()}
+        for properties in (library_properties, known["properties"])
+    )
+    own = {
+        name: inner
+        for name, inner in of_chart.items()
+        if name not in (chart_schema.LIBRARY, "global") and inner != of_library.get(name)
+    }
     values, shared = ((each / "values.yaml").read_text() for each in (chart, LIBRARY))
     data = chart_schema.composed(known["title"], own, values, library, shared)
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
+
+
+def without_descriptions(schema: dict[str, Any]) -> dict[str, Any]:
+    plain = {name: value for name, value in schema.items() if name != "description"}
+    if "properties" in schema:
+        properties = schema["properties"].items()
+        plain["properties"] = {name: without_descriptions(inner) for name, inner in properties}
+    return plain
 
 
 def readme(chart: Path) -> str:

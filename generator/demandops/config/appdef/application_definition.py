@@ -6,23 +6,16 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from demandops.config.appdef.service_definition import (
-    Input,
-    OwnService,
-    Parameter,
-    size_problems,
-)
+from demandops.config.appdef.service_definition import Input, OwnService, Parameter, size_problems
 from demandops.config.base_model import Approval, CamelModel, DnsLabel, FileModel, Text, Word
 from demandops.errors import sentences, suggestion
 
+# What happens if demands that share an application or a service ask for different versions.
+# `refuse`: the later demand is refused. `separate`: a version other than the default runs in an
+# instance of its own (`demandops.demand.separate_instance`). `update`: the newest version runs, but
+# a person must approve a change of the major version. `upgrade`: the newest version runs, even if
+# the major version changes.
 VersionPolicy = Literal["refuse", "separate", "update", "upgrade"]
-"""What happens if demands that share an application or a service ask for different versions.
-
-``refuse``: the later demand is refused. ``separate``: a version other than the default runs in an
-instance of its own (:mod:`demandops.demand.separate_instance`). ``update``: the newest version
-runs, but a person must approve a change of the major version. ``upgrade``: the newest version runs,
-even if the major version changes.
-"""
 
 
 class WireNames(CamelModel):

@@ -9,13 +9,7 @@ from typing import TypeAlias
 from pydantic import Field
 
 from demandops.config.appdef.application_definition import ApplicationDefinition
-from demandops.config.appdef.service_definition import (
-    Deployed,
-    OwnService,
-    Parameter,
-    Scope,
-    ServiceDefinition,
-)
+from demandops.config.appdef.service_definition import Deployed, Parameter, Scope, ServiceDefinition
 from demandops.errors import suggestion
 
 
@@ -23,23 +17,23 @@ class Service(Deployed):
     """A service of one appdef, with the origins of its inputs."""
 
     name: str
+    # The folder in `appdefs/` that has the service's definition
     folder: str
-    """The folder in ``appdefs/`` that has the service's definition."""
     shared: bool
     scope: Scope
+    # The origin of each input: a role of the appdef, or `<service>.<output>`
     inputs: dict[str, str]
-    """The origin of each input: a role of the appdef, or ``<service>.<output>``."""
     parameters: dict[str, Parameter]
+    # For a service that runs once for each topic of a role: that role
     root: str | None = None
-    """For a service that runs once for each topic of a role: that role."""
+    # If each instance has only one source: the roles of the source's topics that the instance
+    # reads, directly or through other services. Empty for any other service.
     roots: tuple[str, ...] = ()
-    """If each instance has only one source: the roles of the source's topics that the instance
-    reads, directly or through other services. Empty for any other service."""
+    # For a service that runs once for each cluster: the service's node in each cluster
     nodes: dict[str, str] = Field(default_factory=dict)
-    """For a service that runs once for each cluster: the service's node in each cluster."""
+    # For a service that runs once for each cluster: a map from the node of an application to the
+    # node of the service in the same cluster
     runs_at: dict[str, str] = Field(default_factory=dict)
-    """For a service that runs once for each cluster: a map from the node of an application to the
-    node of the service in the same cluster."""
 
     @property
     def at_source(self) -> bool:
@@ -48,29 +42,25 @@ class Service(Deployed):
 
     @property
     def is_movable(self) -> bool:
-        """Whether an override may move the service to another node."""
         return not self.at_source and not self.nodes
 
     @property
     def is_placeable(self) -> bool:
-        """Whether the generator may choose the service's node separately from the application's.
-
-        The result is true if each instance serves applications of only one appdef, and the service
-        does not run at its sources.
-        """
+        """Whether the generator may choose the service's node separately from the application's."""
+        # What several appdefs share is not placed: a demand could be refused because of a node that
+        # somebody else's demand had chosen.
         return self.scope == "application" or not (self.shared or self.at_source)
 
     @property
     def file(self) -> str:
-        """The file that defines the service."""
         return f"appdefs/{self.folder}/{'service' if self.shared else 'appdef'}.yaml"
 
 
+# All services of an appdef, by name: those that it defines, and the shared ones that it uses
 Services: TypeAlias = "Mapping[str, Service]"
-"""All services of an appdef, by name: those that it defines, and the shared ones that it uses."""
 
+# The path of a field of an appdef, and a message about the field
 Problem: TypeAlias = "tuple[str, str]"
-"""The path of a field of an appdef, and a message about the field."""
 
 
 def resolved_services(
@@ -82,7 +72,8 @@ def resolved_services(
     """
     services = {
         name: Service.model_construct(
-            **{**dict(own), "inputs": _with_each(own)},
+            # a role in `each` is an input, even if `inputs` lacks it
+            **{**dict(own), "inputs": ({own.each: own.each} if own.each else {}) | own.inputs},
             name=name,
             folder=appdef.name,
             shared=False,
@@ -95,14 +86,14 @@ def resolved_services(
         if name in definitions:
             used = {**dict(definitions[name]), "inputs": bound}
             services[name] = Service.model_construct(**used, folder=name, shared=True)
-    problems = [*_unbound(appdef, definitions), *_unknown(appdef, services)]
+    problems = [*_input_problems(appdef, definitions, services)]
     if problems:
         return {}, problems
     graph = {
-        name: [origin.partition(".")[0] for origin in one.inputs.values() if "." in origin]
-        for name, one in services.items()
+        name: [origin.partition(".")[0] for origin in service.inputs.values() if "." in origin]
+        for name, service in services.items()
     }
-    try:
+    try:  # the roots of a service follow from those of the services that it reads
         order = list(TopologicalSorter(graph).static_order())
     except CycleError as error:
         circle = " reads ".join(f"'{name}'" for name in reversed(error.args[1]))
@@ -113,17 +104,15 @@ def resolved_services(
     return ({}, problems) if problems else (services, [])
 
 
-def _with_each(service: OwnService) -> dict[str, str]:
-    return ({service.each: service.each} if service.each else {}) | service.inputs
-
-
-def _unbound(
-    appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
+def _input_problems(
+    appdef: ApplicationDefinition,
+    definitions: Mapping[str, ServiceDefinition],
+    services: Services,
 ) -> Iterator[Problem]:
     for name, bound in appdef.uses.items():
         if name not in definitions:
-            known = suggestion(name, definitions)
-            yield f"uses.{name}", f"appdefs/{name}/service.yaml does not exist; add it{known}"
+            hint = suggestion(name, definitions)
+            yield f"uses.{name}", f"appdefs/{name}/service.yaml does not exist; add it{hint}"
             continue
         inputs = definitions[name].inputs
         for role in inputs.keys() - bound.keys():
@@ -133,21 +122,18 @@ def _unbound(
                 "<service>.<output>",
             )
         for role in bound.keys() - inputs.keys():
-            known = suggestion(role, inputs)
-            yield f"uses.{name}.{role}", f"'{name}' has no input '{role}'; leave it out{known}"
-
-
-def _unknown(appdef: ApplicationDefinition, services: Services) -> Iterator[Problem]:
+            hint = suggestion(role, inputs)
+            yield f"uses.{name}.{role}", f"'{name}' has no input '{role}'; leave it out{hint}"
     for service in services.values():
         for role, origin in service.inputs.items():
             name, _, output = origin.partition(".")
-            known = services[name].outputs if name in services else services
+            outputs = services[name].outputs if name in services else {}
             if not output and origin not in appdef.inputs:
                 problem = f"'{origin}' is not an input{suggestion(origin, appdef.inputs)}"
             elif output and name not in services:
                 problem = f"'{name}' is not a service{suggestion(name, services)}"
-            elif output and output not in known:
-                problem = f"'{name}' has no output '{output}'{suggestion(output, known)}"
+            elif output and output not in outputs:
+                problem = f"'{name}' has no output '{output}'{suggestion(output, outputs)}"
             else:
                 continue
             yield _place(service, role), problem
@@ -161,10 +147,7 @@ def _place(service: Service, role: str) -> str:
 
 
 def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
-    """Set ``root`` and ``roots`` of a service, and yield the problems.
-
-    The services whose outputs this service reads must have their roots already.
-    """
+    """Set ``root`` and ``roots`` of a service, after those of the services that it reads."""
     service, root = services[name], None
     made_from: dict[str, tuple[str, ...]] = {}
     for role, origin in service.inputs.items():
@@ -205,7 +188,7 @@ def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
                     "or the node",
                 )
     elif service.at_source:
-        roots = tuple(sorted({one for of in made_from.values() for one in of}))
+        roots = tuple(sorted({role for roles in made_from.values() for role in roles}))
         if not roots:
             yield (
                 f"uses.{name}",

@@ -15,22 +15,16 @@ from demandops.config.policy import Duration
 from demandops.errors import sentences
 
 Count = Annotated[int, Field(ge=0, le=1000)]
-"""A number of replicas."""
 
+# A percentage of what a pod requests of a resource. It may be above 100, because a pod may use more
+# than it requests.
 Percent = Annotated[int, Field(ge=1, le=1000)]
-"""A percentage of what a pod requests of a resource.
 
-It may be above 100, because a pod may use more than it requests.
-"""
-
+# What the generator counts to get the number of replicas. Each replica serves up to a fixed number
+# of the counted things.
 Measure = Literal["topics", "sources", "claims", "requesters"]
-"""What the generator counts to get the number of replicas.
-
-Each replica serves up to a fixed number of the counted things.
-"""
 
 Resource = Literal["cpu", "memory"]
-"""The resource whose usage an autoscaler measures."""
 
 
 class Sizes(CamelModel):
@@ -40,14 +34,14 @@ class Sizes(CamelModel):
     replicas: Annotated[dict[Word, Count], Field(min_length=1)]
 
     def replicas_for(self, value: object) -> int | None:
-        """Return the number of replicas for a parameter's value.
+        """Return the number of replicas for a size, or for the largest of a list of sizes.
 
-        For a list of sizes, return the number for the largest size. Return ``None`` if the value,
-        or an item of the list, is not a size, or if the list is empty.
+        Return ``None`` if anything else is among the sizes, or if the list is empty.
         """
         names = value if isinstance(value, list) else [value]
-        known = [self.replicas[name] for name in names if name in [*self.replicas]]
-        return max(known) if known and len(known) == len(names) else None
+        # compared with a list, because a value may have no hash, such as a mapping
+        counts = [self.replicas[name] for name in names if name in [*self.replicas]]
+        return max(counts) if counts and len(counts) == len(names) else None
 
 
 class Scaling(CamelModel):

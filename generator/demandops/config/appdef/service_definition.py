@@ -14,19 +14,17 @@ from demandops.config.inventory import LabelKey, LabelValue, NodeId, Resources
 from demandops.config.node_property import PropertyName, RequiredValue
 from demandops.errors import sentences, suggestion
 
+# The name of an output's topic. `{instance}` stands for the source, the application or the node
+# that the service runs for.
 TopicPattern = Annotated[
     str,
     StringConstraints(
         pattern=r"^(/([A-Za-z_][A-Za-z0-9_]*|([A-Za-z_][A-Za-z0-9_]*)?\{instance\}[A-Za-z0-9_]*))+$"
     ),
 ]
-"""The name of an output's topic.
 
-``{instance}`` stands for the source, the application or the node that the service runs for.
-"""
-
+# The scope of a service: what each of its instances is for
 Scope = Literal["application", "topic", "node", "cluster"]
-"""The scope of a service: what each of its instances is for."""
 
 
 class Place(CamelModel):
@@ -143,8 +141,8 @@ class ServiceDefinition(Deployed, FileModel):
         if (self.each is None) is (self.scope == "topic"):
             raise ValueError("scope 'topic' needs 'each', and no other scope may have 'each'")
         if self.each and self.each not in self.inputs:
-            known = suggestion(self.each, self.inputs)
-            raise ValueError(f"each: '{self.each}' is not an input{known}")
+            hint = suggestion(self.each, self.inputs)
+            raise ValueError(f"each: '{self.each}' is not an input{hint}")
         if self.placement == "source" and self.scope == "application":
             raise ValueError("placement 'source' needs the scope 'topic' or 'node'")
         if self.place and self.scope != "application":
@@ -174,5 +172,5 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         )
     if sizes.replicas_for(parameter.default) is None:
         default = strict_yaml.short_repr(parameter.default)
-        known = suggestion(str(parameter.default), sizes.replicas)
-        yield f"{place}: '{name}' has the default {default}, which is not a size{known}"
+        hint = suggestion(str(parameter.default), sizes.replicas)
+        yield f"{place}: '{name}' has the default {default}, which is not a size{hint}"

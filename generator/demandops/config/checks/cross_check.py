@@ -25,7 +25,7 @@ from demandops.config.config import (
 )
 from demandops.config.config_reader import ConfigReader
 from demandops.config.node_property import comparable_kind, kind_of
-from demandops.config.override import Override, patched_settings
+from demandops.config.override import patched_settings
 from demandops.config.policy import matches
 from demandops.config.registry import ChartSource
 from demandops.connections import connection_types
@@ -33,7 +33,6 @@ from demandops.errors import InvalidInput, suggestion
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
-    """Run all checks, and add their faults to ``reader``."""
     for check in (
         _check_inventory,
         _check_domains,
@@ -43,11 +42,12 @@ def cross_check(config: Config, reader: ConfigReader) -> None:
         _check_uses,
         _check_versions,
         _check_wire_types,
-        _check_connection_types,
-        _check_overrides,
-        check_override_conflicts,
     ):
         check(config, reader)
+    for connection_type in connection_types.by_number():
+        reader.faults += connection_type.config_faults(config, reader)
+    _check_overrides(config, reader)
+    check_override_conflicts(config, reader)
 
 
 def _check_inventory(config: Config, reader: ConfigReader) -> None:
@@ -64,7 +64,7 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
             reader.check_reference(file, f"{place}.bridged.{peer}", peer, NODES_FILE)
         for name, value in node.properties.items():
             kind, first = config.property_kinds[name]
-            if kind_of(value) != kind and node.id not in config.hosts:
+            if kind_of(value) != kind and node.id not in config.hosts:  # once for each host
                 where = f"at '{first}' in {config.file_of(NODES_FILE, first)}"
                 message = f"is {kind_of(value)}, but the property is {kind} {where}"
                 message += "; give it the same type on all nodes"
@@ -114,8 +114,8 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
                 "'podSecurity: host-network'"
             )
             reader.add_fault(file, f"{place}.hostNetwork", message)
+    closed = [d.name for d in config.domains.values() if d.pod_security == "baseline"]
     for word, file in config.entry_files[CLIENTS_FILE].items():
-        closed = [one.name for one in config.domains.values() if one.pod_security == "baseline"]
         if closed and config.clients.of(word).host_network:
             message = (
                 f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
@@ -131,8 +131,8 @@ def _check_charts(config: Config, reader: ConfigReader) -> None:
         for channel, source in chart.channels.items():
             _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
     tops = (source.folder for chart in config.charts.values() for source in chart.sources())
-    needed = (one for top in tops if top for one in chart_files.folders(top, config.files))
-    for folder in dict.fromkeys(needed):
+    folders = (each for top in tops if top for each in chart_files.folders(top, config.files))
+    for folder in dict.fromkeys(folders):  # each library once, in the order in which it is needed
         reader.faults += chart_files.faults(folder, config.files)
 
 
@@ -156,19 +156,16 @@ def _check_chart(
         return
     version = metadata.get("version") if isinstance(metadata, dict) else None
     if version != chart.version:
-        reader.add_fault(
-            file,
-            f"{where}.version",
-            f"is {chart.version}, but {path} has no version; add it there"
-            if version is None
-            else f"is {chart.version}, but {path} says {version}; make them equal",
-        )
+        message = f"is {chart.version}, but {path} says {version}; make them equal"
+        if version is None:
+            message = f"is {chart.version}, but {path} has no version; add it there"
+        reader.add_fault(file, f"{where}.version", message)
 
 
 def _check_services(config: Config, reader: ConfigReader) -> None:
     prefixes: dict[str, tuple[str, str]] = {}
     files: dict[str, str] = {}
-    words = {known.word for known in connection_types.CONNECTION_TYPES}
+    words = {connection_type.word for connection_type in connection_types.CONNECTION_TYPES}
     for file, where, name, service in _defined_services(config):
         folder, _, own = file.rpartition("/")
         reader.check_reference(file, f"{where}chart", service.chart, CHARTS_FILE)
@@ -200,20 +197,17 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
                     f"in appdefs/{name}/service.yaml and use it in both",
                 )
                 continue
-        known = prefixes.setdefault(service.prefix, (file, name))
-        if known != (file, name):
+        # releases of two services with one prefix could have the same name
+        owner = prefixes.setdefault(service.prefix, (file, name))
+        if owner != (file, name):
             message = (
-                f"'{service.prefix}' is already the prefix of '{known[1]}'; choose another prefix"
+                f"'{service.prefix}' is already the prefix of '{owner[1]}'; choose another prefix"
             )
             reader.add_fault(file, f"{where}prefix", message)
 
 
 def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
-    """Yield (file, prefix, name, definition) for each service.
-
-    The path of each field of the service in the file starts with the prefix. The prefix is
-    ``services.<name>.`` in an ``appdef.yaml``, and empty in a ``service.yaml``.
-    """
+    """Yield (file, beginning of its fields' paths, name, definition) for each service."""
     for appdef in config.appdefs.values():
         for name, service in appdef.services.items():
             yield f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, service
@@ -222,24 +216,21 @@ def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:
-    """Check the nodes of shared services, and the input that a shared service names in ``each``.
-
-    The input must have the same origin in all appdefs that use the service.
-    """
     origins: dict[str, tuple[str, str]] = {}
     for name, definition in config.definitions.items():
         file = f"appdefs/{name}/service.yaml"
         for cluster, node in definition.nodes.items():
             reader.check_reference(file, f"nodes.{cluster}", cluster, CLUSTERS_FILE)
             reader.check_reference(file, f"nodes.{cluster}", node, NODES_FILE)
-            known = config.nodes.get(node)
-            if known is not None and known.cluster != cluster:
-                message = f"'{node}' is in cluster '{known.cluster}'; name a node of '{cluster}'"
+            actual = config.nodes[node].cluster if node in config.nodes else cluster
+            if actual != cluster:
+                message = f"'{node}' is in cluster '{actual}'; name a node of '{cluster}'"
                 reader.add_fault(file, f"nodes.{cluster}", message)
     for appdef, services in config.services.items():
         for name, service in services.items():
             if not service.shared or service.each is None:
                 continue
+            # one instance for each topic serves all appdefs, so they must mean the same topics
             origin = service.inputs[service.each]
             first, other = origins.setdefault(name, (appdef, origin))
             if origin != other:
@@ -253,7 +244,9 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
 
 def _check_versions(config: Config, reader: ConfigReader) -> None:
     for name, appdef in config.appdefs.items():
-        if appdef.versions != "refuse" and _is_unlisted(reader, name):
+        # an invalid entry may be the missing one
+        is_unlisted = not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, name)
+        if appdef.versions != "refuse" and is_unlisted:
             reader.add_fault(
                 f"appdefs/{name}/appdef.yaml",
                 "versions",
@@ -267,9 +260,8 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
         if name not in config.appdefs:
             # an appdef.yaml that exists but is invalid has faults of its own
             if f"appdefs/{name}/appdef.yaml" not in reader.files:
-                known = suggestion(name, config.appdefs)
-                message = f"'{name}' is not an application definition{known}"
-                reader.add_fault(file, place, message)
+                hint = suggestion(name, config.appdefs)
+                reader.add_fault(file, place, f"'{name}' is not an application definition{hint}")
             continue
         services = config.services.get(name, {}).values()
         if not services:  # the definition has faults of its own
@@ -280,21 +272,18 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
             where = f"{place}.versions.{version}"
             for chart, wanted in contents.charts.items():
                 _check_used(file, f"{where}.charts.{chart}", chart, charts, name, reader)
-                found = config.charts.get(chart) if chart in charts else None
-                if found is not None and found.at(wanted) is None:
-                    known = suggestion(wanted, [source.version for source in found.sources()])
+                listed_chart = config.charts.get(chart) if chart in charts else None
+                if listed_chart is not None and listed_chart.at(wanted) is None:
+                    sources = listed_chart.sources()
+                    hint = suggestion(wanted, [source.version for source in sources])
                     registry = config.file_of(CHARTS_FILE, chart)
-                    message = f"'{wanted}' is not a version of {chart} in {registry}{known}"
+                    message = f"'{wanted}' is not a version of {chart} in {registry}{hint}"
                     reader.add_fault(file, f"{where}.charts.{chart}", message)
             for image in contents.images:
                 _check_used(file, f"{where}.images.{image}", image, images, name, reader)
 
 
 def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
-    """Refuse ``versions: separate`` if a shared service's ``each`` input is from an unshared one.
-
-    The unshared service runs once for each version, but the shared service only once for all.
-    """
     services = config.services.get(appdef, {})
     for name, service in services.items():
         origin = service.inputs[service.each] if service.shared and service.each else ""
@@ -309,22 +298,12 @@ def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
             )
 
 
-def _is_unlisted(reader: ConfigReader, appdef: str) -> bool:
-    """Return whether no file lists versions of an appdef; False if an entry is invalid."""
-    return not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, appdef)
-
-
 def _check_used(
     file: str, where: str, name: str, used: set[str], appdef: str, reader: ConfigReader
 ) -> None:
     if name not in used:
         message = f"no service of {appdef} uses '{name}'{suggestion(name, used)}"
         reader.add_fault(file, where, message)
-
-
-def _check_connection_types(config: Config, reader: ConfigReader) -> None:
-    for known in connection_types.by_number():
-        reader.faults += known.config_faults(config, reader)
 
 
 def _check_wire_types(config: Config, reader: ConfigReader) -> None:
@@ -348,14 +327,39 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
             reader.check_reference(override.path, f"images.{image}", image, IMAGES_FILE)
         if override.node is not None:
             reader.check_reference(override.path, "node", override.node, NODES_FILE)
-            _check_moved_to(override.node, override, config, reader)
+        selected = [
+            service
+            for appdef, services in config.services.items()
+            for name, service in services.items()
+            for selector in override.select
+            if selector.takes(name, appdef)
+        ]
+        if override.node is not None:
+            if selected and not any(service.is_movable for service in selected):
+                message = (
+                    f"moves nothing, because {selected[0].name} runs at its sources or at the "
+                    "nodes that its definition lists; change its definition, or remove 'node'"
+                )
+                reader.add_fault(override.path, "node", message)
+            if (
+                override.node in config.nodes
+                and override.node not in config.domain_of
+                and config.domains
+                and reader.is_complete(DOMAINS_FILE)
+                # a node that several domains match is in none, and has a fault of its own
+                and not any(matches(override.node, d.nodes) for d in config.domains.values())
+            ):
+                message = f"'{override.node}' is not in any access domain; add it to one in "
+                message += config.place_of(DOMAINS_FILE)
+                reader.add_fault(override.path, "node", message)
         if override.values and override.patches_clients():
             try:
                 # MQTT clients have every field that other clients have
                 patched_settings(config.clients.mqtt, override.values, override.path)
             except InvalidInput as error:
                 reader.faults += error.faults
-        versions = _versions_for(override, config)
+        charts = {service.chart for service in selected} & {*config.charts}
+        versions = {version for chart in charts for version in config.charts[chart].versions()}
         if override.version and versions and override.version not in versions:
             reader.add_fault(
                 override.path,
@@ -364,43 +368,3 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
                 f"{config.place_of(CHARTS_FILE)} has for a selected chart"
                 f"{suggestion(override.version, versions)}",
             )
-
-
-def _check_moved_to(node: str, override: Override, config: Config, reader: ConfigReader) -> None:
-    selected = [
-        service
-        for appdef, services in config.services.items()
-        for name, service in services.items()
-        for selector in override.select
-        if selector.takes(name, appdef)
-    ]
-    if selected and not any(service.is_movable for service in selected):
-        message = (
-            f"moves nothing, because {selected[0].name} runs at its sources or at the nodes that "
-            "its definition lists; change its definition, or remove 'node'"
-        )
-        reader.add_fault(override.path, "node", message)
-    if (
-        node in config.nodes
-        and node not in config.domain_of
-        and config.domains
-        and reader.is_complete(DOMAINS_FILE)
-        and not any(matches(node, domain.nodes) for domain in config.domains.values())
-    ):
-        message = f"'{node}' is not in any access domain; add it to one in "
-        message += config.place_of(DOMAINS_FILE)
-        reader.add_fault(override.path, "node", message)
-
-
-def _versions_for(override: Override, config: Config) -> set[str]:
-    """Return the versions and channels that an override may name for the selected services."""
-    charts = {
-        service.chart
-        for appdef, services in config.services.items()
-        for name, service in services.items()
-        for selector in override.select
-        if selector.takes(name, appdef)
-    }
-    return {
-        known for chart in charts & {*config.charts} for known in config.charts[chart].versions()
-    }

@@ -2,11 +2,6 @@
 
 Such a pair needs an order, and only different priorities give one. It is refused even if no release
 matches both overrides yet, because a later demand could add a release that does.
-
-Two selectors cannot match the same release if they exclude each other in a field for which a
-release has only one value, like service or node. A shared service has many applications and
-requesters, and a Zenoh bridge has many connections, so two selectors that exclude each other in
-these fields may still match the same release.
 """
 
 from __future__ import annotations
@@ -15,9 +10,8 @@ import json
 import re
 from bisect import bisect_left, insort
 from collections import Counter, defaultdict
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 
-from demandops.config.appdef import Services
 from demandops.config.config import Config
 from demandops.config.config_reader import ConfigReader
 from demandops.config.override import Override, Selector, by_rank
@@ -29,16 +23,12 @@ _SINGLE = ("version", "replicas", "node")
 _FROZEN = (*_SINGLE, *_MERGED)
 
 
+# A merge may bring thousands of overrides, each of which contradicts all others
 _MOST_SHOWN = 3
 _INDEXED = ("nodes", "services", "applications", "connections", "appdefs")
 
 
 def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
-    """Add faults for the overrides that need an order but have the same priority.
-
-    An override is told only the first three others that it contradicts: a merge may bring
-    thousands of overrides, each of which contradicts all others.
-    """
     contests = defaultdict[tuple[int, tuple[str, ...]], list[tuple[Override, str]]](list)
     for override in by_rank(config.overrides.values()):
         for what, token in _settings(override):
@@ -46,25 +36,21 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
     rivals = defaultdict[str, dict[str, Override]](dict)
     for contenders in contests.values():
         if len({token for _, token in contenders}) > 1:
-            for one, other in _rivals(contenders, config):
-                rivals[other.name][one.name] = one
-    for other in by_rank(config.overrides[name] for name in rivals):
-        for one in by_rank(rivals[other.name].values())[:_MOST_SHOWN]:
-            names = " and ".join(f"'{name}'" for name in contested_effects(one, other))
+            for rival, override in _rivals(contenders, config):
+                rivals[override.name][rival.name] = rival
+    for override in by_rank(config.overrides[name] for name in rivals):
+        for rival in by_rank(rivals[override.name].values())[:_MOST_SHOWN]:
+            names = " and ".join(f"'{name}'" for name in contested_effects(rival, override))
             reader.add_fault(
-                other.path,
+                override.path,
                 "priority",
-                f"is {other.priority}, as in {one.path}, and both overrides may set {names} of the "
-                "same release; change one of the priorities, or select different releases",
+                f"is {override.priority}, as in {rival.path}, and both overrides may set {names} "
+                "of the same release; change one of the priorities, or select different releases",
             )
 
 
 def _settings(override: Override) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield (what, token) for all that an override sets.
-
-    The order of two overrides matters if they have different tokens for the same thing; this is
-    what :func:`contested_effects` finds for one pair.
-    """
+    """Yield (what, token) for all that an override sets; another token contradicts it."""
     for name in _SINGLE:
         if (value := getattr(override, name)) is not None:
             yield (name,), str(value)
@@ -87,13 +73,13 @@ def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, .
 def _rivals(
     contenders: list[tuple[Override, str]], config: Config
 ) -> Iterator[tuple[Override, Override]]:
-    """Yield (one, other) for overrides with different tokens that may select the same release.
+    """Yield (earlier, later) for overrides with different tokens that may select one release.
 
-    Each ``other`` is yielded with at most three that come before it. Only selectors are compared
-    whose patterns begin alike in one field, the one in which the selectors differ most. So the cost
-    grows with the number of overrides, not with that of pairs, unless patterns hardly differ.
+    Each later one is yielded with at most three others.
     """
-
+    # Only selectors are compared whose patterns begin alike in one field, the one in which the
+    # selectors differ most. So the cost grows with the number of overrides, not with that of pairs,
+    # unless patterns hardly differ.
     shares = shares_any_clients(config)
 
     def crowding(field: str) -> int:
@@ -111,102 +97,102 @@ def _rivals(
         return {re.split("[*?]", pattern)[0] for pattern in patterns or ("",)}
 
     field = min(_INDEXED, key=crowding)
-    known: dict[str, dict[str, list[tuple[Override, Selector]]]] = {}
-    ordered: list[str] = []
-    for other, token in contenders:
-        met = dict[str, Override]()
-        for right in other.select:
+    earlier: dict[str, dict[str, list[tuple[Override, Selector]]]] = {}
+    starts: list[str] = []  # the keys of `earlier`, sorted
+
+    def alike(start: str) -> Iterator[str]:
+        """Yield the starts that begin with ``start`` or with which ``start`` begins."""
+        yield from (start[:end] for end in range(len(start)) if start[:end] in earlier)
+        for place in range(bisect_left(starts, start), len(starts)):
+            if not starts[place].startswith(start):
+                return
+            yield starts[place]
+
+    for override, token in contenders:
+        rivals = dict[str, Override]()
+        for right in override.select:
             for start in starts_of(right, field):
-                if len(met) < _MOST_SHOWN:
+                if len(rivals) < _MOST_SHOWN:
                     near = (
                         pair
-                        for begin in _alike(start, known, ordered)
-                        for held, pairs in known[begin].items()
-                        if held != token
+                        for begin in alike(start)
+                        for other_token, pairs in earlier[begin].items()
+                        if other_token != token
                         for pair in pairs
                     )
-                    for one, left in near:
-                        if one.name not in met and may_match_same_release(
+                    for rival, left in near:
+                        if rival.name not in rivals and may_match_same_release(
                             left, right, config, shares
                         ):
-                            met[one.name] = one
-                            if len(met) == _MOST_SHOWN:
+                            rivals[rival.name] = rival
+                            if len(rivals) == _MOST_SHOWN:
                                 break
-        for right in other.select:
+        for right in override.select:
             for start in starts_of(right, field):
-                if start not in known:
-                    insort(ordered, start)
-                known.setdefault(start, {}).setdefault(token, []).append((other, right))
-        yield from ((one, other) for one in met.values())
+                if start not in earlier:
+                    insort(starts, start)
+                earlier.setdefault(start, {}).setdefault(token, []).append((override, right))
+        yield from ((rival, override) for rival in rivals.values())
 
 
-def _alike(start: str, known: Container[str], ordered: list[str]) -> Iterator[str]:
-    """Yield the known texts that begin with ``start`` or with which ``start`` begins."""
-    yield from (start[:end] for end in range(len(start)) if start[:end] in known)
-    for place in range(bisect_left(ordered, start), len(ordered)):
-        if not ordered[place].startswith(start):
-            return
-        yield ordered[place]
-
-
-def contested_effects(one: Override, other: Override) -> list[str]:
+def contested_effects(first: Override, second: Override) -> list[str]:
     """Return the effects for which the order of two overrides matters."""
     contested = [
         name
         for name in _SINGLE
-        if None not in (left := getattr(one, name), right := getattr(other, name)) and left != right
+        if None not in (left := getattr(first, name), right := getattr(second, name))
+        and left != right
     ]
-    if one.values and other.values and not patches_commute(one.values, other.values):
+    if first.values and second.values and not patches_commute(first.values, second.values):
         contested.append("values")
-    pins = (one.images or {}, other.images or {})
+    pins = (first.images or {}, second.images or {})
     contested += [
         f"images.{name}"
         for name in sorted({*pins[0]} & {*pins[1]})
         if pins[0][name] != pins[1][name]
     ]
-    for holding, shaping in ((one, other), (other, one)):
+    for holding, shaping in ((first, second), (second, first)):
         effects = [name for name in shaping.effects() if name in _FROZEN]
         if holding.hold and effects:
             contested += ["hold", *effects]
     return contested
 
 
-def patches_commute(one: object, other: object) -> bool:
+def patches_commute(first: object, second: object) -> bool:
     """Return whether two merge patches have the same result in either order."""
-    if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return all(patches_commute(one[key], other[key]) for key in one if key in other)
-    return json.dumps(one, sort_keys=True) == json.dumps(
-        other, sort_keys=True
-    )  # unlike ==, it distinguishes 1 from True
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return all(patches_commute(first[key], second[key]) for key in first if key in second)
+    # unlike ==, JSON distinguishes 1 from True
+    return json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)
 
 
 def may_match_same_release(
-    one: Selector, other: Selector, config: Config, shares_clients: bool
+    first: Selector, second: Selector, config: Config, shares_clients: bool
 ) -> bool:
     """Return whether some release, now or later, may match both selectors."""
-    if (one.connections and _selects_services(other)) or (
-        other.connections and _selects_services(one)
+    if (first.connections and _selects_services(second)) or (
+        second.connections and _selects_services(first)
     ):
         return False
-    for name in _separating_fields(one, other, config, shares_clients):
-        left, right = getattr(one, name), getattr(other, name)
+    for name in _separating_fields(first, second, config, shares_clients):
+        left, right = getattr(first, name), getattr(second, name)
         if left and right and not _any_overlap(left, right):
             return False
-    left, right = one.labels or {}, other.labels or {}
+    left, right = first.labels or {}, second.labels or {}
     return all(left[key] == right[key] for key in left if key in right)
 
 
 def _any_overlap(left: Iterable[str], right: Iterable[str]) -> bool:
     """Return whether some text matches a pattern of both sides."""
-    plain = [{one for one in side if not {*one} & {*"*?"}} for side in (left, right)]
+    plain = [{text for text in side if not {*text} & {*"*?"}} for side in (left, right)]
     if plain[0] & plain[1]:
         return True
-    pairs = (
-        (one, other)
-        for one in left
-        for other in ({*right} - plain[1] if one in plain[0] else right)
+    # two texts without wildcards overlap only if they are equal, and lists of names may be long
+    return any(
+        patterns_overlap(first, second)
+        for first in left
+        for second in ({*right} - plain[1] if first in plain[0] else right)
     )
-    return any(patterns_overlap(*pair) for pair in pairs)
 
 
 def _selects_services(selector: Selector) -> bool:
@@ -214,42 +200,34 @@ def _selects_services(selector: Selector) -> bool:
 
 
 def shares_any_clients(config: Config) -> bool:
-    return any(known.shares_clients(config) for known in connection_types.CONNECTION_TYPES)
+    return any(kind.shares_clients(config) for kind in connection_types.CONNECTION_TYPES)
 
 
 def _separating_fields(
-    one: Selector, other: Selector, config: Config, shares_clients: bool
+    first: Selector, second: Selector, config: Config, shares_clients: bool
 ) -> Iterator[str]:
-    """Yield the fields that can separate two selectors.
-
-    If both selectors have one of these fields and do not overlap in it, no release matches both.
-    """
+    """Yield the fields in which selectors must overlap to match the same release."""
+    # A release has only one service and one node. But a shared service has many applications and
+    # requesters, and a Zenoh bridge has many connections.
     yield from ("services", "nodes")
-    if not any(_shared(one, other, services) for services in config.services.values()):
+    may_match_shared_service = any(
+        service.scope != "application"
+        and all(not s.services or matches(name, s.services) for s in (first, second))
+        for services in config.services.values()
+        for name, service in services.items()
+    )
+    if not may_match_shared_service:
         yield from ("applications", "appdefs")
-    if one.connections and other.connections and not shares_clients:
+    if first.connections and second.connections and not shares_clients:
         yield "connections"
 
 
-def _shared(one: Selector, other: Selector, services: Services) -> bool:
-    """Return whether both selectors may match one service that several applications share."""
-    return any(
-        service.scope != "application"
-        and all(not s.services or matches(name, s.services) for s in (one, other))
-        for name, service in services.items()
-    )
-
-
-def patterns_overlap(one: str, other: str) -> bool:
-    """Return whether some text matches both patterns.
-
-    ``*`` stands for any number of characters, and ``?`` for one character.
-    """
-    # row[i]: whether the part of ``one`` read so far overlaps with the first i characters of other
-    row = [not other[:length].strip("*") for length in range(len(other) + 1)]
-    for a in one:
+def patterns_overlap(first: str, second: str) -> bool:
+    # row[i]: whether the part of `first` read so far overlaps with i characters of `second`
+    row = [not second[:length].strip("*") for length in range(len(second) + 1)]
+    for a in first:
         after = [row[0] and a == "*"]
-        for b, above, before in zip(other, row[1:], row, strict=False):
+        for b, above, before in zip(second, row[1:], row, strict=False):
             if "*" in (a, b):
                 after.append(above or after[-1])
             else:
