@@ -31,8 +31,8 @@ _Ends: TypeAlias = "tuple[str, ...]"
 
 
 def _needing_field(field: str, path: str) -> str:
-    # The goal does not list an implied connection, so its faults are reported at the input, delivery
-    # or node that needs it. Only the requesters of the connection are written in the goal.
+    # The goal does not list an implied connection, so its faults are reported at the input,
+    # delivery or node that needs it. Only its requesters are written in the goal.
     return path if path.startswith("requesters") else field
 
 

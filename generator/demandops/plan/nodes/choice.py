@@ -32,10 +32,12 @@ from demandops.plan.overrides.claim_overrides import moved_by_overrides
 from demandops.quoting import quoted
 
 _MOST_SHOWN = 5
+# After a booking failed on so many nodes, no other node is tried, because each trial takes time.
+# The bound is a number and not a time, so every generator comes to the same end.
 MOST_TRIED = 20
-"""After a booking failed on so many nodes, no other node is tried; each trial takes time."""
+# The code of the fault if no node fits, but at least one node lacks only room. Such a demand may
+# wait.
 NO_ROOM = "no-room"
-"""The code of the fault if no node fits, but at least one node lacks only room."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,8 +48,8 @@ class Chosen:
     why: str
 
 
+# The positions that a demand gives, by node id. A position in the inventory has precedence.
 Positions = Mapping[str, Position]
-"""The positions that a demand gives, by node id; a position in the inventory has precedence."""
 
 
 def requirement_of(service: Service) -> Requirement:
@@ -62,7 +64,7 @@ def requirement_of(service: Service) -> Requirement:
 
 
 def on_node(app: Application, node: str, service: Service | None, world: World) -> Application:
-    """Return an application moved to ``node``; if ``service`` is given, only this service moves."""
+    """Return an application with ``service``, or with all of itself, moved to ``node``."""
     if service is None:
         app = replace(app, node=node)
     else:
@@ -76,14 +78,10 @@ def with_overridden_nodes(app: Application, world: World) -> Application:
 
 
 def shares(service: Service, one: Application, other: Application) -> bool:
-    """Return whether two applications share the instances of a service that runs for each topic.
-
-    They do if they have the same appdef and node. A separate instance shares only with separate
-    instances of the same version. If two applications share instances, the generator tries to place
-    the service on one node for both.
-    """
-    of = ((app.appdef, app.node, app.own_version) for app in (one, other))
-    return service.scope == "topic" and len({*of}) == 1
+    """Return whether two applications share the instances of a service that runs for each topic."""
+    # A separate instance of an application shares only with separate instances of its version.
+    identities = {(app.appdef, app.node, app.own_version) for app in (one, other)}
+    return service.scope == "topic" and len(identities) == 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,38 +89,34 @@ class Choice:
     """The choice of a node for one application, or for one of its services.
 
     ``service`` is ``None`` if the node is for the whole application. ``claims`` are the claims that
-    the application would get; the chosen node replaces the node in them.
+    the application would get; the chosen node replaces the node in them. ``suits`` returns whether
+    the demand can be booked with the given application; without it, a node is chosen without this
+    check.
     """
 
-    one: Demanded
+    item: Demanded
     requirement: Requirement
     world: World
     room: Room
     claims: tuple[Claim, ...]
     service: Service | None = None
     suits: Callable[[Application], bool] | None = None
-    """A function that returns whether the demand can be booked with the given application.
-
-    ``None`` means that a node is chosen without this check.
-    """
 
     @property
     def config(self) -> Config:
-        """The configuration."""
         return self.world.config
 
     @property
     def app(self) -> Application:
-        """The application."""
-        assert isinstance(self.one.held, Application)  # noqa: S101 - only these are placed
-        return self.one.held
+        assert isinstance(self.item.held, Application)  # noqa: S101 - only these are placed
+        return self.item.held
 
     def fits(self, node: str) -> bool:
         """Return whether a node meets the requirement, accepts services and permits this demand."""
-        known = self.config.nodes.get(node)
-        if known is None or any(lacks(known, self.requirement)):
+        entry = self.config.nodes.get(node)
+        if entry is None or any(lacks(entry, self.requirement)):
             return False
-        return not self._closed(known) and self._is_permitted(known)
+        return not self._closed(entry) and self._is_permitted(entry)
 
     def candidates(self, positions: Positions) -> Iterator[Chosen]:
         """Yield the nodes that fit, have room and pass :attr:`suits`, the best first.
@@ -135,6 +129,7 @@ class Choice:
         skipped: dict[str, None] = {}
         tried = 0
         least: Mapping[str, int] | None = None
+        # The checks that cost least come first. A trial of the whole booking comes last.
         for node in fitting:
             if node.capacity is not None and least is None:
                 least = self.room.least(self._claims_on(node), self._name)
@@ -162,8 +157,8 @@ class Choice:
 
         :attr:`suits` is not asked.
         """
-        known = self.config.nodes.get(node)
-        if known is None or not self.fits(node) or self._shortage(known):
+        entry = self.config.nodes.get(node)
+        if entry is None or not self.fits(node) or self._shortage(entry):
             return None
         return Chosen(node, why)
 
@@ -174,11 +169,12 @@ class Choice:
     def _fitting(self) -> list[Node]:
         required, config = self.requirement, self.config
         traits = (*((name,) for name in required.capabilities), *required.labels)
+        # Of the nodes with each required trait, only the shortest list is searched.
         pools = [config.nodes_with.get(trait, ()) for trait in traits]
         return [
             node
             for node in min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
-            if not any(lacks(node, self.requirement)) and not self._closed(node)
+            if not any(lacks(node, required)) and not self._closed(node)
         ]
 
     def _shortage(self, node: Node) -> list[str]:
@@ -193,8 +189,8 @@ class Choice:
 
     def _claims_on(self, node: Node) -> list[Claim]:
         return [
-            replace(one, held=on_node(one.application, node.id, self.service, self.world))
-            for one in self.claims
+            replace(claim, held=on_node(claim.application, node.id, self.service, self.world))
+            for claim in self.claims
         ]
 
     def _merit(self, node: Node, centre: Position | None, positions: Positions) -> str:
@@ -207,21 +203,18 @@ class Choice:
         return f"the one with the {'most' if choose == 'pack' else 'fewest'} applications"
 
     def _is_home(self, node: Node) -> bool:
-        """Return whether the choice is for a service and ``node`` is the application's node."""
+        # A service on its application's node needs no connection to it.
         return self.service is not None and node.id == self.app.node
 
     def _rank(
         self, node: Node, centre: Position | None, positions: Positions
     ) -> tuple[bool, float, float, str]:
-        """Return the key by which nodes are sorted; the best node has the lowest key.
-
-        ``placement`` of the settings decides whether the distance or the number of applications
-        counts first.
-        """
+        """Return the key by which nodes are sorted; the best node has the lowest key."""
         distance = self._distance(node, centre, positions)
         booked = self.world.ledger.applications_on.get(node.id) or 0
         booked += self.room.newly_placed[node.id]
         away = not self._is_home(node)
+        # The id comes last, so that every generator and every replay chooses the same node.
         match self.config.repo_settings.placement:
             case "spread":
                 return away, booked, distance, node.id
@@ -230,25 +223,24 @@ class Choice:
         return away, distance, booked, node.id
 
     def _distance(self, node: Node, centre: Position | None, positions: Positions) -> float:
-        """Return a node's squared distance from ``centre``; infinity if a position is unknown."""
         position = self._position(node.id, positions)
         if centre is None or position is None:
             return inf
+        # Squared, because every machine computes this alike.
         return (position.x - centre.x) ** 2 + (position.y - centre.y) ** 2
 
     def _centre(self, positions: Positions) -> Position | None:
         """Return the middle of the sources whose position is known; ``None`` if none is known."""
         sources = sorted({topic.source for _, topic in self.app.all_inputs()})
-        known = [found for source in sources if (found := self._position(source, positions))]
-        if not known:
+        placed = [at for source in sources if (at := self._position(source, positions))]
+        if not placed:
             return None
-        x, y = (fsum(getattr(one, axis) for one in known) / len(known) for axis in "xy")
+        x, y = (fsum(getattr(at, axis) for at in placed) / len(placed) for axis in "xy")
         return Position(x=x, y=y)
 
     def _position(self, node: str, positions: Positions) -> Position | None:
-        """Return a node's position from the inventory or, if it has none there, from the demand."""
-        listed = self.config.nodes.get(node)
-        return (listed.position if listed else None) or positions.get(node)
+        entry = self.config.nodes.get(node)
+        return (entry.position if entry else None) or positions.get(node)
 
     def _closed(self, node: Node) -> str:
         """Return why a node accepts no application at all, or an empty text."""
@@ -257,7 +249,7 @@ class Choice:
         return "" if node.id in self.config.domain_of else "is in no access domain"
 
     def _is_permitted(self, node: Node) -> bool:
-        return permission.may_place(self.one, self.app.appdef, node.id, self.config)
+        return permission.may_place(self.item, self.app.appdef, node.id, self.config)
 
     def none_fits(self, positions: Positions) -> Fault:
         """Return the fault for an application or a service that gets no node.
@@ -297,8 +289,8 @@ class Choice:
 
     def _fault(self, message: str, code: str) -> Fault:
         if self.service is None:
-            return self.one.fault("place", message, code=code)
-        return self.one.fault("appdef", f"{self.service.name}: {message}", code=code)
+            return self.item.fault("place", message, code=code)
+        return self.item.fault("appdef", f"{self.service.name}: {message}", code=code)
 
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
@@ -316,10 +308,10 @@ def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
         if condition is None:  # the form of the demand has a fault
             continue
         if condition.name not in kinds:
-            known = (
+            remedy = (
                 suggestion(condition.name, kinds) or f"; add it in {config.place_of(NODES_FILE)}"
             )
-            yield f"no node has the property {quoted(condition.name)}{known}"
+            yield f"no node has the property {quoted(condition.name)}{remedy}"
         elif problem := condition_problem(condition, kinds[condition.name][0]):
             yield problem
 
@@ -329,17 +321,17 @@ def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
     if requirement.role not in ("", node.type):
         yield f"the role {quoted(requirement.role)}"
     labels = node.labels() if requirement.labels else {}
-    for key, wanted in requirement.labels:
-        if labels.get(key) != wanted:
-            yield f"the label {quoted(f'{key}={wanted}')}"
+    for key, value in requirement.labels:
+        if labels.get(key) != value:
+            yield f"the label {quoted(f'{key}={value}')}"
     for capability in requirement.capabilities:
         if capability not in node.capabilities:
             yield f"the capability {quoted(capability)}"
     for text in requirement.properties:
         if not meets_condition(node.properties, text):
             condition = read_condition(text)
-            value = node.properties.get(condition.name) if condition else None
-            has = "" if value is None else f" (it has {strict_yaml.short_repr(value)})"
+            actual = node.properties.get(condition.name) if condition else None
+            has = "" if actual is None else f" (it has {strict_yaml.short_repr(actual)})"
             yield f"the property {quoted(text)}{has}"
 
 
