@@ -19,13 +19,10 @@ from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import suspended_by
 from demandops.subject import SubjectKind
 
+# The state of a claim or of a demand. A claim is held by its demand, kept by an override, or
+# suspended by an override. A demand has the state of its claims. If the states of its claims
+# differ, the demand is partly suspended. If it waits for room, it has no claims.
 State = Literal["held", "kept", "suspended", "partly suspended", "waiting"]
-"""The state of a claim or of a demand.
-
-A claim is held by its demand, kept by an override, or suspended by an override. A demand has the
-state of its claims. If the states of its claims differ, the demand is partly suspended. If it waits
-for room, it is waiting and has no claims.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,7 +43,6 @@ class HeldDemand:
 
 
 def state_of(claim: Claim, world: World) -> State:
-    """Return whether a claim is held, kept or suspended."""
     if suspended_by(claim, world) is not None:
         return "suspended"
     return "kept" if claim.keeping_override else "held"
@@ -60,8 +56,7 @@ def domains_of(nodes: Iterable[str], config: Config) -> tuple[str, ...]:
 def nodes_of(claim: Claim) -> tuple[str, ...]:
     """Return the nodes that a claim needs, sorted.
 
-    An application needs its node, the sources of its inputs and the nodes to which it delivers. A
-    connection needs the nodes at its ends and the node of its broker.
+    These include the sources of its inputs, the nodes to which it delivers, and its broker's node.
     """
     held = claim.held
     if claim.is_on_application:
@@ -79,13 +74,13 @@ def demands(world: World) -> list[HeldDemand]:
     by_demand: defaultdict[str, list[Claim]] = defaultdict(list)
     for claim in world.ledger:
         by_demand[claim.demand].append(claim)
-    found = [held_demand(claims, world) for claims in by_demand.values()]
-    found += [waiting_demand(one) for one in world.ledger.waiting.values()]
-    return sorted(found, key=lambda one: (one.since, one.name))
+    entries = [held_demand(claims, world) for claims in by_demand.values()]
+    entries += [waiting_demand(demand) for demand in world.ledger.waiting.values()]
+    return sorted(entries, key=lambda entry: (entry.since, entry.name))
 
 
 def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
-    """Return the entry in the list for a demand; ``claims`` are all claims that it holds."""
+    """Return the entry for a demand; ``claims`` are all claims that it holds."""
     states = {state_of(claim, world) for claim in claims}
     (state,) = states if len(states) == 1 else ("partly suspended",)
     suspending = filter(None, (suspended_by(claim, world) for claim in claims))
@@ -106,23 +101,21 @@ def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
     )
 
 
-def waiting_demand(one: WaitingDemand) -> HeldDemand:
-    """Return the entry in the list for a waiting demand, which holds nothing yet."""
+def waiting_demand(demand: WaitingDemand) -> HeldDemand:
     return HeldDemand(
-        name=one.demand,
+        name=demand.demand,
         state="waiting",
-        requests=(one.request,),
-        requesters=tuple(sorted(one.requesters)),
+        requests=(demand.request,),
+        requesters=tuple(sorted(demand.requesters)),
         applications=(),
         connections=(),
         nodes=(),
         domains=(),
-        since=one.since,
+        since=demand.since,
         lease=None,
         suspended_by=(),
     )
 
 
 def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> Iterator[str]:
-    """Yield the ids of the claimed applications, or of the claimed connections, sorted."""
     yield from sorted(claim.subject.id for claim in claims if claim.subject.kind is kind)

@@ -28,15 +28,12 @@ Unit = TypeVar("Unit", bound="_Unit")
 _Unit: TypeAlias = "Subject | ReleaseKey"
 _Read: TypeAlias = "Subject | tuple[str, ...]"
 
+# Records a read of the whole ledger.
 _ALL: _Read = ("all",)
-"""The entry that records a read of the whole ledger."""
 
 
 class TracedPlan:
-    """The plan of one configuration, for one ledger after another.
-
-    All these ledgers have the same ended overrides.
-    """
+    """The plan of one configuration, for ledgers that have the same ended overrides."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -49,22 +46,19 @@ class TracedPlan:
     ) -> dict[ReleaseKey, Release | None]:
         """Plan the releases that the changes may affect; the first call plans all releases.
 
-        Args:
-            ledger: the ledger after the changes.
-            changes: every claim that changed.
-            kept: every service instance whose kept replicas changed.
-
-        Returns:
-            A map from the key of each planned release to the release, or to ``None`` if the release
-            does not run.
+        ``kept`` are the service instances whose kept replicas changed. A release that does not run any
+        longer is ``None``.
 
         Raises:
             Refused: for the same reasons as :func:`demandops.plan.planner.plan`. Then this object
                 is out of date and must not be used again.
         """
-        stale = {
-            unit for read in (*_changed(changes), *kept) for unit in self._readers.pop(read, ())
-        }
+        # The reads whose result may differ now.
+        reads: set[_Read] = {_ALL, *kept}
+        for change in changes:
+            entries = index_entries(change.before), index_entries(change.after)
+            reads |= {change.key.subject}.union(*entries)
+        stale = {unit for read in reads for unit in self._readers.pop(read, ())}
         for subject in ledger.claims:
             if subject in stale or subject not in self._keys:
                 self._keys[subject] = self._traced(
@@ -75,11 +69,11 @@ class TracedPlan:
                 del self._keys[subject]
         needed = {key for keys in self._keys.values() for key in keys}
         gone = self._planned - needed
-        found: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
+        planned: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
         for key in sorted(needed - self._planned | (needed & stale), key=repr):
-            found[key] = self._traced(ledger, key, plan)
+            planned[key] = self._traced(ledger, key, plan)
         self._planned = needed
-        return found
+        return planned
 
     def _traced(self, ledger: Ledger, unit: Unit, work: Callable[[World, Unit], T]) -> T:
         reads: set[_Read] = set()
@@ -94,14 +88,6 @@ class TracedPlan:
         for read in reads:
             self._readers.setdefault(read, set()).add(unit)
         return result
-
-
-def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
-    """Return the reads whose result may differ after the changes."""
-    reads: set[_Read] = {_ALL}
-    for change in changes:
-        reads |= {change.key.subject, *index_entries(change.before), *index_entries(change.after)}
-    return reads
 
 
 @dataclass(frozen=True)
