@@ -46,8 +46,8 @@ class TracedPlan:
     ) -> dict[ReleaseKey, Release | None]:
         """Plan the releases that the changes may affect; the first call plans all releases.
 
-        ``kept`` are the service instances whose kept replicas changed. A release that does not run any
-        longer is ``None``.
+        ``kept`` are the service instances whose kept replicas changed. A release that does not run
+        any longer is ``None``.
 
         Raises:
             Refused: for the same reasons as :func:`demandops.plan.planner.plan`. Then this object
