@@ -32,8 +32,6 @@ class Want:
 
 
 class Detector:
-    """The rules in effect, the entities that were seen, and the events that have not ended."""
-
     def __init__(self, file: RuleFile, now: float) -> None:
         self.file = file
         self._rules = {rule.name: rule for rule in file.rules}
@@ -43,7 +41,6 @@ class Detector:
 
     @property
     def lasting(self) -> frozenset[Key]:
-        """The events that have started and not stopped."""
         return self._state.lasting
 
     @property

@@ -37,8 +37,6 @@ _UNKNOWN = "timeout"
 
 @dataclass(frozen=True, slots=True)
 class Sending:
-    """A goal to send for an event."""
-
     key: Key
     purpose: Purpose
     goal: Goal
@@ -105,8 +103,6 @@ class _Entry:
 
 
 class WantedDemands:
-    """For each event, the demand that it wants and the demand that it holds."""
-
     def __init__(self) -> None:
         self._entries: dict[Key, _Entry] = {}
         self._owners: dict[str, Key] = {}  # which event has a demand id
@@ -165,34 +161,28 @@ class WantedDemands:
         The text is empty if the goal succeeded, if the previous attempt failed for the same reason,
         or if the demand to end or renew is not held any longer.
         """
-        entry = self._entries[sending.key]
+        entry, text, is_start = self._entries[sending.key], "", sending.purpose == "start"
         entry.is_under_way = False
-        text = self._record(entry, sending, outcome, now)
+        is_over = outcome.code == "not-held" and not is_start
+        if outcome.code and not is_over:
+            # The node may have booked the goal, so it must be ended if it is wanted no longer.
+            if outcome.code == _UNKNOWN and is_start:
+                entry.held, entry.is_sure = sending.goal, False
+            is_away = outcome.code in {*_NOT_ACCEPTED, _UNKNOWN}
+            entry.not_before = now + (_RETRY_S if is_away else entry.retry_s)
+            text = outcome.message if outcome.message != entry.refusal else ""
+            entry.refusal = outcome.message
+        elif sending.purpose == "end" or is_over:
+            entry.held, entry.is_sure, entry.refusal = None, True, ""
+        else:
+            if is_start:
+                entry.held, entry.is_sure = sending.goal, True
+            pause = outcome.lease_s * _RENEW_AFTER or entry.renew_s
+            entry.renew_at, entry.refusal = now + pause if pause else inf, ""
         if entry.held is None and self._owners.get(sending.goal.id) == sending.key:
             del self._owners[sending.goal.id]
         self._enqueue(sending.key, entry)
         return text
-
-    def _record(self, entry: _Entry, sending: Sending, outcome: Outcome, now: float) -> str:
-        is_over = outcome.code == "not-held" and sending.purpose != "start"
-        if outcome.code and not is_over:
-            # The node may have booked the goal, so it must be ended if it is wanted no longer.
-            if outcome.code == _UNKNOWN and sending.purpose == "start":
-                entry.held, entry.is_sure = sending.goal, False
-            is_away = outcome.code in {*_NOT_ACCEPTED, _UNKNOWN}
-            entry.not_before = now + (_RETRY_S if is_away else entry.retry_s)
-            is_new = outcome.message != entry.refusal
-            entry.refusal = outcome.message
-            return outcome.message if is_new else ""
-        entry.refusal = ""
-        if sending.purpose == "end" or is_over:
-            entry.held, entry.is_sure = None, True
-            return ""
-        if sending.purpose == "start":
-            entry.held, entry.is_sure = sending.goal, True
-        pause = outcome.lease_s * _RENEW_AFTER or entry.renew_s
-        entry.renew_at = now + pause if pause else inf
-        return ""
 
     def _enqueue(self, key: Key, entry: _Entry) -> None:
         if entry.wanted is None and entry.held is None and not entry.is_under_way:
@@ -207,7 +197,6 @@ class WantedDemands:
         return len(self._entries)
 
     def unanswered(self) -> int:
-        """Return how many events have a demand that is still to be booked or released."""
         entries = self._entries.values()
         return sum(entry.wanted != entry.held or not entry.is_sure for entry in entries)
 

@@ -98,7 +98,6 @@ def version_of_instance(app: Application, service: Service) -> str:
 
 
 def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:
-    """Return the inputs of an application for which a service instance runs, as topic keys."""
     if service.root is not None:
         topics = app.inputs_from(service.root, str(key.source), str(key.topic))
         return [(service.root, topic.topic, topic.source) for topic in topics]

@@ -1,8 +1,7 @@
 """Implied connections: those that a demand needs, but does not list.
 
-A service that reads a topic of another node needs a connection. The demand claims this connection
-in the same way as a connection that it lists. So the connection is shared with other demands,
-changes when the application moves, and is released with the demand.
+The demand claims such a connection in the same way as one that it lists. So the connection is
+shared with other demands, changes when the application moves, and is released with the demand.
 """
 
 from __future__ import annotations

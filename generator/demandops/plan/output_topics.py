@@ -57,17 +57,15 @@ def distinguishing_text(config: Config, role: str, topic: InputTopic, version: s
 # A fusion reads hundreds of such topics, and each demand plans the fusion again.
 @lru_cache(maxsize=65_536)
 def published_topic(pattern: str, source: str, distinguishing: str) -> InputTopic:
-    """Return the topic that a service publishes for ``source``."""
     return InputTopic(topic_name(pattern, naming.topic_part(source, distinguishing)), source)
 
 
 def topic_name(pattern: str, instance: str) -> str:
-    """Return the topic name that ``pattern``, an output of an appdef, gives."""
     return pattern.replace("{instance}", instance)
 
 
 def usual_topic(config: Config, source: str, role: str) -> str | None:
-    """Return the usual topic of a source in ``role``, or ``None`` if the inventory has none."""
+    """Return the usual topic of a source that the inventory names for ``role``, or ``None``."""
     node = config.nodes.get(source)
     return node.topics.get(role) if node else None
 

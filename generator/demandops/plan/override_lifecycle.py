@@ -25,8 +25,7 @@ from demandops.subject import Subject
 class LedgerUpdate:
     """The ledger after a change of overrides or claims, and the ledger files to write.
 
-    ``keys`` are the keys of the claims that may have changed. ``files`` maps each path to the new
-    text, or to ``None`` if the file is to be removed.
+    ``keys`` are the keys of the claims that may have changed. A file with ``None`` is removed.
     """
 
     ledger: Ledger
@@ -115,10 +114,7 @@ def _marker(override: Override) -> dict[str, str]:
 def changed_claim_files(
     before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
 ) -> dict[str, str | None]:
-    """Return the new texts of the files of the claims at ``keys`` that changed, by path.
-
-    ``None`` instead of a text means that the file is to be removed.
-    """
+    """Return the new texts of the files of changed claims, by path; ``None`` removes a file."""
     files: dict[str, str | None] = {}
     for key in keys:
         claim = after.get(key)
@@ -128,7 +124,7 @@ def changed_claim_files(
 
 
 def expired_overrides(world: World, now: datetime) -> list[Override]:
-    """Return the overrides that are in effect although their end has passed, sorted by end."""
+    """Return the overrides in effect although their end has passed, sorted by end."""
     expired = [
         (override.end, override.name, override)
         for override in world.overrides

@@ -56,8 +56,6 @@ class CompiledRule:
 
 
 class HoursRule(CompiledRule):
-    """A rule whose condition holds during the hours of a schedule."""
-
     def __init__(self, rule: Rule, hours: Hours) -> None:
         super().__init__(rule)
         self.schedule = hours.schedule
@@ -67,8 +65,6 @@ class HoursRule(CompiledRule):
 
 
 class ThresholdRule(CompiledRule):
-    """A rule on a number that an entity reports."""
-
     def __init__(self, rule: Rule, limits: Threshold) -> None:
         super().__init__(rule)
         self.field, self._limits = limits.field, limits
@@ -108,8 +104,6 @@ class AreaRule(CompiledRule):
 
 
 class PairRule(CompiledRule):
-    """A rule on the distance between two entities."""
-
     # The map is divided into squares as wide as the distance at which the condition stops. So all
     # partners of an entity are in the entity's square and the squares around it, and an entity is
     # not compared with all others.
@@ -177,7 +171,6 @@ class PairRule(CompiledRule):
 
 
 def distance(one: Observation, other: Observation) -> float:
-    """Return the metres between two entities that have positions."""
     assert one.position is not None and other.position is not None  # noqa: S101 - rules need them
     return hypot(one.position[0] - other.position[0], one.position[1] - other.position[1])
 

@@ -91,7 +91,6 @@ class State:
 
     @property
     def lasting(self) -> frozenset[Key]:
-        """The events that have started and not stopped."""
         return frozenset(key for key, phase in self.phases.items() if phase.lasts)
 
     def shifted(self, seconds: float) -> State:

@@ -136,7 +136,6 @@ class EngineStep:
     # ---- observations ----
 
     def observe(self, observation: Observation) -> None:
-        """Apply an observation at the current time of the step."""
         if observation.at != self._now:
             observation = observation._replace(at=self._now)
         who, source, entity = observation.who, observation.source, observation.entity

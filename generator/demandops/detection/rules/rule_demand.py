@@ -19,8 +19,6 @@ Action = Literal["demand", "deployment_request"]
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A goal as plain data, and the action that takes it."""
-
     action: Action
     data: Mapping[str, Any]
 
@@ -72,8 +70,6 @@ class BookedDemand:
 
 @dataclass(frozen=True)
 class RuleDemand:
-    """The template of a rule's demand."""
-
     action: Action
     data: Mapping[str, Any]
 
@@ -81,7 +77,6 @@ class RuleDemand:
         return Goal(self.action, filled(self.data, values))
 
     def names(self) -> set[str]:
-        """Return the names in braces that the template uses, such as ``entity``."""
         return {name for _, text in texts(self.data, "") for name in names(text)}
 
     def outline(self, values: Values) -> Goal:
@@ -125,7 +120,6 @@ class RuleDemand:
 
 
 def requesters_in(action: Action, data: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the requesters that the data of a goal, or of its template, names."""
     if action == "demand":
         yield from data.get("requesters", ())
         return

@@ -148,7 +148,7 @@ class Rule(CamelModel):
 
     def is_for(self, *entities: str) -> bool:
         """Return whether the rule is for an event about these entities."""
-        # If the rule is for pairs from two sources, its patterns limit only the entity of the first.
+        # The patterns of a rule for pairs from two sources limit only the entity of the first.
         limited = entities[:1] if self.together and self.together.other else entities
         return all(matches(entity, self.entities) for entity in limited)
 
@@ -206,10 +206,8 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
                 # Two rules may have an event for one entity at the same time if they have a pattern
                 # in common, or if one of them has ``*``. Different patterns that match the same
                 # entity, such as ``car*`` and ``*1``, are not recognized.
-                patterns = {*rule.entities}, {*other.entities}
-                may_meet = "*" in patterns[0] | patterns[1] or not patterns[0].isdisjoint(
-                    patterns[1]
-                )
+                own, others = {*rule.entities}, {*other.entities}
+                may_meet = "*" in own | others or not own.isdisjoint(others)
                 if id == other_id and may_meet:
                     message = (
                         f"is also the id of a demand of rule '{other.name}', so the event that "

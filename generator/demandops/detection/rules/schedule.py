@@ -35,8 +35,8 @@ class Schedule:
     def next_check(self, now: float) -> float:
         """Return the time after ``now`` at which to call :meth:`is_on` again."""
         local = datetime.fromtimestamp(now, self.zone)
-        # The result of :meth:`is_on` changes at a start, at an end, and if summer time begins or ends.
-        # To notice the latter soon, an hour is the longest time.
+        # The result of :meth:`is_on` changes at a start, at an end, and if summer time begins or
+        # ends. To notice the latter soon, an hour is the longest time.
         ahead = [now + 3600.0]
         for day in (0, 1):
             date = local.date() + timedelta(days=day)

@@ -30,7 +30,6 @@ from demandops.plan.release_keys import keys_of_claims
 
 
 def faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[Fault]:
-    """Yield a fault for each demanded application or connection that an override denies."""
     denying = [override for override in reversed(after.overrides) if override.deny]
     if not denying or not request.adds_claims:
         return

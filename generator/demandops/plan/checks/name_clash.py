@@ -55,7 +55,7 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
 
 
 def all_names(world: World) -> Names:
-    """Return the names of all releases. This takes time for a large ledger."""
+    """This takes time for a large ledger."""
     keys = (key for claims in world.ledger.claims.values() for key in keys_of_claims(world, claims))
     return with_keys(NONE, world, dict.fromkeys(keys))
 
@@ -134,7 +134,6 @@ def faults_in_files(
 
 
 def refuse_shared_names(world: World, keys: Iterable[ReleaseKey]) -> None:
-    """Raise :class:`Refused` if two of the releases at ``keys`` need one name."""
     taken: dict[Name, ReleaseKey] = {}
     clashes = [
         (key, name, taken[name])
@@ -155,7 +154,6 @@ _REMEDY = "use another id, or wait until the other is released"
 
 
 def _located(message: str, request: DemandRequest, claim: ClaimKey | None) -> Fault:
-    """Return a fault at the item of the request that needs a claim, or in the claim's file."""
     for item in request.demanded:
         if claim and item.held.subject == claim.subject:
             return item.fault("id", message, code="conflict")

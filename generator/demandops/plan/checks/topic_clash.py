@@ -58,7 +58,6 @@ def faults(
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
-    """Yield the topic clashes that a claim would cause, each located in the claim's file."""
     keys = keys_of_claims(after, [claim])
     for clash in faults(request_for(claim), before, after, keys):
         yield clash.within(path_of(claim.key))
@@ -210,7 +209,7 @@ def _keys_called(
 
 
 def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys of the instances of a service on a node; some of them may not run."""
+    """Some of the instances may not run."""
     name = service.name
     if service.scope == "cluster":
         yield ServiceKey(name, node, for_cluster=True)
@@ -234,7 +233,7 @@ def words(key: ReleaseKey) -> str:
 def _remedy(
     key: ServiceKey, other: ServiceKey | None, service: Service, output: str, config: Config
 ) -> str:
-    """Return how to resolve a clash; ``other`` is ``None`` if the clash is with a connection."""
+    """``other`` is ``None`` if the clash is with a connection."""
     is_named = "{instance}" in service.outputs[output]
     is_of_same = (
         other is not None
@@ -255,7 +254,6 @@ def _remedy(
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
-    """Return which field of the request makes a service run; empty if no field does."""
     for item in request.demanded:
         if not isinstance(item.held, Application):
             continue

@@ -117,7 +117,6 @@ def differences(
 
 
 def _of_application(item: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
-    """Yield the difference between a claim's version and the newest one of the other claims."""
     app, ledger = claim.application, after.ledger
     versions = after.config.application_versions[app.appdef]
     # Two words may name one version, for example a channel and a number.

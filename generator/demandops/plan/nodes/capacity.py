@@ -60,19 +60,14 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return a map from (node, resource) to how much more ``after`` requests than ``before``.
-
-    What stays the same is left out.
-    """
+    """Return how much more ``after`` requests than ``before``; what stays the same is left out."""
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return the growth of the services' requests when claims change, by (node, resource).
-
-    It is empty if no node declares a capacity.
+    """Return the growth of the services' requests when claims change.
 
     Raises:
         Refused: if an application definition that ``after`` needs is missing.
@@ -124,7 +119,6 @@ def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterato
 
 
 def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[Fault]:
-    """Yield a fault for each capacity that the growth would exceed (:func:`excesses`)."""
     for node, excess in excesses(usage, grown, config):
         message = (
             f"'{node}' {excess}; choose another node, release something first, or ask "
@@ -170,12 +164,9 @@ class Room:
     def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:
         """Return, in words, the resources of which a node has too little for an application.
 
-        The result is empty if the node has room, or if the application cannot be planned.
-
-        Args:
-            claims: the claims to book for the application, with ``node`` as its node.
-            node: the node.
-            service: if not empty, only the service of this name is placed on the node.
+        ``claims`` are those to book for the application on ``node``. If ``service`` is not empty,
+        only the service of this name is placed there. The result is empty if the node has room, or
+        if the application cannot be planned.
         """
         entry = self._world.config.nodes.get(node)
         if entry is None or entry.capacity is None:
@@ -201,8 +192,8 @@ class Room:
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
         """Return what an application requests at least of its node, as resource → amount.
 
-        Services that the application shares do not count, and neither do services with a node of
-        their own. If ``service`` is not empty, only the service of this name counts.
+        Services that it shares do not count, and neither do services with a node of their own. If
+        ``service`` is not empty, only the service of this name counts.
         """
         subject, world = claims[0].subject, self._world
         # Planning for each node takes long. This amount is the same on all nodes, so it is planned

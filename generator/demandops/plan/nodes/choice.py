@@ -42,8 +42,6 @@ NO_ROOM = "no-room"
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A chosen node, and the reason for the choice in words."""
-
     node: str
     why: str
 
@@ -73,12 +71,11 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
 
 
 def with_overridden_nodes(app: Application, world: World) -> Application:
-    """Return an application with its services moved to the nodes that overrides name."""
     return replace(app, moved=MappingProxyType(moved_by_overrides(app, world)))
 
 
 def shares(service: Service, one: Application, other: Application) -> bool:
-    """Return whether two applications share the instances of a service that runs for each topic."""
+    """Return whether two applications share the instances of a service for each topic."""
     # A separate instance of an application shares only with separate instances of its version.
     identities = {(app.appdef, app.node, app.own_version) for app in (one, other)}
     return service.scope == "topic" and len(identities) == 1
@@ -147,7 +144,12 @@ class Choice:
                 if tried == MOST_TRIED:
                     return
             else:
-                merit = self._merit(node, centre, positions)
+                choose = self.config.repo_settings.placement
+                merit = f"the one with the {'most' if choose == 'pack' else 'fewest'} applications"
+                if self._is_home(node):
+                    merit = "the node of its application"
+                elif choose == "nearest" and self._distance(node, centre, positions) < inf:
+                    merit = "the nearest to its sources"
                 only = f", counting only nodes {' and '.join(skipped)}" if skipped else ""
                 why = f"{merit} among {len(fitting)} nodes that fit{only}"
                 yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
@@ -193,15 +195,6 @@ class Choice:
             for claim in self.claims
         ]
 
-    def _merit(self, node: Node, centre: Position | None, positions: Positions) -> str:
-        """Return, in words, why a node comes first, for example ``the nearest to its sources``."""
-        if self._is_home(node):
-            return "the node of its application"
-        choose = self.config.repo_settings.placement
-        if choose == "nearest" and self._distance(node, centre, positions) < inf:
-            return "the nearest to its sources"
-        return f"the one with the {'most' if choose == 'pack' else 'fewest'} applications"
-
     def _is_home(self, node: Node) -> bool:
         # A service on its application's node needs no connection to it.
         return self.service is not None and node.id == self.app.node
@@ -209,7 +202,6 @@ class Choice:
     def _rank(
         self, node: Node, centre: Position | None, positions: Positions
     ) -> tuple[bool, float, float, str]:
-        """Return the key by which nodes are sorted; the best node has the lowest key."""
         distance = self._distance(node, centre, positions)
         booked = self.world.ledger.applications_on.get(node.id) or 0
         booked += self.room.newly_placed[node.id]
@@ -336,6 +328,5 @@ def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
 
 
 def joined(reasons: list[str]) -> str:
-    """Return the reasons as one text: ``a, b and c``."""
     *first, last = reasons
     return f"{', '.join(first)} and {last}" if first else last

@@ -46,10 +46,9 @@ def with_moved(
 
 
 def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger in which the connections of a demand follow its application.
+    """Return the ledger in which the connections of a demand follow, and the changed keys.
 
-    ``claim`` is the demand's claim on the application before the move. The second value has the
-    keys of the changed claims.
+    ``claim`` is the demand's claim on the application before the move.
     """
     config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
     app = claim.application

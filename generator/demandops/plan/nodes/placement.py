@@ -51,25 +51,17 @@ def with_chosen_nodes(
     trial: Trial | None,
     checkpoint: Callable[[], None],
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with a node for each application and service that is to be placed.
+    """Return the request with a node for each application and service to place, and the faults.
 
     A booked application or service stays on its node if the node still fits. If other demands hold
     it too, it stays even on a node that is drained or no longer permitted. Any other application or
     service gets the first node that fits and has room. ``placement`` in the settings decides the
     order of the nodes. Finally, services move to the nodes that overrides name.
 
-    Args:
-        request: the request.
-        world: the claims and the configuration before the request.
-        usage: what services request on each node in ``world``.
-        trial: if given, a node is chosen only if ``trial`` returns ``True`` for the request with
-            this node. It is not called for a node on which the application or service is booked
-            already, nor for one on which another application has a service to share.
-        checkpoint: called at each step; it may raise an exception to end the search.
-
-    Returns:
-        The request, and the faults: of each application or service that gets no node, and of each
-        node in the demand that lacks what is required or contradicts an existing claim.
+    If ``trial`` is given, a node is chosen only if ``trial`` returns ``True`` for the request with
+    this node. It is not called for a node on which the application or service is booked already,
+    nor for one on which another application has a service to share. ``checkpoint`` is called at
+    each step; it may raise an exception to end the search.
     """
     if not request.adds_claims:
         return request, []
@@ -91,11 +83,7 @@ def with_chosen_nodes(
 
 
 def needs_placement(request: DemandRequest, world: World) -> bool:
-    """Return whether nodes must be chosen or checked for a request.
-
-    This is so if the request leaves the choice of a node to the generator. It is also so if a
-    service of a requested application has a node of its own, in the request or in the ledger.
-    """
+    # A service with a node of its own, in the request or in the ledger, needs its node checked.
     apps = (item.held for item in request.demanded if isinstance(item.held, Application))
     return any(
         app.place
@@ -118,7 +106,6 @@ def _placed(
     trial: Trial | None,
     checkpoint: Callable[[], None],
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with chosen nodes, and a fault for each choice that failed."""
     ledger, faults = world.ledger, list[Fault]()
     kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
     room = Room(world, usage, [*ledger.claims_of_demand(request.demand), *kept], checkpoint)
@@ -252,10 +239,7 @@ def _with_node(request: DemandRequest, item: Demanded, choice: Choice) -> Demand
 
 
 def _shared_node(app: Application, service: Service, world: World) -> str:
-    """Return the node on which another application has a service instance that ``app`` can share.
-
-    Return an empty text if there is no such instance.
-    """
+    """Return the node on which another application has an instance to share, or an empty text."""
     # If a second instance ran on another node, the application's node would get the same outputs
     # twice.
     role = service.root or ""
@@ -325,7 +309,6 @@ def _with_services(
     room: Room,
     suits: Callable[[Application], bool] | None,
 ) -> tuple[Demanded, list[Fault]]:
-    """Return a demanded application with its services on chosen nodes, and the faults."""
     app = item.held
     assert isinstance(app, Application)  # noqa: S101 - callers pass only applications
     claims, faults = world.ledger.claims_on(app.subject), list[Fault]()

@@ -91,10 +91,7 @@ _Moved = tuple[World, Chosen, list[ClaimKey], Names]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return the services of an application for which ``node`` was chosen or named.
-
-    If ``node`` is the application's own node, the first item is ``None``.
-    """
+    """Return the services of an application on ``node``, and ``None`` first for itself."""
     app = world.ledger.application(id)
     if app is None:
         return []
@@ -182,10 +179,7 @@ def _moved(
 
 @dataclass(frozen=True, slots=True)
 class LedgerAfterMoves:
-    """The ledger after services have moved to the nodes that overrides name.
-
-    ``keys`` are the keys of the claims that may have changed.
-    """
+    """``keys`` are the keys of the claims that may have changed."""
 
     ledger: Ledger
     keys: tuple[ClaimKey, ...]
@@ -310,10 +304,7 @@ def _faults(
 
 
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
-    """Yield a fault for each topic that two connections bring to a node from different senders.
-
-    ``claim`` is the claim on one of the two connections.
-    """
+    """Yield a fault for each topic that two connections bring to a node from different senders."""
     if claim.is_on_application:
         return
     ledger = after.ledger

@@ -43,7 +43,7 @@ class Traits:
 
 
 def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
-    """Return the services of an application that overrides move, as a map to their new nodes."""
+    """Return the new nodes of the services that overrides move, by the name of the service."""
     moving = [override for override in world.overrides if override.node]
     nodes: dict[str, str] = {}
     for service in world.config.services.get(app.appdef, {}).values() if moving else ():
@@ -59,7 +59,6 @@ def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
 
 
 def traits_of(item: Claim | Demanded) -> Traits:
-    """Return the values of a claim or a demand with which selectors are compared."""
     held = item.held
     if isinstance(held, Application):
         return Traits(held.nodes, item.requesters, (held.id,), (held.appdef,))
@@ -67,7 +66,6 @@ def traits_of(item: Claim | Demanded) -> Traits:
 
 
 def fits(selector: Selector, traits: Traits, config: Config) -> bool:
-    """Return whether ``traits`` match every field of ``selector``."""
     fields = (
         (selector.applications, traits.applications),
         (selector.appdefs, traits.appdefs),
@@ -85,7 +83,6 @@ def fits(selector: Selector, traits: Traits, config: Config) -> bool:
 
 
 def has_labels(selector: Selector, node: str, config: Config) -> bool:
-    """Return whether a node has all labels of a selector."""
     entry = config.nodes.get(node)
     labels = entry.labels() if entry else {}
     return all(labels.get(key) == value for key, value in (selector.labels or {}).items())
@@ -194,7 +191,7 @@ def with_kept_claims(
 ) -> tuple[Ledger, Changes]:
     """Update the kept claims after a booking; return the ledger and all changes.
 
-    Only the kept claims on ``subjects`` and on the subjects that the booking changed are updated.
+    ``subjects`` are updated as well, although the booking may not have changed them.
     """
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
@@ -225,7 +222,6 @@ def update_kept_claims(
 
 
 def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
-    """Return every subject with a kept claim, sorted."""
     return tuple(dict.fromkeys(claim.subject for claim in ledger.kept_claims()))
 
 

@@ -62,8 +62,6 @@ class ConnectionEntry:
 
 @dataclass(frozen=True, slots=True)
 class SuspendedEntry:
-    """A booked claim that is not planned, and the override that suspends it."""
-
     kind: str
     id: str
     demand: str
@@ -74,8 +72,6 @@ class SuspendedEntry:
 
 @dataclass(frozen=True, slots=True)
 class WaitingEntry:
-    """A demand that waits for room, and since when."""
-
     demand: str
     requesters: list[str]
     since: str
@@ -260,7 +256,6 @@ class EntryChange:
 
 
 def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
-    """Return the changes of services, then those of connections, each sorted by name."""
     return (
         *_changes("service", dict(old.services), dict(new.services)),
         *_changes("connection", dict(old.connections), dict(new.connections)),

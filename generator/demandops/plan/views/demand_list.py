@@ -25,7 +25,7 @@ from demandops.subject import SubjectKind
 State = Literal["held", "kept", "suspended", "partly suspended", "waiting"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HeldDemand:
     """A demand and what it holds. Of the demand's leases, ``lease`` is the first that ends."""
 
@@ -33,13 +33,13 @@ class HeldDemand:
     state: State
     requests: tuple[str, ...]
     requesters: tuple[str, ...]
-    applications: tuple[str, ...]
-    connections: tuple[str, ...]
-    nodes: tuple[str, ...]
-    domains: tuple[str, ...]
+    applications: tuple[str, ...] = ()
+    connections: tuple[str, ...] = ()
+    nodes: tuple[str, ...] = ()
+    domains: tuple[str, ...] = ()
     since: datetime
-    lease: Lease | None
-    suspended_by: tuple[str, ...]
+    lease: Lease | None = None
+    suspended_by: tuple[str, ...] = ()
 
 
 def state_of(claim: Claim, world: World) -> State:
@@ -67,10 +67,7 @@ def nodes_of(claim: Claim) -> tuple[str, ...]:
 
 
 def demands(world: World) -> list[HeldDemand]:
-    """Return every demand that holds something or waits for room, the oldest first.
-
-    The result also has an entry for each override that keeps claims.
-    """
+    """Return every demand, and each override that keeps claims, the oldest first."""
     by_demand: defaultdict[str, list[Claim]] = defaultdict(list)
     for claim in world.ledger:
         by_demand[claim.demand].append(claim)
@@ -107,13 +104,7 @@ def waiting_demand(demand: WaitingDemand) -> HeldDemand:
         state="waiting",
         requests=(demand.request,),
         requesters=tuple(sorted(demand.requesters)),
-        applications=(),
-        connections=(),
-        nodes=(),
-        domains=(),
         since=demand.since,
-        lease=None,
-        suspended_by=(),
     )
 
 

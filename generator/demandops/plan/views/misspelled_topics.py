@@ -23,7 +23,6 @@ _SHORT = 4
 
 
 def notes(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each misspelled topic in a request that adds claims."""
     if request.adds_claims:
         known = _KnownTopics(world)
         for item in request.demanded:
@@ -31,7 +30,6 @@ def notes(request: DemandRequest, world: World) -> Iterator[str]:
 
 
 def warnings(world: World) -> Iterator[Fault]:
-    """Yield a warning for each misspelled topic in the claims of a world."""
     known = _KnownTopics(world)
     for claim in sorted(world.ledger, key=lambda claim: claim_file.path_of(claim.key)):
         for note in known.notes_on(claim.held):
@@ -52,7 +50,11 @@ class _KnownTopics:
         if isinstance(held, Application):
             what = f"application '{held.id}'"
             for role, input in held.all_inputs():
-                known = (self._of(input.source), self._usual(role, input.source))
+                place = (role, input.source)
+                if place not in self._booked:
+                    booked = self._world.ledger.usual_topics(*place, excluded="")
+                    self._booked[place] = frozenset(booked)
+                known = (self._of(input.source), self._booked[place])
                 yield from self._notes(what, input.source, input.topic, *known)
             return
         for route in held.topics:
@@ -78,12 +80,6 @@ class _KnownTopics:
             self._listed[node] = frozenset(topics)
         return self._listed[node]
 
-    def _usual(self, role: str, source: str) -> frozenset[str]:
-        if (role, source) not in self._booked:
-            booked = self._world.ledger.usual_topics(role, source, excluded="")
-            self._booked[role, source] = frozenset(booked)
-        return self._booked[role, source]
-
 
 def _is_misspelling(topic: str, other: str) -> bool:
     """Return whether ``topic`` may be a misspelling of ``other``.
@@ -105,5 +101,4 @@ def _is_misspelling(topic: str, other: str) -> bool:
 
 
 def _common(one: str, other: str) -> int:
-    """Return how many characters are the same at the start of two texts."""
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))

@@ -36,7 +36,6 @@ _MOST_NODES = 3
 
 
 def warnings(world: World) -> Iterator[Fault]:
-    """Yield each warning, located in the file that causes it."""
     config = world.config
     yield from _kinds_of_charts(config)
     yield from _open_by_host_network(config)
@@ -60,7 +59,6 @@ def warnings(world: World) -> Iterator[Fault]:
 
 
 def _unfit_places(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each requirement of a service that no node meets."""
     placed = {  # a shared service is in several definitions, but in one file
         (service.file, service.name): service
         for services in config.services.values()

@@ -17,17 +17,12 @@ from demandops.subject import Subject
 
 
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
-    """Yield the releases that run; with ``subject``, only those that claims on ``subject`` need.
-
-    Raises:
-        Refused: for the same reasons as :func:`demandops.plan.planner.plan`.
-    """
+    """Yield the releases that run, or only those that claims on ``subject`` need."""
     keys = keys_of(world, subject) if subject else all_keys(world)
     yield from filter(None, (plan(world, key) for key in keys))
 
 
 def release_named(world: World, name: str) -> Release | None:
-    """Return the running release that is called ``name``, or ``None``."""
     return next((release for release in releases(world) if release.name == name), None)
 
 
@@ -60,7 +55,6 @@ def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[st
 
 
 def how_to_release(claim: Claim) -> str:
-    """Return, in words, how the holders of a claim release it."""
     if claim.keeping_override is not None:
         return f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
     if is_released_by_demand_id(claim):
@@ -96,6 +90,5 @@ def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]
 
 
 def denied_release_named(world: World, name: str) -> tuple[Release, Override] | None:
-    """Return the denied release that is called ``name`` and the denying override, or ``None``."""
     denied = (denied_release(world, key) for key in all_keys(world))
     return next((pair for pair in denied if pair and pair[0].name == name), None)

@@ -9,7 +9,7 @@ the other releases are planned again. The generator instead predicts which relea
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, TypeAlias, TypeVar, cast
 
 from demandops.config.config import Config
@@ -82,19 +82,13 @@ class TracedPlan:
             cast(Any, _Recording(ledger.index, reads)),
             cast(Any, None),  # planning does not read the ends of leases
             ledger.ended,
-            kept=cast(Any, _RecordingKept(_Recording(ledger.kept.steps, reads))),
+            # of the kept replicas, planning reads only the steps
+            kept=cast(Any, SimpleNamespace(steps=_Recording(ledger.kept.steps, reads))),
         )
         result = work(World(self._config, traced), unit)
         for read in reads:
             self._readers.setdefault(read, set()).add(unit)
         return result
-
-
-@dataclass(frozen=True)
-class _RecordingKept:
-    """Stands for the ledger's kept replicas; planning reads only their :attr:`steps`."""
-
-    steps: _Recording
 
 
 class _Recording:

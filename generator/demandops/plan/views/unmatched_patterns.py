@@ -1,6 +1,7 @@
 """Warnings about patterns of the policy that match nothing now.
 
-Such a pattern is misspelled, or what it matches was removed or does not exist yet.
+Such a pattern is misspelled, or what it matches was removed or does not exist yet. Patterns of
+requesters are not checked: the state repo has no list of requesters.
 """
 
 from __future__ import annotations
@@ -14,10 +15,6 @@ from demandops.quoting import quoted
 
 
 def warnings(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each pattern of an access domain that matches nothing.
-
-    Patterns of requesters are not checked: the state repo has no list of requesters.
-    """
     nodes = tuple(sorted(config.nodes))
     for name, domain in sorted(config.domains.items()):
         own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == name))
