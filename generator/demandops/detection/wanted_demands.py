@@ -3,9 +3,6 @@
 This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the
 outcome. Each event has at most one goal under way. If an event ends before its demand was sent,
 nothing is sent for it.
-
-After a rule is renamed, an event of the old name and an event of the new name may want demands with
-the same id. The second event then waits until the first event has ended its demand.
 """
 
 from __future__ import annotations
@@ -145,6 +142,8 @@ class WantedDemands:
 
     def _reserve(self, key: Key, goal: Goal) -> bool:
         """Reserve the demand id of a goal for an event; return false if another event has it."""
+        # After a rule is renamed, an event of the old name and an event of the new name may want
+        # demands with the same id. The second then waits until the first has ended its demand.
         # A ``DeploymentRequest`` has no demand id, so there is nothing to reserve.
         return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
 

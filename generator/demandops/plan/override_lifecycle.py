@@ -44,11 +44,8 @@ def update_ledger(
 ) -> LedgerUpdate:
     """Return the ledger that a change of the configuration requires, and the files to write.
 
-    Args:
-        before, after: the world before and after the change.
-        subjects: the subjects whose claims a person changed.
-        markers: the ledger's markers of ended overrides, as a map from path to text.
-        now: the current time, also the booking time of each claim that an override books.
+    ``subjects`` are those whose claims a person changed. ``markers`` are the ledger's markers of
+    ended overrides, by path. ``now`` is also the booking time of claims that an override books.
     """
     # An override that is merged after its end never applies. One that was in effect before stays
     # in effect until the generator's own commit ends it.
@@ -94,11 +91,7 @@ def update_claims(
 
 
 def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    """Return the ledger after the end of an override, and the files to write with the marker.
-
-    Raises:
-        ValueError: if the override has no end.
-    """
+    """Return the ledger after the end of an override, and the files to write with the marker."""
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     ended = {**world.ledger.ended, override.name: format_time(override.end)}

@@ -111,7 +111,6 @@ def is_needed(world: World, key: ReleaseKey) -> bool:
 
 
 def takes(app: Application, service: Service, key: ServiceKey) -> bool:
-    """Return whether an application whose appdef has ``service`` needs the instance at ``key``."""
     return not service.roots or bool(roots_of(app, service, key))
 
 
@@ -137,9 +136,6 @@ def affected_keys(
 
     The cost grows with the number of changed topics. If a change moves an application or gives it
     another appdef or version, the cost grows with the number of all its topics.
-
-    Raises:
-        Refused: if an application definition that ``after`` needs is missing.
     """
     before, after = without_suspended(before), without_suspended(after)
     keys: dict[ReleaseKey, None] = {}
@@ -197,22 +193,13 @@ def _with_inputs_not_in(app: Application, other: Application) -> Application:
 
 
 def all_keys(world: World) -> tuple[ReleaseKey, ...]:
-    """Return the key of every release that the ledger needs.
-
-    Raises:
-        Refused: if the definition of a claimed application is missing.
-    """
+    """Return the key of every release; raise ``Refused`` if a definition is missing."""
     subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
     keys = (key for subject in subjects for key in keys_of(world, subject, strict=True))
     return tuple(dict.fromkeys(keys))
 
 
 def services_of(config: Config, name: str) -> Services:
-    """Return the services of an application definition.
-
-    Raises:
-        Refused: if the state repo has no such definition.
-    """
     services = config.services.get(name)
     if services is None:
         message = f"'{name}' is in use, but appdefs/{name} is gone; restore it"

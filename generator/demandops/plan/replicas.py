@@ -29,7 +29,6 @@ class Autoscaler:
         return f"{self.min} to {self.max} by an autoscaler ({by})"
 
     def values(self) -> dict[str, int]:
-        """Return the variables for a template of Helm values."""
         targets = {str(name): percent for name, percent in self.targets.items()}
         return {"min": self.min, "max": self.max} | targets
 
@@ -41,11 +40,7 @@ def replicas_of(
     claims: Collection[Claim],
     requesters: Collection[str],
 ) -> int | Autoscaler:
-    """Return how many replicas a service needs, or the autoscaler that chooses the number.
-
-    Raises:
-        Refused: if the value of ``scaling.sizes.parameter`` is none of the sizes.
-    """
+    """Return how many replicas a service needs, or the autoscaler that chooses the number."""
     if scaling.autoscaler:
         return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
     if scaling.sizes:

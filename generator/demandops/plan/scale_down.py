@@ -25,11 +25,7 @@ def with_kept_replicas(
 ) -> tuple[Ledger, tuple[Instance, ...]]:
     """Return the updated ledger, and the service instances whose kept replicas changed.
 
-    ``keys`` are the keys of the releases that the demand may change. ``now`` is when the demand was
-    received.
-
-    Raises:
-        Refused: if a release cannot be planned in ``after``.
+    ``keys`` are the keys of the releases that the demand may change.
     """
     kept, changed = after.ledger.kept, list[Instance]()
     for key in keys:
@@ -62,7 +58,6 @@ def _number(release: ServiceRelease | None) -> int:
 
 
 def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
-    """Return the ledger without the steps of ``instance`` that have ended."""
     kept = world.ledger.kept
     steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
     return replace(world.ledger, kept=kept.replace(instance, steps))

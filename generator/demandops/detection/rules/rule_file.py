@@ -165,8 +165,8 @@ def read(text: str, file: str) -> RuleFile:
     """Return the rules in the text of a file.
 
     Raises:
-        InvalidInput: if the rules are not valid. The error has the faults that were found
-            together, each with its line. When they are mended, further ones may appear.
+        InvalidInput: with the faults that were found together, each with its line. When they are
+            mended, further ones may appear.
     """
     with located_in(text):
         rules = parse_file(RuleFile, text, file)

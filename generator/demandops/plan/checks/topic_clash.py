@@ -1,8 +1,8 @@
 """Topic clashes: a demand is refused if a node would have two sources of one topic.
 
-Topics are named as the reference names them, so two ids of nodes or applications may give the same
-topic, for example ``a/b`` and ``a-b``. A connection may also bring a topic to a node where a
-service publishes the same topic.
+A subscriber would mix the two, without an error. Topics are named as the reference names them, so
+two ids of nodes or applications may give the same topic, for example ``a/b`` and ``a-b``. A
+connection may also bring a topic to a node where a service publishes the same topic.
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def _publishers(
     # The output patterns of the definitions tell which instances would publish the topic. So only
     # these are looked up, and not the outputs of all services on the node.
     for services in world.config.services.values():
-        for name, service in services.items():
+        for service in services.values():
             for pattern in service.outputs.values():
                 first, *others = map(re.escape, pattern.split("{instance}"))
                 expression = first + "(.+)" + r"\1".join(others) if others else first
@@ -169,7 +169,7 @@ def _publishers(
                 if match is None:
                     continue
                 keys = (
-                    _keys_called(world, node, name, service, match[1], excluded)
+                    _keys_called(world, node, service, match[1], excluded)
                     if others
                     else _keys_on(world, node, service)
                 )
@@ -177,18 +177,14 @@ def _publishers(
 
 
 def _keys_called(
-    world: World,
-    node: str,
-    name: str,
-    service: Service,
-    instance: str,
-    excluded: ServiceKey | None,
+    world: World, node: str, service: Service, instance: str, excluded: ServiceKey | None
 ) -> Iterator[ServiceKey]:
     """Yield the keys of a service's instances on ``node`` that topic names show as ``instance``.
 
     Some of the instances may not run. The instance ``excluded`` may be left out.
     """
-    ledger, config, role = world.ledger, world.config, service.root
+    ledger, config = world.ledger, world.config
+    name, role = service.name, service.root
     if service.scope in ("node", "cluster"):
         if naming.topic_part(node) == instance:
             yield ServiceKey(name, node, for_cluster=service.scope == "cluster")

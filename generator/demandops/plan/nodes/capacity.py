@@ -67,11 +67,7 @@ def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return the growth of the services' requests when claims change.
-
-    Raises:
-        Refused: if an application definition that ``after`` needs is missing.
-    """
+    """Return the growth of the services' requests when claims change."""
     if not after.config.limits_capacity:
         return {}
     keys = affected_keys(before, after, changes)

@@ -101,11 +101,11 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
     """Yield (the demand's claim, route) for each connection of a demand that carries a flow."""
     for id in ledger.connections_bringing(flow.receiver, flow.target):
         claim = ledger.get(ClaimKey(Subject(SubjectKind.CONNECTION, id), demand))
-        for route in claim.connection.topics if claim else ():
-            assert claim is not None  # noqa: S101 - ``route`` comes from the claim
-            ends = route.sender_and_receiver(*claim.connection.nodes)
-            if (*ends, route.written_topic) == (flow.sender, flow.receiver, flow.target):
-                yield claim, route
+        if claim is not None:
+            for route in claim.connection.topics:
+                ends = route.sender_and_receiver(*claim.connection.nodes)
+                if (*ends, route.written_topic) == (flow.sender, flow.receiver, flow.target):
+                    yield claim, route
 
 
 def _carried_by(flow: Flow, carrier: Connection | None, claim: Claim, world: World) -> Claim:

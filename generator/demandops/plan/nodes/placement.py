@@ -7,7 +7,7 @@ stages treat both alike.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timezone
 from types import MappingProxyType
@@ -253,18 +253,6 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
     return ""
 
 
-def _unfit_named_nodes(item: Demanded, app: Application, world: World) -> Iterator[Fault]:
-    for name in app.named:
-        service = world.config.services.get(app.appdef, {}).get(name)
-        node = world.config.nodes.get(app.services[name])
-        if service and node and (lacking := list(lacks(node, requirement_of(service)))):
-            message = (
-                f"{quoted(node.id)} lacks {joined(lacking)}, which the service requires ('place' "
-                f"in {service.file}); name another node, or name none for this service"
-            )
-            yield item.fault(f"services.{name}", message, code="no-node")
-
-
 def _positions(request: DemandRequest) -> Positions:
     return request.positions if isinstance(request, Put) else {}
 
@@ -328,7 +316,15 @@ def _with_services(
         item = replace(item, held=replace(app, services=first.services))
         room.book([_claim(request, item)])
         return item, faults
-    faults += _unfit_named_nodes(item, app, world)
+    services = world.config.services.get(app.appdef, {})
+    for name in app.named:
+        named, definition = world.config.nodes.get(app.services[name]), services.get(name)
+        if named and definition and (lacking := [*lacks(named, requirement_of(definition))]):
+            message = (
+                f"{quoted(named.id)} lacks {joined(lacking)}, which the service requires ('place' "
+                f"in {definition.file}); name another node, or name none for this service"
+            )
+            faults.append(item.fault(f"services.{name}", message, code="no-node"))
     # A node that the demand named for a service and names no longer does not stay.
     no_longer_named = {
         name
@@ -336,7 +332,7 @@ def _with_services(
         if claim.demand == request.demand
         for name in claim.application.named
     }
-    stay = {*world.config.services.get(app.appdef, {})} - {*app.services} - no_longer_named
+    stay = {*services} - {*app.services} - no_longer_named
     booked = first.services if first else {}
     kept = {name: node for name, node in booked.items() if name in stay}
     item = replace(item, held=replace(app, services=MappingProxyType(kept | {**app.services})))

@@ -96,12 +96,8 @@ def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
     if app is None:
         return []
     definitions = world.config.services.get(app.appdef, {})
-    services = [
-        definitions[name]
-        for name, at in sorted(app.services.items())
-        if at == node and name in definitions
-    ]
-    return [*([None] if app.node == node else []), *services]
+    names = sorted(name for name, at in app.services.items() if at == node and name in definitions)
+    return [*([None] if app.node == node else []), *(definitions[name] for name in names)]
 
 
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
@@ -320,13 +316,14 @@ def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
         if (sender, route.read_topic) in inputs:
             continue
         target = (receiver, route.written_topic)
-        senders = set[str]()
-        for connection in map(ledger.connection, ledger.connections_bringing(*target)):
-            for other in connection.topics if connection else ():
-                assert connection is not None  # noqa: S101 - ``other`` comes from it
-                from_node, to_node = other.sender_and_receiver(*connection.nodes)
-                if (to_node, other.written_topic) == target:
-                    senders.add(from_node)
+        senders = {
+            from_node
+            for connection in map(ledger.connection, ledger.connections_bringing(*target))
+            if connection is not None
+            for other in connection.topics
+            for from_node, to_node in [other.sender_and_receiver(*connection.nodes)]
+            if (to_node, other.written_topic) == target
+        }
         for other_sender in senders - {sender}:
             topic = quoted(route.written_topic)
             words = f"{topic} would come from {quoted(sender)} and from {quoted(other_sender)}"

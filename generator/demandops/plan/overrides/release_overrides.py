@@ -54,9 +54,6 @@ def apply_effects(
 
     ``by`` has pairs of an override and the names of its effects on the release. The effects on
     images and Helm values are only recorded, in :attr:`ServiceRelease.shaping`.
-
-    Raises:
-        Refused: if an override moves the release to a node that is unknown or in no access domain.
     """
     by = tuple(by)
     if not by:

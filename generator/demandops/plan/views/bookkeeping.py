@@ -113,11 +113,6 @@ class Bookkeeping:
 
 
 def bookkeeping(world: World) -> Bookkeeping:
-    """Return what runs and who requests it.
-
-    Raises:
-        Refused: for the same reasons as :func:`demandops.plan.planner.plan`.
-    """
     active = without_suspended(world)
     services = {}
     for release in release_causes.releases(world):

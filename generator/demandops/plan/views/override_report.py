@@ -34,11 +34,7 @@ class Entry:
 
 
 def override_report(world: World, now: datetime) -> list[Entry]:
-    """Return an entry for every override, sorted by name.
-
-    Raises:
-        Refused: for the same reasons as :func:`demandops.plan.planner.plan`.
-    """
+    """Return an entry for every override, sorted by name."""
     if not world.config.overrides:
         return []
     releases = defaultdict[str, list[Release]](list)

@@ -47,11 +47,8 @@ class TracedPlan:
         """Plan the releases that the changes may affect; the first call plans all releases.
 
         ``kept`` are the service instances whose kept replicas changed. A release that does not run
-        any longer is ``None``.
-
-        Raises:
-            Refused: for the same reasons as :func:`demandops.plan.planner.plan`. Then this object
-                is out of date and must not be used again.
+        any longer is ``None``. If this raises ``Refused``, the plan is out of date and must not be
+        used again.
         """
         # The reads whose result may differ now.
         reads: set[_Read] = {_ALL, *kept}
