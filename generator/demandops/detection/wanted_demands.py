@@ -21,7 +21,7 @@ Purpose = Literal["start", "renew", "end"]
 
 # The fraction of a lease after which to renew it, so that time is left for more attempts.
 _RENEW_AFTER = 1 / 3
-# How many seconds until the next try if no node answered. A refused goal waits for its rule's
+# How many seconds until the next try if no node took the goal. A refused goal waits for its rule's
 # ``retry`` instead.
 _RETRY_S = 5.0
 # How many seconds until the next try while another event holds a demand with the same id.

@@ -33,8 +33,8 @@ from demandops.plan.nodes.choice import (
 )
 from demandops.quoting import quoted
 
-# The booking time of a claim that is not booked yet. It is later than any other booking time, so
-# such a claim never counts as the first on its application.
+# The booking time of a claim that is not booked yet. It is later than any other booking time, as
+# that of a new claim is, so ``merge: latest`` takes its parameters.
 _LAST = datetime.max.replace(tzinfo=timezone.utc)
 
 # Returns whether a request can be booked. All its applications have a node already.

@@ -61,7 +61,7 @@ def nodes_of(claim: Claim) -> tuple[str, ...]:
     held = claim.held
     if claim.is_on_application:
         sources = (topic.source for _, topic in claim.application.all_inputs())
-        delivered = (one.node for one in claim.application.deliver)
+        delivered = (delivery.node for delivery in claim.application.deliver)
         return tuple(sorted({*held.nodes, *sources, *delivered}))
     return tuple(sorted({*held.nodes, *filter(None, (claim.connection.broker,))}))
 

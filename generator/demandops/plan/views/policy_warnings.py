@@ -104,7 +104,7 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
         if node.host_network and node.id in config.domain_of
     ]
     nodes.sort(key=lambda pair: (pair[0], pair[1].id))
-    # A network policy of Kubernetes does not apply to pods on the host's network.
+    # Kubernetes applies a NetworkPolicy only to pods with their own network.
     for name, group in groupby(nodes, key=lambda pair: pair[0]):
         if config.domains[name].network == "namespace":
             ids = [node.id for _, node in group]

@@ -56,11 +56,13 @@ class TracedPlan:
             entries = index_entries(change.before), index_entries(change.after)
             reads |= {change.key.subject}.union(*entries)
         stale = {unit for read in reads for unit in self._readers.pop(read, ())}
+
+        def keys_needed(world: World, subject: Subject) -> tuple[ReleaseKey, ...]:
+            return tuple(keys_of(world, subject, strict=True))
+
         for subject in ledger.claims:
             if subject in stale or subject not in self._keys:
-                self._keys[subject] = self._traced(
-                    ledger, subject, lambda seen, of: tuple(keys_of(seen, of, strict=True))
-                )
+                self._keys[subject] = self._traced(ledger, subject, keys_needed)
         for subject in [unit for unit in stale if unit in self._keys]:
             if subject not in ledger.claims:
                 del self._keys[subject]
