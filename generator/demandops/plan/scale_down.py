@@ -45,7 +45,7 @@ def _steps(before: World, after: World, key: ServiceKey, recorded: Steps, now: d
     release = without_kept(after, key)
     kept_for = release.service.scaling.kept_for if release else None
     if release is None or kept_for is None:
-        return ()  # a service that nobody needs stops at once, and so does one without ``downAfter``
+        return ()  # a service that nobody needs stops at once, as does one without ``downAfter``
     try:
         old = without_kept(before, key)
     except Refused:  # the release before the demand can no longer be planned
