@@ -111,7 +111,7 @@ class EngineStep:
 
     def _look_at_counts(self) -> None:
         for rule in self._engine.rules.values():
-            if isinstance(rule, AreaRule) and rule.count:
+            if isinstance(rule, AreaRule):
                 self._latch_count(rule)
 
     def _lose_silent(self, who: Who, last: Observation) -> None:

@@ -39,10 +39,9 @@ class Usage:
     def of(self, node: str, resource: str) -> int:
         return self.amounts.get((node, resource)) or 0
 
-    def plus(self, more: Mapping[Need, int]) -> Usage:
-        """Return the usage with the amounts of ``more`` added; a negative amount lowers it."""
+    def plus(self, growth: Mapping[Need, int]) -> Usage:
         amounts = self.amounts
-        for need, amount in more.items():
+        for need, amount in growth.items():
             total = self.of(*need) + amount
             amounts = amounts.insert(need, total) if total else amounts.discard(need)
         return Usage(amounts)

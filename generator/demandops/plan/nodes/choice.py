@@ -7,7 +7,7 @@ chosen if it fits. If it does not fit, the best other node that fits is chosen.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import fsum, inf
 from types import MappingProxyType
 
@@ -28,7 +28,7 @@ from demandops.demand.demand_request import Demanded
 from demandops.errors import Fault, suggestion
 from demandops.ledger.world import World
 from demandops.plan.nodes.capacity import Room
-from demandops.plan.overrides.claim_overrides import moved_by_overrides
+from demandops.plan.overrides.claim_overrides import with_overridden_nodes
 from demandops.quoting import quoted
 
 _MOST_SHOWN = 5
@@ -44,10 +44,6 @@ NO_ROOM = "no-room"
 class Chosen:
     node: str
     why: str
-
-
-# The positions that a demand gives, by node id. A position in the inventory has precedence.
-Positions = Mapping[str, Position]
 
 
 def requirement_of(service: Service) -> Requirement:
@@ -68,10 +64,6 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
     else:
         app = replace(app, services=MappingProxyType({**app.services, service.name: node}))
     return with_overridden_nodes(app, world)
-
-
-def with_overridden_nodes(app: Application, world: World) -> Application:
-    return replace(app, moved=MappingProxyType(moved_by_overrides(app, world)))
 
 
 def shares(service: Service, one: Application, other: Application) -> bool:
@@ -98,6 +90,8 @@ class Choice:
     claims: tuple[Claim, ...]
     service: Service | None = None
     suits: Callable[[Application], bool] | None = None
+    # Those that the demand gives, by node id. A position in the inventory has precedence.
+    positions: Mapping[str, Position] = field(default_factory=dict)
 
     @property
     def config(self) -> Config:
@@ -115,14 +109,14 @@ class Choice:
             return False
         return not self._closed(entry) and self._is_permitted(entry)
 
-    def candidates(self, positions: Positions) -> Iterator[Chosen]:
+    def candidates(self) -> Iterator[Chosen]:
         """Yield the nodes that fit, have room and pass :attr:`suits`, the best first.
 
         The choice ends early if the demand cannot be booked on :data:`MOST_TRIED` nodes.
         """
         fitting = self._fitting()
-        centre = self._centre(positions)
-        fitting.sort(key=lambda node: self._rank(node, centre, positions))
+        centre = self._centre()
+        fitting.sort(key=lambda node: self._rank(node, centre))
         skipped: dict[str, None] = {}
         tried = 0
         least: Mapping[str, int] | None = None
@@ -148,7 +142,7 @@ class Choice:
                 merit = f"the one with the {'most' if choose == 'pack' else 'fewest'} applications"
                 if self._is_home(node):
                     merit = "the node of its application"
-                elif choose == "nearest" and self._distance(node, centre, positions) < inf:
+                elif choose == "nearest" and self._distance(node, centre) < inf:
                     merit = "the nearest to its sources"
                 only = f", counting only nodes {' and '.join(skipped)}" if skipped else ""
                 why = f"{merit} among {len(fitting)} nodes that fit{only}"
@@ -199,10 +193,8 @@ class Choice:
         # A service on its application's node needs no connection to it.
         return self.service is not None and node.id == self.app.node
 
-    def _rank(
-        self, node: Node, centre: Position | None, positions: Positions
-    ) -> tuple[bool, float, float, str]:
-        distance = self._distance(node, centre, positions)
+    def _rank(self, node: Node, centre: Position | None) -> tuple[bool, float, float, str]:
+        distance = self._distance(node, centre)
         booked = self.world.ledger.applications_on.get(node.id) or 0
         booked += self.room.newly_placed[node.id]
         away = not self._is_home(node)
@@ -214,25 +206,25 @@ class Choice:
                 return away, -booked, distance, node.id
         return away, distance, booked, node.id
 
-    def _distance(self, node: Node, centre: Position | None, positions: Positions) -> float:
-        position = self._position(node.id, positions)
+    def _distance(self, node: Node, centre: Position | None) -> float:
+        position = self._position(node.id)
         if centre is None or position is None:
             return inf
         # Squared, because every machine computes this alike.
         return (position.x - centre.x) ** 2 + (position.y - centre.y) ** 2
 
-    def _centre(self, positions: Positions) -> Position | None:
+    def _centre(self) -> Position | None:
         """Return the middle of the sources whose position is known; ``None`` if none is known."""
         sources = sorted({topic.source for _, topic in self.app.all_inputs()})
-        placed = [at for source in sources if (at := self._position(source, positions))]
+        placed = [at for source in sources if (at := self._position(source))]
         if not placed:
             return None
         x, y = (fsum(getattr(at, axis) for at in placed) / len(placed) for axis in "xy")
         return Position(x=x, y=y)
 
-    def _position(self, node: str, positions: Positions) -> Position | None:
+    def _position(self, node: str) -> Position | None:
         entry = self.config.nodes.get(node)
-        return (entry.position if entry else None) or positions.get(node)
+        return (entry.position if entry else None) or self.positions.get(node)
 
     def _closed(self, node: Node) -> str:
         """Return why a node accepts no application at all, or an empty text."""
@@ -243,7 +235,7 @@ class Choice:
     def _is_permitted(self, node: Node) -> bool:
         return permission.may_place(self.item, self.app.appdef, node.id, self.config)
 
-    def none_fits(self, positions: Positions) -> Fault:
+    def none_fits(self) -> Fault:
         """Return the fault for an application or a service that gets no node.
 
         Call this only if :meth:`candidates` yields no node. The fault lists some nodes and what
@@ -251,7 +243,7 @@ class Choice:
         """
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
-        centre, code = self._centre(positions), "no-node"
+        centre, code = self._centre(), "no-node"
         misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
         places = {self.config.place_of(NODES_FILE): None}
         for node in self.config.nodes_by_role.get(self.requirement.role, ()):
@@ -270,7 +262,7 @@ class Choice:
                 reasons.append("meets the requirement, but the demand would be refused there")
             text = f"'{node.id}' {joined(reasons)}"
             count = len(missing) + len(reasons) - bool(missing)
-            misses.append((count, self._rank(node, centre, positions), text))
+            misses.append((count, self._rank(node, centre), text))
         shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
         hidden = len(misses) - len(shown)
         more = [f"{hidden} more {'are' if hidden > 1 else 'is'} not shown"] if hidden else []

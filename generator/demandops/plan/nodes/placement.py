@@ -23,14 +23,13 @@ from demandops.plan.nodes.capacity import Room, Usage
 from demandops.plan.nodes.choice import (
     Choice,
     Chosen,
-    Positions,
     joined,
     lacks,
     on_node,
     requirement_of,
     shares,
-    with_overridden_nodes,
 )
+from demandops.plan.overrides.claim_overrides import with_overridden_nodes
 from demandops.quoting import quoted
 
 # The booking time of a claim that is not booked yet. It is later than any other booking time, as
@@ -146,6 +145,7 @@ def _placed(
 
         return can_be_booked
 
+    positions = request.positions if isinstance(request, Put) else {}
     # The choices follow one another. What is chosen first is not changed for the sake of what comes
     # later, and after the first failure no more is tried.
     for index, item in enumerate(demanded):
@@ -154,7 +154,8 @@ def _placed(
                 return request, faults
             checkpoint()
             claims = (_claim(request, item),)
-            choice = Choice(item, item.held.place, world, room, claims, suits=suits(index))
+            place = item.held.place
+            choice = Choice(item, place, world, room, claims, None, suits(index), positions)
             placed = _with_node(request, item, choice)
             if isinstance(placed, Fault):
                 faults.append(placed)
@@ -230,8 +231,7 @@ def _with_node(request: DemandRequest, item: Demanded, choice: Choice) -> Demand
         return item.fault("place", message, code="no-node")
     chosen = _booked(choice, request.demand)
     if chosen is None:
-        positions = _positions(request)
-        chosen = next(choice.candidates(positions), None) or choice.none_fits(positions)
+        chosen = next(choice.candidates(), None) or choice.none_fits()
     if isinstance(chosen, Fault):
         return chosen
     placed = f"application '{app.id}' is placed on {quoted(chosen.node)}, {chosen.why}"
@@ -251,10 +251,6 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
             if claim.application.inputs_from(role, topic.source, topic.topic):
                 return other.chosen_node(service.name)
     return ""
-
-
-def _positions(request: DemandRequest) -> Positions:
-    return request.positions if isinstance(request, Put) else {}
 
 
 def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
@@ -336,17 +332,18 @@ def _with_services(
     booked = first.services if first else {}
     kept = {name: node for name, node in booked.items() if name in stay}
     item = replace(item, held=replace(app, services=MappingProxyType(kept | {**app.services})))
+    positions = request.positions if isinstance(request, Put) else {}
     for service in _services_to_place(app, world):
         claims = (_claim(request, item),)
-        choice = Choice(item, requirement_of(service), world, room, claims, service, suits)
+        required = requirement_of(service)
+        choice = Choice(item, required, world, room, claims, service, suits, positions)
         here, shared = booked.get(service.name, ""), _shared_node(choice.app, service, world)
         chosen: Chosen | Fault = Chosen(here, "where it is booked already")
         if not here or (here != shared and not choice.fits(here)):
-            positions = _positions(request)
             chosen = (
                 choice.chosen(shared, "where the service already runs for this topic")
-                or next(choice.candidates(positions), None)
-                or choice.none_fits(positions)
+                or next(choice.candidates(), None)
+                or choice.none_fits()
             )
         if isinstance(chosen, Fault):
             faults.append(chosen)

@@ -35,10 +35,9 @@ from demandops.plan.nodes.choice import (
     on_node,
     requirement_of,
     shares,
-    with_overridden_nodes,
 )
 from demandops.plan.nodes.moved_connections import Move, renaming, with_moved
-from demandops.plan.overrides.claim_overrides import suspended_by
+from demandops.plan.overrides.claim_overrides import suspended_by, with_overridden_nodes
 from demandops.plan.release_keys import affected_keys
 from demandops.quoting import quoted
 from demandops.subject import Subject, SubjectKind
@@ -157,7 +156,7 @@ def _moved(
     reasons: list[str] = []
     # On the sender's own node, no connection would rename the topic.
     renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
-    for chosen in islice(choice.candidates({}), MOST_TRIED):
+    for chosen in islice(choice.candidates(), MOST_TRIED):
         if route := renamed.get(chosen.node):
             problem = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
             reasons.append(f"on {quoted(chosen.node)} {problem}")
@@ -170,7 +169,7 @@ def _moved(
             keys = [change.key for change in changes]
             return (after, chosen, keys, moved_names), len(reasons) + 1
         reasons.append(f"on {quoted(chosen.node)} {fault.message}")
-    return sentences(reasons) or choice.none_fits({}).message, len(reasons)
+    return sentences(reasons) or choice.none_fits().message, len(reasons)
 
 
 @dataclass(frozen=True, slots=True)

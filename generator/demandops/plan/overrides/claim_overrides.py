@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
+from types import MappingProxyType
 
 from demandops.config.config import Config
 from demandops.config.override import Override, Selector
@@ -42,8 +43,8 @@ class Traits:
     service: str = ""
 
 
-def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
-    """Return the new nodes of the services that overrides move, by the name of the service."""
+def with_overridden_nodes(app: Application, world: World) -> Application:
+    """Return an application with its services moved to the nodes that overrides name."""
     moving = [override for override in world.overrides if override.node]
     nodes: dict[str, str] = {}
     for service in world.config.services.get(app.appdef, {}).values() if moving else ():
@@ -55,7 +56,7 @@ def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
             for override in moving:
                 if override.node and selects(override, traits, world.config):
                     nodes[service.name] = override.node
-    return nodes
+    return replace(app, moved=MappingProxyType(nodes))
 
 
 def traits_of(item: Claim | Demanded) -> Traits:

@@ -6,7 +6,7 @@ whenever it is shown, and is stored nowhere.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -252,8 +252,8 @@ class EntryChange:
 
 def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
     return (
-        *_changes("service", dict(old.services), dict(new.services)),
-        *_changes("connection", dict(old.connections), dict(new.connections)),
+        *_changes("service", old.services, new.services),
+        *_changes("connection", old.connections, new.connections),
     )
 
 
@@ -261,7 +261,7 @@ _Entry = ServiceEntry | ConnectionEntry
 
 
 def _changes(
-    kind: Literal["service", "connection"], old: dict[str, _Entry], new: dict[str, _Entry]
+    kind: Literal["service", "connection"], old: Mapping[str, _Entry], new: Mapping[str, _Entry]
 ) -> Iterator[EntryChange]:
     for name in sorted({*old, *new}):
         if name not in new:
@@ -276,7 +276,6 @@ def _changes(
 
 
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    """Yield the facts about ``entry``; the caller compares them with the facts about ``other``."""
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
         yield f"from {entry.source} to {entry.target}"
