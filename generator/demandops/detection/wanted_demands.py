@@ -26,10 +26,10 @@ _RENEW_AFTER = 1 / 3
 _RETRY_S = 5.0
 # How many seconds until the next try while another event holds a demand with the same id.
 _OTHER_S = 0.2
-# The codes of outcomes in which no node accepted the goal.
-_NOT_ACCEPTED = frozenset({"no-server", "rejected"})
 # The code if nobody knows whether the node booked the goal.
 _UNKNOWN = "timeout"
+# The codes of outcomes in which no node took the goal, as far as is known.
+_NOT_TAKEN = frozenset({"no-server", "rejected", _UNKNOWN})
 
 
 @dataclass(frozen=True, slots=True)
@@ -167,8 +167,7 @@ class WantedDemands:
             # The node may have booked the goal, so it must be ended if it is wanted no longer.
             if outcome.code == _UNKNOWN and is_start:
                 entry.held, entry.is_sure = sending.goal, False
-            is_away = outcome.code in {*_NOT_ACCEPTED, _UNKNOWN}
-            entry.not_before = now + (_RETRY_S if is_away else entry.retry_s)
+            entry.not_before = now + (_RETRY_S if outcome.code in _NOT_TAKEN else entry.retry_s)
             text = outcome.message if outcome.message != entry.refusal else ""
             entry.refusal = outcome.message
         elif sending.purpose == "end" or is_over:

@@ -82,14 +82,14 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     parts = list(_parts(world, service, key, apps))
     inputs: dict[str, tuple[InputTopic, ...]] = {}
     for role in sorted(service.inputs):
-        published = {
+        read = {
             published.topic
             for part in parts
             for published in topics_of_origin(config, part, _origin(config, key, role, part))
         }
         # Only some demands name the message type of a topic. An entry without the type sorts first,
         # so the entry with the type replaces it here.
-        inputs[role] = tuple({topic[:2]: topic for topic in sorted(published)}.values())
+        inputs[role] = tuple({topic[:2]: topic for topic in sorted(read)}.values())
     # If claims have several values of a parameter, the definition says how they are merged.
     parameters: dict[str, object] = {}
     for name, parameter in sorted(service.parameters.items()):

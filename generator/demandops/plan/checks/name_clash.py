@@ -36,6 +36,8 @@ Names: TypeAlias = "HashTrieMap[Name, HashTrieSet[ReleaseKey]]"
 
 NONE: Names = HashTrieMap()
 
+_REMEDY = "use another id, or wait until the other is released"
+
 
 def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
     """Yield the names that only the release at ``key`` may have."""
@@ -55,7 +57,7 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
 
 
 def all_names(world: World) -> Names:
-    """This takes time for a large ledger."""
+    """Return the names of all releases. This takes time for a large ledger."""
     keys = (key for claims in world.ledger.claims.values() for key in keys_of_claims(world, claims))
     return with_keys(NONE, world, dict.fromkeys(keys))
 
@@ -148,9 +150,6 @@ def refuse_shared_names(world: World, keys: Iterable[ReleaseKey]) -> None:
 def _message(key: ReleaseKey, name: Name, other: ReleaseKey) -> str:
     needed = f"the {' '.join(name)}, which belongs to {words(other)}"
     return f"{words(key)} needs {needed}; {_REMEDY}"
-
-
-_REMEDY = "use another id, or wait until the other is released"
 
 
 def _located(message: str, request: DemandRequest, claim: ClaimKey | None) -> Fault:

@@ -205,7 +205,7 @@ def _keys_called(
 
 
 def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Some of the instances may not run."""
+    """Yield the keys of a service's instances on a node; some of them may not run."""
     name = service.name
     if service.scope == "cluster":
         yield ServiceKey(name, node, for_cluster=True)
@@ -229,7 +229,7 @@ def words(key: ReleaseKey) -> str:
 def _remedy(
     key: ServiceKey, other: ServiceKey | None, service: Service, output: str, config: Config
 ) -> str:
-    """``other`` is ``None`` if the clash is with a connection."""
+    """Return how to resolve a clash; ``other`` is ``None`` if it is with a connection."""
     is_named = "{instance}" in service.outputs[output]
     is_of_same = (
         other is not None

@@ -174,9 +174,8 @@ def _moved(
 
 @dataclass(frozen=True, slots=True)
 class LedgerAfterMoves:
-    """``keys`` are the keys of the claims that may have changed."""
-
     ledger: Ledger
+    # those of the claims that may have changed
     keys: tuple[ClaimKey, ...]
     # (file, message) for each override that cannot move a service of an application
     stays: tuple[tuple[str, str], ...]
