@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from demandops.detection.events.detection_state import Key
@@ -13,27 +13,22 @@ from demandops.detection.rules.rule_file import RuleFile
 def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, Goal]:
     """Return each event whose demand is booked or waits for room, with a goal that can end it.
 
-    Args:
-        file: the rules.
-        bookkeeping: the bookkeeping as ``demandops bookkeeping --output json`` prints it.
+    ``bookkeeping`` has the form that ``demandops bookkeeping --output json`` prints.
     """
-    found: dict[Key, Goal] = {}
-    for booked in _demands(bookkeeping):
+    demands = []
+    for id, entry in bookkeeping.get("demands", {}).items():
+        own_id = id if entry["action"] == "Demand" else ""
+        demands.append(BookedDemand(own_id, entry["request"], tuple(entry["requesters"])))
+    for entry in bookkeeping.get("waiting", ()):
+        demands.append(BookedDemand(entry["demand"], "", tuple(entry["requesters"])))
+    goals: dict[Key, Goal] = {}
+    for demand in demands:
         for rule in file.rules:
-            values = rule.template.subjects_of(booked, rule.subjects, rule.name)
+            values = rule.template.subjects_of(demand, rule.subjects, rule.name)
             if values is not None:
                 subjects = tuple(str(values[name]) for name in rule.subjects)
                 if rule.is_for(*subjects):
                     goal = rule.template.outline({"rule": rule.name, **values})
-                    found[rule.name, subjects] = goal
+                    goals[rule.name, subjects] = goal
                     break
-    return found
-
-
-def _demands(bookkeeping: Mapping[str, Any]) -> Iterator[BookedDemand]:
-    """Yield the demands that hold something, and those that wait for room."""
-    for id, entry in bookkeeping.get("demands", {}).items():
-        own_id = id if entry["action"] == "Demand" else ""
-        yield BookedDemand(own_id, entry["request"], tuple(entry["requesters"]))
-    for entry in bookkeeping.get("waiting", ()):
-        yield BookedDemand(entry["demand"], "", tuple(entry["requesters"]))
+    return goals

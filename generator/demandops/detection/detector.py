@@ -13,7 +13,7 @@ from demandops.config.durations import seconds_of
 from demandops.detection.events.detection_state import Event, Key, Observation
 from demandops.detection.events.event_engine import EventEngine
 from demandops.detection.rules.rule_demand import Goal
-from demandops.detection.rules.rule_file import Rule, RuleFile
+from demandops.detection.rules.rule_file import RuleFile
 from demandops.detection.rules.rule_template import Values
 
 
@@ -32,8 +32,6 @@ class Want:
 
 
 class Detector:
-    """The rules in effect, the entities that were seen, and the events that have not ended."""
-
     def __init__(self, file: RuleFile, now: float) -> None:
         self.file = file
         self._rules = {rule.name: rule for rule in file.rules}
@@ -43,7 +41,6 @@ class Detector:
 
     @property
     def lasting(self) -> frozenset[Key]:
-        """The events that have started and not stopped."""
         return self._state.lasting
 
     @property
@@ -54,31 +51,22 @@ class Detector:
     def resume(self, booked: Mapping[Key, Goal], now: float, settle_s: float) -> list[Want]:
         """Continue the events whose demands were booked before the detector started.
 
-        Call this before the first step, because it forgets what steps have found.
+        Call this before the first step, because it forgets what steps have found. ``booked`` has a
+        goal for each event, which may lack everything except the demand's id and requesters. The
+        events' entities count as gone if they stay unseen for ``settle_s`` seconds, or for the
+        timeout of their source if that is longer.
 
-        Args:
-            booked: each event, with its demand as a goal. The goal may lack everything except the
-                demand's id and requesters.
-            now: the time.
-            settle_s: how many seconds the events' entities may stay unseen until they count as
-                gone. If their source's timeout is longer, the timeout counts instead.
-
-        Returns:
-            What each event wants: its demand or, if no rule is for the event any longer, the end of
-            its demand.
+        Return what each event wants: its demand or, if no rule is for the event any longer, the end
+        of its demand.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting
         return [self._want(key, goal if key in lasting else None) for key, goal in booked.items()]
 
     def step(self, observations: Iterable[Observation], now: float) -> list[tuple[Event, Want]]:
-        """Apply observations and the time that has passed.
-
-        Returns:
-            The events that start or stop, each with what it wants.
-        """
+        """Return the events that start or stop by now, each with what it wants."""
         self._state, events = self._engine.step(self._state, observations, now)
-        found = []
+        wants = []
         for event in events:
             goal = None
             if event.starts:
@@ -86,23 +74,19 @@ class Detector:
                 goal = self._rules[event.rule].template.goal(event.values)
             else:
                 self._values.pop(event.key, None)
-            found.append((event, self._want(event.key, goal)))
-        return found
+            wants.append((event, self._want(event.key, goal)))
+        return wants
 
     def set_clock(self, seconds: float) -> None:
-        """Shift all recorded times, because the clock was set forward by ``seconds``.
-
-        ``seconds`` is negative if the clock was set back.
-        """
+        """Shift all recorded times, because the clock was set forward by ``seconds``, or back."""
         self._state = self._state.shifted(seconds)
 
     def replace_rules(self, file: RuleFile, now: float, settle_s: float) -> list[Want]:
         """Replace the rules; return what changes for the events that have not ended.
 
         An event ends if its rule is gone or is no longer for its entities. If the rule has changed,
-        the event wants the goal of the changed rule. If the template of the changed rule needs a
-        value that is not known, the event keeps its goal. Dwell times begin anew. As in
-        :meth:`resume`, the entities of lasting events count as gone if unseen for ``settle_s``.
+        the event wants the goal of the changed rule. Dwell times begin anew. As in :meth:`resume`,
+        the entities of lasting events count as gone if unseen for ``settle_s``.
         """
         before, old = self._state.lasting, self._rules
         self.file, self._engine = file, EventEngine(file)
@@ -110,20 +94,19 @@ class Detector:
         self._state = self._engine.start(now, sorted(before), settle_s)
         changed = []
         for key in sorted(before):
+            name, subjects = key
             if key not in self._state.lasting:
                 self._values.pop(key, None)
                 changed.append(Want(key, None))
-            elif old[key[0]] != self._rules[key[0]]:
-                values = self._values_of(self._rules[key[0]], key)
-                if values is not None:
-                    changed.append(self._want(key, self._rules[key[0]].template.goal(values)))
+            elif old[name] != self._rules[name]:
+                rule = self._rules[name]
+                entities = dict(zip(rule.subjects, subjects, strict=True))
+                values: Values = {**self._values.get(key, {}), "rule": name, **entities}
+                # After a restart, the values at the start of an event are not known, for example
+                # ``distance``. An event whose new demand needs such a value keeps the old one.
+                if rule.template.names() <= set(values):
+                    changed.append(self._want(key, rule.template.goal(values)))
         return changed
-
-    def _values_of(self, rule: Rule, key: Key) -> Values | None:
-        """Return the values for the rule's template; ``None`` if a value is not known."""
-        named = dict(zip(rule.subjects, key[1], strict=True))
-        values: Values = {**self._values.get(key, {}), "rule": rule.name, **named}
-        return values if rule.template.names() <= set(values) else None
 
     def _want(self, key: Key, goal: Goal | None) -> Want:
         rule = self._rules.get(key[0])

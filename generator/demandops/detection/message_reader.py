@@ -26,28 +26,21 @@ class Unreadable(Exception):
 
 
 class MessageReader:
-    """Reads the messages of one source."""
+    """Reads the messages of one source, and of these only the fields that rules need."""
 
     def __init__(self, file: RuleFile, source: str) -> None:
-        """Make a reader for the messages of ``source``.
-
-        It reads only the fields that the source and the rules in ``file`` need.
-        """
         definition = file.sources[source]
         self._source = source
         self._entity = definition.entity and _getter(definition.entity)
         self._position = definition.position and tuple(map(_getter, definition.position))
-        limits = (rule.threshold for rule in file.rules)
-        fields = {one.field for one in limits if one is not None and one.source == source}
+        thresholds = (rule.threshold for rule in file.rules)
+        fields = {limits.field for limits in thresholds if limits and limits.source == source}
         self._fields = {field: _getter(field) for field in sorted(fields)}
 
     def observation(self, message: Any, entity: str, at: float) -> Observation:  # noqa: ANN401
-        """Return what a message reports, as an observation.
+        """Return what a message, which arrived at the time ``at``, reports.
 
-        Args:
-            message: the message.
-            entity: the entity that the topic names; empty if a field of the message names it.
-            at: the time at which the message arrived.
+        ``entity`` is the entity that the topic names; it is empty if a field of the message does.
 
         Raises:
             Unreadable: if a field is missing, a number is missing or not finite, a position is too

@@ -3,9 +3,6 @@
 This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports the
 outcome. Each event has at most one goal under way. If an event ends before its demand was sent,
 nothing is sent for it.
-
-After a rule is renamed, an event of the old name and an event of the new name may want demands with
-the same id. The second event then waits until the first event has ended its demand.
 """
 
 from __future__ import annotations
@@ -22,21 +19,21 @@ from demandops.detection.rules.rule_demand import Goal
 
 Purpose = Literal["start", "renew", "end"]
 
+# The fraction of a lease after which to renew it, so that time is left for more attempts.
 _RENEW_AFTER = 1 / 3
-"""The fraction of a lease after which to renew it, so that time is left for more attempts."""
+# How many seconds until the next try if no node took the goal. A refused goal waits for its rule's
+# ``retry`` instead.
 _RETRY_S = 5.0
+# How many seconds until the next try while another event holds a demand with the same id.
 _OTHER_S = 0.2
-"""How many seconds until the next try while another event holds a demand with the same id."""
-_NOT_ACCEPTED = frozenset({"no-server", "rejected"})
-"""The codes of outcomes in which no node accepted the goal."""
+# The code if nobody knows whether the node booked the goal.
 _UNKNOWN = "timeout"
-"""The code if nobody knows whether the node booked the goal."""
+# The codes of outcomes in which no node took the goal, as far as is known.
+_NOT_TAKEN = frozenset({"no-server", "rejected", _UNKNOWN})
 
 
 @dataclass(frozen=True, slots=True)
 class Sending:
-    """A goal to send for an event."""
-
     key: Key
     purpose: Purpose
     goal: Goal
@@ -74,21 +71,22 @@ class _Entry:
 
     def next(self, now: float) -> tuple[Purpose, Goal] | None:
         """Return the goal to send at ``now`` and its purpose, or ``None``."""
+        wanted, held = self.wanted, self.held
         if self.is_under_way or now < self.not_before:
             return None
-        if self.held is not None and (self.wanted is None or not self._replaces(self.held)):
-            return "end", self.held.ended()
-        if self.wanted is None:
+        if held is not None:
+            # A ``Demand`` replaces the one with its id. Any other held demand is ended first.
+            is_replaced = wanted is not None and (
+                wanted == held
+                or (wanted.action == held.action == "demand" and wanted.id == held.id)
+            )
+            if not is_replaced:
+                return "end", held.ended()
+        if wanted is None:
             return None
-        if self.wanted != self.held or not self.is_sure:
-            return "start", self.wanted
-        return ("renew", self.wanted.renewed()) if now >= self.renew_at else None
-
-    def _replaces(self, held: Goal) -> bool:
-        """Return whether the wanted goal can be sent without ending the held demand first."""
-        assert self.wanted is not None  # noqa: S101 - callers check this before
-        is_put = self.wanted.action == held.action == "demand" and self.wanted.id == held.id
-        return is_put or self.wanted == held
+        if wanted != held or not self.is_sure:
+            return "start", wanted
+        return ("renew", wanted.renewed()) if now >= self.renew_at else None
 
     def due(self) -> float:
         """Return the time from which :meth:`next` may have a goal to send.
@@ -102,8 +100,6 @@ class _Entry:
 
 
 class WantedDemands:
-    """For each event, the demand that it wants and the demand that it holds."""
-
     def __init__(self) -> None:
         self._entries: dict[Key, _Entry] = {}
         self._owners: dict[str, Key] = {}  # which event has a demand id
@@ -111,7 +107,6 @@ class WantedDemands:
         self._number = 0
 
     def want(self, want: Want) -> None:
-        """Record the goal that an event wants now; ``None`` ends the event's demand."""
         entry = self._entries.setdefault(want.key, _Entry())
         entry.wanted, entry.not_before, entry.refusal = want.goal, -inf, ""
         entry.retry_s, entry.renew_s = want.retry_s, want.renew_s
@@ -120,10 +115,10 @@ class WantedDemands:
     def hold(self, key: Key, goal: Goal) -> None:
         """Record that a demand was booked before the detector started.
 
-        The caller then calls :meth:`want` for the same event. If the event still wants the demand,
-        the next goal renews the demand, because nobody knows how much time its lease has left.
+        The caller then calls :meth:`want` for the same event.
         """
         entry = self._entries.setdefault(key, _Entry())
+        # Nobody knows how much time its lease has left, so it is renewed at once.
         entry.held, entry.renew_at = goal, -inf
         self._reserve(key, goal)
         self._enqueue(key, entry)
@@ -136,19 +131,20 @@ class WantedDemands:
         while self._queue and self._queue[0][0] <= now:
             _, _, key = heappop(self._queue)
             entry = self._entries.get(key)
-            if entry is not None and (found := entry.next(now)):
-                if self._reserve(key, found[1]):
+            if entry is not None and (due := entry.next(now)):
+                purpose, goal = due
+                if self._reserve(key, goal):
                     entry.is_under_way = True
-                    return Sending(key, *found)
+                    return Sending(key, purpose, goal)
                 entry.not_before = now + _OTHER_S
                 self._enqueue(key, entry)
         return None
 
     def _reserve(self, key: Key, goal: Goal) -> bool:
-        """Reserve the demand id of a goal for an event; return false if another event has the id.
-
-        A ``DeploymentRequest`` has no demand id, so nothing is reserved and the result is true.
-        """
+        """Reserve the demand id of a goal for an event; return false if another event has it."""
+        # After a rule is renamed, an event of the old name and an event of the new name may want
+        # demands with the same id. The second then waits until the first has ended its demand.
+        # A ``DeploymentRequest`` has no demand id, so there is nothing to reserve.
         return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
 
     def next_at(self) -> float:
@@ -159,40 +155,32 @@ class WantedDemands:
         return self._queue[0][0] if self._queue else inf
 
     def answered(self, sending: Sending, outcome: Outcome, now: float) -> str:
-        """Record the outcome of a goal.
+        """Record the outcome of a goal; return the reason of a failure, for the log.
 
-        Returns:
-            The reason of a failure, for the log. The text is empty if the goal succeeded, if the
-            previous attempt failed for the same reason, or if the demand to end or renew is not
-            held any longer.
+        The text is empty if the goal succeeded, if the previous attempt failed for the same reason,
+        or if the demand to end or renew is not held any longer.
         """
-        entry = self._entries[sending.key]
+        entry, text, is_start = self._entries[sending.key], "", sending.purpose == "start"
         entry.is_under_way = False
-        text = self._record(entry, sending, outcome, now)
+        is_over = outcome.code == "not-held" and not is_start
+        if outcome.code and not is_over:
+            # The node may have booked the goal, so it must be ended if it is wanted no longer.
+            if outcome.code == _UNKNOWN and is_start:
+                entry.held, entry.is_sure = sending.goal, False
+            entry.not_before = now + (_RETRY_S if outcome.code in _NOT_TAKEN else entry.retry_s)
+            text = outcome.message if outcome.message != entry.refusal else ""
+            entry.refusal = outcome.message
+        elif sending.purpose == "end" or is_over:
+            entry.held, entry.is_sure, entry.refusal = None, True, ""
+        else:
+            if is_start:
+                entry.held, entry.is_sure = sending.goal, True
+            pause = outcome.lease_s * _RENEW_AFTER or entry.renew_s
+            entry.renew_at, entry.refusal = now + pause if pause else inf, ""
         if entry.held is None and self._owners.get(sending.goal.id) == sending.key:
             del self._owners[sending.goal.id]
         self._enqueue(sending.key, entry)
         return text
-
-    def _record(self, entry: _Entry, sending: Sending, outcome: Outcome, now: float) -> str:
-        is_over = outcome.code == "not-held" and sending.purpose != "start"
-        if outcome.code and not is_over:
-            if outcome.code == _UNKNOWN and sending.purpose == "start":
-                entry.held, entry.is_sure = sending.goal, False
-            is_away = outcome.code in {*_NOT_ACCEPTED, _UNKNOWN}
-            entry.not_before = now + (_RETRY_S if is_away else entry.retry_s)
-            is_new = outcome.message != entry.refusal
-            entry.refusal = outcome.message
-            return f"{outcome.message}" if is_new else ""
-        entry.refusal = ""
-        if sending.purpose == "end" or is_over:
-            entry.held, entry.is_sure = None, True
-            return ""
-        if sending.purpose == "start":
-            entry.held, entry.is_sure = sending.goal, True
-        pause = outcome.lease_s * _RENEW_AFTER or entry.renew_s
-        entry.renew_at = now + pause if pause else inf
-        return ""
 
     def _enqueue(self, key: Key, entry: _Entry) -> None:
         if entry.wanted is None and entry.held is None and not entry.is_under_way:
@@ -207,8 +195,8 @@ class WantedDemands:
         return len(self._entries)
 
     def unanswered(self) -> int:
-        """Return how many events have a demand that is still to be booked or released."""
-        return sum(one.wanted != one.held or not one.is_sure for one in self._entries.values())
+        entries = self._entries.values()
+        return sum(entry.wanted != entry.held or not entry.is_sure for entry in entries)
 
     def refusals(self) -> Iterator[tuple[Key, str]]:
         """Yield the events whose last goal failed, and why."""

@@ -6,7 +6,8 @@ usual topic for an input role: the topic in the source's inventory entry or, if 
 first topic that a demand booked. Any other topic is a further topic of the source. A name that is
 made from a further topic contains the source and this topic. If the inventory names no usual topic,
 the claims record which topics are further topics. So a name stays the same while anybody demands
-the topic and nobody changes the usual topic in the inventory.
+the topic and nobody changes the usual topic in the inventory. The reference's programs subscribe to
+outputs by name: with other names, they would hear nothing, without an error.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from demandops.plan.release import ServiceKey
 def outputs(
     config: Config, service: Service, key: ServiceKey, *, further: bool = False
 ) -> dict[str, str]:
-    """Return the topics that a service instance publishes, as a map from output name to topic.
+    """Return the topics that a service instance publishes, by the name of the output.
 
     ``further`` is true if the instance runs for a further topic of a source. It is ignored if the
     inventory names the usual topic.
@@ -35,49 +36,36 @@ def outputs(
     if service.root is None:
         instance = naming.topic_part(key.application or key.node)
     else:
-        input = InputTopic(str(key.topic), str(key.source), further=further)
-        instance = instance_of(config, service.root, input, key.version)
+        topic = InputTopic(str(key.topic), str(key.source), further=further)
+        text = distinguishing_text(config, service.root, topic, key.version)
+        instance = naming.topic_part(topic.source, text)
     return {
         name: topic_name(pattern, instance) for name, pattern in sorted(service.outputs.items())
     }
 
 
-def instance_of(config: Config, role: str, topic: InputTopic, version: str = "") -> str:
-    """Return the text that replaces ``{instance}`` for the service instance that reads ``topic``.
-
-    ``version`` is the version of a separate instance; it is empty for any other application.
-    """
-    return naming.topic_part(topic.source, distinguishing_text(config, role, topic, version))
-
-
 def distinguishing_text(config: Config, role: str, topic: InputTopic, version: str) -> str:
     """Return the text that makes topic names differ although their source is the same.
 
-    The text contains ``topic`` if ``topic`` is a further topic of its source. The text also
-    contains ``version``, which may be empty.
+    It contains ``topic`` if this is a further topic of its source, and ``version``.
     """
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
     return topic.distinguishing_text(further, version)
 
 
+# A fusion reads hundreds of such topics, and each demand plans the fusion again.
 @lru_cache(maxsize=65_536)
 def published_topic(pattern: str, source: str, distinguishing: str) -> InputTopic:
-    """Return the topic that a service publishes for ``source``.
-
-    ``distinguishing`` is the result of :func:`distinguishing_text`. A fusion reads hundreds of such
-    topics, so the results are cached.
-    """
     return InputTopic(topic_name(pattern, naming.topic_part(source, distinguishing)), source)
 
 
 def topic_name(pattern: str, instance: str) -> str:
-    """Return the topic name that ``pattern``, an output of an appdef, gives for ``instance``."""
     return pattern.replace("{instance}", instance)
 
 
 def usual_topic(config: Config, source: str, role: str) -> str | None:
-    """Return the usual topic of a source in ``role``, or ``None`` if the inventory has none."""
+    """Return the usual topic of a source that the inventory names for ``role``, or ``None``."""
     node = config.nodes.get(source)
     return node.topics.get(role) if node else None
 
@@ -89,32 +77,33 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
     """
     if not request.adds_claims:
         return request
-    # the claims of the put's own demand do not count, because the put may release their topics
+    # The claims of the put's own demand do not count, because the put may release their topics.
     own = request.demand if isinstance(request, Put) else None
     first: dict[tuple[str, str], str] = {}
 
     def is_further(role: str, topic: InputTopic) -> bool:
         usual = usual_topic(config, topic.source, role)
         if usual is None:
-            known = ledger.booked_input(role, topic.source, topic.topic)
-            if known is not None:
-                return known.further
+            booked = ledger.booked_input(role, topic.source, topic.topic)
+            if booked is not None:
+                return booked.further
             place = (role, topic.source)
             if place not in first and ledger.has_usual_topic(*place, except_demand=own):
                 return True
             usual = first.setdefault(place, topic.topic)
         return topic.topic != usual
 
-    apps = [one.held for one in request.demanded if isinstance(one.held, Application)]
+    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
+    # A usual topic that is booked stays the usual one, even if the request lists it after others.
     for role, topic in (each for app in apps for each in _per_topic(app, config)):
-        known = ledger.booked_input(role, topic.source, topic.topic)
-        if known is not None and not known.further:
+        booked = ledger.booked_input(role, topic.source, topic.topic)
+        if booked is not None and not booked.further:
             first.setdefault((role, topic.source), topic.topic)
     demanded = (
-        replace(one, held=_marked(one.held, config, is_further))
-        if isinstance(one.held, Application)
-        else one
-        for one in request.demanded
+        replace(item, held=_marked(item.held, config, is_further))
+        if isinstance(item.held, Application)
+        else item
+        for item in request.demanded
     )
     return replace(request, demanded=tuple(demanded))
 
@@ -122,8 +111,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
     """Return the ledger with ``further`` set in claims that were read from an earlier format.
 
-    In this format, the files of claims do not say which topics are further topics. The usual topic
-    of a source is the one in the inventory or, if there is none, the one that was booked first.
+    In this format, the files of claims do not say which topics are further topics.
     """
     first: dict[tuple[str, str], str] = {}
 
@@ -132,7 +120,7 @@ def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
         return first.setdefault((role, topic.source), usual) != topic.topic
 
     claims = [claim for claim in ledger if claim.is_on_application]
-    for claim in sorted(claims, key=lambda one: (one.booked, one.subject.id, one.demand)):
+    for claim in sorted(claims, key=lambda claim: (claim.booked, claim.subject.id, claim.demand)):
         held = _marked(claim.application, config, is_further)
         ledger = ledger.replace(claim.key, replace(claim, held=held))
     return ledger

@@ -1,8 +1,8 @@
 """Changes to the ledger when overrides change or end: kept claims, moved services, markers.
 
-A marker is a file of the ledger that records that an override has ended. If an override's end has
-passed when the override is merged, the override never applies. When an override in effect reaches
-its end, the generator publishes a commit that ends the override. Until then it stays in effect.
+A marker is a file of the ledger that records that an override has ended. When an override in effect
+reaches its end, the generator publishes a commit with the marker. Until then the override stays in
+effect, so what runs depends on files alone and not on a clock.
 """
 
 from __future__ import annotations
@@ -25,15 +25,14 @@ from demandops.subject import Subject
 class LedgerUpdate:
     """The ledger after a change of overrides or claims, and the ledger files to write.
 
-    ``keys`` are the keys of the claims that may have changed. ``files`` maps each path to the new
-    text, or to ``None`` if the file is to be removed.
+    ``keys`` are the keys of the claims that may have changed. A file with ``None`` is removed.
     """
 
     ledger: Ledger
     keys: tuple[ClaimKey, ...]
     files: Mapping[str, str | None]
+    # (file, reason) for each override and each application whose service it cannot move
     stays: tuple[tuple[str, str], ...] = ()
-    """(file, reason) for each override and each application whose service it cannot move."""
 
 
 def update_ledger(
@@ -45,17 +44,16 @@ def update_ledger(
 ) -> LedgerUpdate:
     """Return the ledger that a change of the configuration requires, and the files to write.
 
-    Args:
-        before, after: the world before and after the change.
-        subjects: the subjects whose claims a person changed.
-        markers: the ledger's markers of ended overrides, as a map from path to text.
-        now: the current time. A new override whose end has passed does not apply.
+    ``subjects`` are those whose claims a person changed. ``markers`` are the ledger's markers of
+    ended overrides, by path. ``now`` is also the booking time of claims that an override books.
     """
-    known = {one.name: one for one in before.overrides}
+    # An override that is merged after its end never applies. One that was in effect before stays
+    # in effect until the generator's own commit ends it.
+    in_effect = {override.name: override.end for override in before.overrides}
     expired = [
-        one
-        for one in expired_overrides(after, now)
-        if one.name not in known or known[one.name].end != one.end
+        override
+        for override in expired_overrides(after, now)
+        if override.name not in in_effect or in_effect[override.name] != override.end
     ]
     stale = ended_override_file.stale_markers(markers, after.config.overrides)
     ended = {
@@ -63,7 +61,7 @@ def update_ledger(
         for name, end in after.ledger.ended.items()
         if ended_override_file.path_of(name) not in stale
     }
-    ended |= {one.name: format_time(one.end) for one in expired if one.end}
+    ended |= {each.name: format_time(each.end) for each in expired if each.end}
     files: dict[str, str | None] = dict.fromkeys(stale)
     for override in expired:
         files |= _marker(override)
@@ -81,13 +79,8 @@ def update_claims(
 ) -> LedgerUpdate:
     """After claims changed, update the kept claims and the moved services on these subjects.
 
-    Return the ledger, and the files to write.
-
-    Args:
-        before: the ledger before the change.
-        after: the world after the change.
-        subjects: the subjects whose claims changed.
-        now: the booking time of each claim that an override books.
+    ``before`` is the ledger before the change, ``after`` the world after it. ``now`` is the booking
+    time of each claim that an override books.
     """
     subjects = tuple(subjects)
     ledger, kept = update_kept_claims(before, after, subjects, now)
@@ -98,13 +91,7 @@ def update_claims(
 
 
 def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    """Return the ledger after the end of an override, and the files to write.
-
-    One of the files is the marker, which records that the override has ended.
-
-    Raises:
-        ValueError: if the override has no end.
-    """
+    """Return the ledger after the end of an override, and the files to write with the marker."""
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     ended = {**world.ledger.ended, override.name: format_time(override.end)}
@@ -120,10 +107,7 @@ def _marker(override: Override) -> dict[str, str]:
 def changed_claim_files(
     before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
 ) -> dict[str, str | None]:
-    """Return the files of the claims at ``keys`` that changed, as a map from path to new text.
-
-    ``None`` instead of a text means that the file is to be removed.
-    """
+    """Return the new texts of the files of changed claims, by path; ``None`` removes a file."""
     files: dict[str, str | None] = {}
     for key in keys:
         claim = after.get(key)
@@ -133,14 +117,18 @@ def changed_claim_files(
 
 
 def expired_overrides(world: World, now: datetime) -> list[Override]:
-    """Return the overrides that are in effect although their end has passed, sorted by end."""
-    expired = [(one.end, one.name, one) for one in world.overrides if one.end and one.end <= now]
-    return [one for _, _, one in sorted(expired, key=lambda item: item[:2])]
+    """Return the overrides in effect although their end has passed, sorted by end."""
+    expired = [
+        (override.end, override.name, override)
+        for override in world.overrides
+        if override.end and override.end <= now
+    ]
+    return [override for _, _, override in sorted(expired, key=lambda item: item[:2])]
 
 
 def changed_override_files(before: World, after: World) -> list[str]:
     """Return, sorted, the paths of the overrides that come into effect, change or end."""
-    old = {one.name: one for one in before.overrides}
-    new = {one.name: one for one in after.overrides}
+    old = {override.name: override for override in before.overrides}
+    new = {override.name: override for override in after.overrides}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]
     return sorted((new.get(name) or old[name]).path for name in names)

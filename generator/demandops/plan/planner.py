@@ -1,12 +1,13 @@
 """The planner: :func:`plan` returns the release that claims need at a key.
 
-The keys come from :mod:`demandops.plan.release_keys`.
+The keys come from :mod:`demandops.plan.release_keys`. A release follows from the ledger and the
+configuration alone, so every generator and every replay of a commit plans the same.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TypeGuard
@@ -51,30 +52,18 @@ def plan(world: World, key: ReleaseKey) -> Release | None:
 
 
 def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
-    """Return the release of a service as demands need it, or ``None`` if no claim needs it.
-
-    The release has neither kept replicas nor the effects of overrides.
-
-    Raises:
-        Refused: for the same reasons as :func:`plan`.
-    """
+    """Return a service as demands need it: without kept replicas, and without overrides."""
     world = without_suspended(world)
     kept = world.ledger.kept.replace(key.instance, ())
     return _service(replace(world, ledger=replace(world.ledger, kept=kept)), key)
 
 
 def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
-    """Return the release at ``key`` and the override that denies it.
-
-    Return ``None`` if no override denies it, or if no claim needs it.
-
-    Raises:
-        Refused: for the same reasons as :func:`plan`.
-    """
+    """Return the release at ``key`` and the override that denies it, or ``None``."""
     world = without_suspended(world)
     release = _unshaped(world, key)
-    by = release_overrides.service_denied_by(release, world) if release else None
-    return (release, by) if release and by else None
+    override = release_overrides.service_denied_by(release, world) if release else None
+    return (release, override) if release and override else None
 
 
 def _unshaped(world: World, key: ReleaseKey) -> Release | None:
@@ -91,13 +80,35 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     service = services_of(config, _as_claimed(world, apps[0]).appdef)[key.service]
     node, domain = config.node_and_domain(key.node)
     parts = list(_parts(world, service, key, apps))
-    inputs = {role: _inputs(config, key, role, parts) for role in sorted(service.inputs)}
-    topics = [one for read in inputs.values() for one in read]
-    parameters = _merged_parameters(service.parameters, claims)
-    requesters = _requesters(claims, service, key)
+    inputs: dict[str, tuple[InputTopic, ...]] = {}
+    for role in sorted(service.inputs):
+        read = {
+            published.topic
+            for part in parts
+            for published in topics_of_origin(config, part, _origin(config, key, role, part))
+        }
+        # Only some demands name the message type of a topic. An entry without the type sorts first,
+        # so the entry with the type replaces it here.
+        inputs[role] = tuple({topic[:2]: topic for topic in sorted(read)}.values())
+    # If claims have several values of a parameter, the definition says how they are merged.
+    parameters: dict[str, object] = {}
+    for name, parameter in sorted(service.parameters.items()):
+        giving = [claim for claim in claims if name in claim.application.parameters]
+        parameters[name] = _merged_value(name, parameter, giving) if giving else parameter.default
+    requesters = requesters_of(claims)
+    if service.roots:
+        # A claim may hold many topics, and each topic has holders of its own. Only the holders of
+        # the topics for which this instance runs are its requesters.
+        holders = (
+            claim.holders(topic)
+            for claim in claims
+            for topic in roots_of(claim.application, service, key)
+        )
+        requesters = tuple(sorted({who for names in holders for who in names}))
     further = service.root is not None and parts[0].inputs[service.root][0].further
     applications = tuple(dict.fromkeys(app.id for app in apps))
     version = version_of_service(world, service, applications)
+    topics = [topic for role_topics in inputs.values() for topic in role_topics]
     needed = replicas_of(service.scaling, parameters, topics, claims, requesters)
     kept = world.ledger.kept.steps.get(key.instance)
     replicas, keeps = with_kept(needed, service.scaling, kept or ())
@@ -120,24 +131,9 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def _as_claimed(world: World, app: Application) -> Application:
-    """Return an application as its first claim has it; that claim decides the appdef and nodes."""
+    # Claims on one application may differ if a person wrote one of them. Its first claim decides
+    # the appdef and the nodes, for all of them alike.
     return world.ledger.application(app.id) or app
-
-
-def _requesters(claims: Iterable[Claim], service: Service, key: ServiceKey) -> tuple[str, ...]:
-    """Return the requesters of a service instance.
-
-    If the instance runs for certain topics, only the requesters that hold one of these topics are
-    returned.
-    """
-    if not service.roots:
-        return requesters_of(claims)
-    holders = (
-        claim.holders(topic)
-        for claim in claims
-        for topic in roots_of(claim.application, service, key)
-    )
-    return tuple(sorted({who for names in holders for who in names}))
 
 
 def _parts(
@@ -145,49 +141,35 @@ def _parts(
 ) -> Iterator[Application]:
     """Yield each application with only those inputs that the instance at ``key`` depends on.
 
-    Several claims on one application give one application with the inputs of all these claims. If
-    the instance reads only the topic that it runs for, only one application is yielded.
+    Several claims on one application give one application with the inputs of all these claims.
     """
-    by_id: dict[str, list[Application]] = {}
+    claimed: dict[str, list[Application]] = {}
     for app in apps:
-        by_id.setdefault(app.id, []).append(app)
-    shared = service.root and {service.root: (_shared_input(apps, service.root, key),)}
-    for same in by_id.values():
+        claimed.setdefault(app.id, []).append(app)
+    shared: dict[str, tuple[InputTopic, ...]] = {}
+    if service.root is not None:
+        source, name = str(key.source), str(key.topic)
+        topics = [topic for app in apps for topic in app.inputs_from(service.root, source, name)]
+        type = min((topic.type for topic in topics if topic.type), default="")
+        further = all(topic.further for topic in topics)
+        shared = {service.root: (InputTopic(name, source, type, further),)}
+    for same in claimed.values():
         first = _as_claimed(world, same[0])
         if shared:
             yield first.with_inputs(shared)
             if len(service.inputs) == 1:
-                return
+                return  # all applications give the instance this one topic, so one is enough
             continue
         roles = service.roots or {role for app in same for role in app.inputs}
-        united = {role: {one for app in same for one in app.inputs.get(role, ())} for role in roles}
+        inputs = {
+            role: {topic for app in same for topic in app.inputs.get(role, ())} for role in roles
+        }
         if service.roots:
-            united = {r: {one for one in of if one.source == key.node} for r, of in united.items()}
-        yield first.with_inputs({role: tuple(of) for role, of in united.items()})
-
-
-def _shared_input(apps: Iterable[Application], role: str, key: ServiceKey) -> InputTopic:
-    source, topic = str(key.source), str(key.topic)
-    found = [one for app in apps for one in app.inputs_from(role, source, topic)]
-    type = min((one.type for one in found if one.type), default="")
-    return InputTopic(topic, source, type, all(one.further for one in found))
-
-
-def _inputs(
-    config: Config, key: ServiceKey, role: str, parts: Iterable[Application]
-) -> tuple[InputTopic, ...]:
-    """Return the topics that an instance reads in a role, sorted.
-
-    A topic has its message type if a demand names the type.
-    """
-    found: set[InputTopic] = set()
-    for part in parts:
-        origin = _origin(config, key, role, part)
-        if "." in origin:
-            found.update(one.topic for one in topics_of_origin(config, part, origin))
-        else:
-            found.update(part.inputs.get(origin, ()))
-    return tuple({one[:2]: one for one in sorted(found)}.values())
+            inputs = {
+                role: {topic for topic in topics if topic.source == key.node}
+                for role, topics in inputs.items()
+            }
+        yield first.with_inputs({role: tuple(topics) for role, topics in inputs.items()})
 
 
 def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str:
@@ -205,24 +187,24 @@ def demanded_inputs(
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
     if service.roots:
-        kept = {*roots_of(app, service, key)}
-        left = {
-            role: tuple(one for one in of if (role, one.topic, one.source) in kept)
-            for role, of in app.inputs.items()
+        roots = {*roots_of(app, service, key)}
+        inputs = {
+            role: tuple(each for each in topics if (role, each.topic, each.source) in roots)
+            for role, topics in app.inputs.items()
         }
-        app = app.with_inputs(left)
+        app = app.with_inputs(inputs)
     for role in service.inputs:
-        for one in topics_of_origin(world.config, app, _origin(world.config, key, role, app)):
-            yield role, one.topic.topic, one.root
+        origin = _origin(world.config, key, role, app)
+        for published in topics_of_origin(world.config, app, origin):
+            yield role, published.topic.topic, published.root
 
 
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
-    """Return the release name of a service instance.
+    """Return the release name of a service instance, such as ``od-edge-vehicle00``.
 
-    If the instance runs for a topic, the name contains the node and the topic's source, as in
-    ``od-edge-vehicle00``. The name also contains a slug of the topic, unless ``topics`` in the
-    source's inventory entry lists the topic as the usual one. For a separate instance, the name
-    also contains the version.
+    If the instance runs for a topic, the name contains the node and the topic's source. The name
+    also contains a slug of the topic, unless ``topics`` in the source's inventory entry lists the
+    topic as the usual one. For a separate instance, the name also contains the version.
     """
     if service.root is None:
         return naming.object_name(service.prefix, key.application or key.node)
@@ -232,38 +214,25 @@ def service_name(config: Config, service: Service, key: ServiceKey) -> str:
     return naming.object_name(service.prefix, key.node, source, *further, *version)
 
 
-def _merged_parameters(
-    definitions: Mapping[str, Parameter], claims: Iterable[Claim]
-) -> dict[str, object]:
-    """Return the value of every parameter of a service.
-
-    If claims have several values of a parameter, the appdef says how the values are merged.
-    """
-    values: dict[str, object] = {}
-    claims = [claim for claim in claims if claim.application.parameters]
-    for name, parameter in sorted(definitions.items()):
-        given = [claim for claim in claims if name in claim.application.parameters]
-        values[name] = _merged_value(name, parameter, given) if given else parameter.default
-    return values
-
-
 def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> object:
-    given = [claim.application.parameters[name] for claim in claims]
+    values = [claim.application.parameters[name] for claim in claims]
     if parameter.merge == "latest":
         latest = max(claims, key=lambda claim: (claim.booked, claim.demand))
         return latest.application.parameters[name]
     if parameter.merge == "union":
         items = [
-            item for value in given for item in (value if isinstance(value, list) else [value])
+            item for value in values for item in (value if isinstance(value, list) else [value])
         ]
+        # The items may be of any type, and not all types can be compared. As JSON they are sorted
+        # in one order on every machine.
         unique = {json.dumps(item, sort_keys=True): item for item in items}
-        return [unique[key] for key in sorted(unique)]
+        return [unique[text] for text in sorted(unique)]
     if parameter.merge in ("max", "min"):
-        numbers = [value for value in given if _is_number(value)]
-        if len(numbers) != len(given):
+        numbers = [value for value in values if _is_number(value)]
+        if len(numbers) != len(values):
             odd, claim = next(
                 (value, claim)
-                for value, claim in zip(given, claims, strict=True)
+                for value, claim in zip(values, claims, strict=True)
                 if not _is_number(value)
             )
             message = (
@@ -273,7 +242,7 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
             )
             raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)
-    if any(value != given[0] for value in given):
+    if any(value != values[0] for value in values):
         first: dict[str, Claim] = {}
         for claim in claims:
             first.setdefault(json.dumps(claim.application.parameters[name]), claim)
@@ -285,10 +254,11 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
             "application definition say how to merge the values"
         )
         raise Refused.at(f"parameters.{name}", message, code="conflict")
-    return given[0]
+    return values[0]
 
 
 def _is_number(value: object) -> TypeGuard[int | float]:
+    # In Python a bool is an int, but the maximum of truth values has no meaning for a parameter.
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -298,7 +268,6 @@ class _ClaimedConnections:
     type: ConnectionType
 
     def at(self, node: str) -> Iterable[str]:
-        """Return the ids of the connections that end at a node, sorted."""
         return self.world.ledger.connections_at(self.type, node)
 
     def get(self, id: str) -> Connection | None:
@@ -319,26 +288,23 @@ class _ClaimedConnections:
         problems = list(route_faults(self.type, topics, first.nodes, self.world.config))
         if problems:
             raise Refused(
-                replace(one, field="connections", message=f"'{id}': {one.message}")
-                for one in problems
+                replace(problem, field="connections", message=f"'{id}': {problem.message}")
+                for problem in problems
             )
         brokers = (claim.connection.broker for claim in claims)
         return replace(first, broker=next(filter(None, brokers), ""), topics=topics)
 
 
 def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
-    """Return one route for each source topic that claims on a connection list, sorted by topic."""
+    """Return one route for each source topic that the claims list, sorted by topic."""
     return routes.merged_routes(route for claim in claims for route in claim.connection.topics)
 
 
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
-    """Return whether the initial deployment already carries a route between two nodes.
-
-    ``bridged`` in the inventory lists what the initial deployment carries. The initial deployment
-    keeps topic names, so it carries no route that renames a topic.
-    """
+    """Return whether the initial deployment already carries a route between two nodes."""
     sender, receiver = route.sender_and_receiver(source, target)
     node = config.nodes.get(sender)
+    # The initial deployment keeps topic names, so it carries no route that renames a topic.
     if node is None or route.source != route.target:
         return False
     return route.read_topic in node.bridged.get(receiver, ())

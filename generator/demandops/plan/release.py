@@ -42,7 +42,6 @@ class ServiceKey:
 
     @property
     def scope(self) -> Scope:
-        """What the service instance is for: a topic, a node, a cluster or an application."""
         if self.application is not None:
             return "application"
         if self.for_cluster:
@@ -51,7 +50,7 @@ class ServiceKey:
 
     @property
     def instance(self) -> Instance:
-        """This key as a tuple of texts: the key of the instance's record of kept replicas."""
+        """The key of the record of kept replicas in the ledger."""
         named = (self.service, self.node, self.application, self.source, self.topic, self.version)
         scope = "cluster" if self.for_cluster else ""
         return ("replicas", *(name or "" for name in named), scope)
@@ -69,8 +68,7 @@ class ServiceRelease:
     """The desired state of one service instance: one Helm release.
 
     ``chart`` is the chart of ``version``, unless an override pins another chart version. ``keeps``
-    is set while the service keeps more replicas than its demands need; it has the time until which
-    the service keeps these replicas.
+    is set while the service keeps more replicas than its demands need.
     """
 
     key: ServiceKey
@@ -91,16 +89,13 @@ class ServiceRelease:
 
     @property
     def autoscaler(self) -> Autoscaler | None:
-        """The autoscaler that chooses the number of replicas; ``None`` if the number is fixed."""
         return self.replicas if isinstance(self.replicas, Autoscaler) else None
 
     @property
     def images(self) -> tuple[str, ...]:
-        """The names of the service's images in the registry."""
         return self.service.images
 
     def image(self, name: str, config: Config) -> Image:
-        """Return the image called ``name``, as the service's version and overrides pin it."""
         return self.shaping.image(name, self.version.image(name, config.images[name]))
 
     @property
@@ -110,19 +105,16 @@ class ServiceRelease:
         what = f"{self.key.service} {self.key.version}".rstrip()
         return f"{what} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
 
-    @property
-    def _until(self) -> str:
-        return f" until {format_time(self.keeps.until)}" if self.keeps else ""
-
     def facts(self) -> list[str]:
         """Return what the release runs with, as lines; commit messages show changed lines.
 
         Outputs, images that the version does not pin, and patches of Helm values are left out.
         """
+        until = f" until {format_time(self.keeps.until)}" if self.keeps else ""
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
             *(f"{name} = {value}" for name, value in self.parameters.items()),
-            f"replicas {self.replicas}{self._until}",
+            f"replicas {self.replicas}{until}",
             *([f"version {self.version.name}"] if self.version.name else []),
             f"chart {self.chart.version}",
             *(
@@ -135,8 +127,7 @@ class ServiceRelease:
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
         """Yield (file, entry, what the entry decides) for entries that shape the release.
 
-        These entries define the service, choose its version, keep replicas that are to stop later
-        (``downAfter``), and name its chart. An empty ``entry`` stands for the whole file.
+        An empty ``entry`` stands for the whole file.
         """
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"
@@ -160,7 +151,7 @@ Release = ServiceRelease | Client
 
 
 def claims_of(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
-    """Return the claims on the applications or connections for which a release runs."""
+    """Return the claims on a release's applications or connections."""
     if isinstance(release, ServiceRelease):
         return tuple(c for id in release.applications for c in ledger.application_claims(id))
     return tuple(c for id in release.connections for c in ledger.connection_claims(id))

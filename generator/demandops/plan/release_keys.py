@@ -44,16 +44,18 @@ def keys_of_claims(
 
     ``strict`` means the same as for :func:`keys_of`.
     """
-    keys = (
-        key
-        for claim in claims
-        for key in (
-            _service_keys(world, claim, strict)
-            if claim.is_on_application
-            else _client_keys(world, claim)
-        )
-    )
-    yield from dict.fromkeys(keys)
+    keys: dict[ReleaseKey, None] = {}
+    for claim in claims:
+        if not claim.is_on_application:
+            keys |= dict.fromkeys(_client_keys(world, claim))
+            continue
+        # The first claim on an application decides its appdef and nodes for all claims on it.
+        first = world.ledger.application(claim.subject.id) or claim.application
+        app = claim.application.moved_to_nodes_of(first)
+        if strict or first.appdef in world.config.services:
+            for service in services_of(world.config, first.appdef).values():
+                keys |= dict.fromkeys(instances(app, service))
+    yield from keys
 
 
 def _client_keys(world: World, claim: Claim) -> Iterable[ClientKey]:
@@ -61,39 +63,28 @@ def _client_keys(world: World, claim: Claim) -> Iterable[ClientKey]:
     return first.known_type.keys(first.id, *first.nodes)
 
 
-def _service_keys(world: World, claim: Claim, strict: bool) -> Iterator[ServiceKey]:
-    app = claim.application
-    first = world.ledger.application(app.id) or app
-    known = strict or first.appdef in world.config.services
-    app = app.moved_to_nodes_of(first)
-    for service in services_of(world.config, first.appdef).values() if known else ():
-        yield from instances(app, service)
-
-
 def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
-    """Return the claims that need a service instance.
+    """Return the claims that need a service instance, sorted by application and demand.
 
-    They are sorted by application and demand. For a service that runs once for each cluster, they
-    are grouped by appdef first. Callers pass a world without suspended claims if these must not
-    count.
+    For a service that runs once for each cluster, they are grouped by appdef first. Callers pass a
+    world without suspended claims if these must not count.
     """
     ledger = world.ledger
     if key.application is not None:
         needed = _service(world, key.application, key) is not None
         return ledger.application_claims(key.application) if needed else ()
-    topic = (str(key.source), str(key.topic))
     if key.for_cluster:
         users = world.config.users_of(key.service)
-        claims = tuple(one for name in users for one in ledger.claims_of_definition(name))
+        claims = tuple(claim for name in users for claim in ledger.claims_of_definition(name))
+    elif key.scope == "node":
+        claims = ledger.claims_at(key.node)
     else:
-        claims = (
-            ledger.claims_at(key.node) if key.scope == "node" else ledger.claims_reading(*topic)
-        )
-    services = {id: _service(world, id, key) for id in {one.subject.id for one in claims}}
+        claims = ledger.claims_reading(str(key.source), str(key.topic))
+    services = {id: _service(world, id, key) for id in {claim.subject.id for claim in claims}}
     return tuple(
-        one
-        for one in claims
-        if (service := services[one.subject.id]) and takes(one.application, service, key)
+        claim
+        for claim in claims
+        if (service := services[claim.subject.id]) and takes(claim.application, service, key)
     )
 
 
@@ -111,23 +102,22 @@ def is_needed(world: World, key: ReleaseKey) -> bool:
         return _service(world, key.application, key) is not None
     if key.scope in ("node", "cluster"):
         return bool(claims_needing(world, key))
+    # Thousands of claims may read a topic. This ends at the first that needs the instance.
     return any(
-        service is not None and takes(one.application, service, key)
-        for one in world.ledger.each_reading(str(key.source), str(key.topic))
-        for service in (_service(world, one.subject.id, key),)
+        service is not None and takes(claim.application, service, key)
+        for claim in world.ledger.each_reading(str(key.source), str(key.topic))
+        for service in (_service(world, claim.subject.id, key),)
     )
 
 
 def takes(app: Application, service: Service, key: ServiceKey) -> bool:
-    """Return whether an application whose appdef has ``service`` needs the instance at ``key``."""
     return not service.roots or bool(roots_of(app, service, key))
 
 
 def _service(world: World, application: str, key: ServiceKey) -> Service | None:
-    """Return the application's service to which the instance at ``key`` may belong.
+    """Return the application's service to which the instance at ``key`` may belong, or ``None``.
 
-    Return ``None`` if the application has no such service, or if the instance cannot belong to it,
-    for example because the application moved to another node.
+    For example, no instance on a node belongs to an application that moved to another node.
     """
     first = world.ledger.application(application)
     services = world.config.services.get(first.appdef, {}) if first else {}
@@ -146,19 +136,23 @@ def affected_keys(
 
     The cost grows with the number of changed topics. If a change moves an application or gives it
     another appdef or version, the cost grows with the number of all its topics.
-
-    Raises:
-        Refused: if an application definition that ``after`` needs is missing.
     """
     before, after = without_suspended(before), without_suspended(after)
     keys: dict[ReleaseKey, None] = {}
     for change in changes:
         subject, claims = change.key.subject, _differing(change, after)
+        old, new = before.ledger.application(subject.id), after.ledger.application(subject.id)
+        is_moved = False
+        if subject.kind is SubjectKind.APPLICATION and old and new:
+            versions = (running_version(world, subject.id) for world in (before, after))
+            is_moved = not old.has_same_definition_and_nodes(new) or not same_version(*versions)
         for world, claim in zip((before, after), claims, strict=True):
-            own = [claim] if claim and world.ledger.get(claim.key) else []
-            if not _has_same_place_and_version(before, after, subject):
-                own += world.ledger.claims_on(subject)
-            keys |= dict.fromkeys(keys_of_claims(world, own, strict=world is after))
+            affected = [claim] if claim and world.ledger.get(claim.key) else []
+            if is_moved:
+                # The claims of other demands did not change, but what they need runs elsewhere now,
+                # or in another version.
+                affected += world.ledger.claims_on(subject)
+            keys |= dict.fromkeys(keys_of_claims(world, affected, strict=world is after))
     return tuple(keys)
 
 
@@ -166,72 +160,46 @@ def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim |
     """Return the claim before and the claim after a change, reduced to what differs.
 
     If the claims differ only in inputs, the inputs that are in both claims are left out of both.
-    Otherwise both claims are returned whole. A difference in requesters counts only if a service
-    definition or an override depends on the requesters.
+    Otherwise both claims are returned whole.
     """
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
         return before, after
     old, new = before.application, after.application
-    same = replace(new, inputs=old.inputs) == old
-    if not same or old.parameters:  # a parameter's value may depend on the booking times
+    is_same = replace(new, inputs=old.inputs) == old
+    if not is_same or old.parameters:  # a parameter's value may depend on the booking times
         return before, after
-    others = (before.requesters, before.partial) != (after.requesters, after.partial)
-    if others and _looks_at_requesters(new.appdef, world):
-        return before, after
+    if (before.requesters, before.partial) != (after.requesters, after.partial):
+        # Other requesters change a release only if an override selects by them, or a service
+        # definition derives the number of replicas from them.
+        selectors = (selector for override in world.overrides for selector in override.select)
+        services = world.config.services.get(new.appdef, {}).values()
+        if any(selector.requesters for selector in selectors) or any(
+            service.scaling.may_depend_on_requesters for service in services
+        ):
+            return before, after
     return (
         replace(before, held=_with_inputs_not_in(old, new)),
         replace(after, held=_with_inputs_not_in(new, old)),
     )
 
 
-def _looks_at_requesters(appdef: str, world: World) -> bool:
-    selectors = (selector for override in world.overrides for selector in override.select)
-    services = world.config.services.get(appdef, {}).values()
-    return any(selector.requesters for selector in selectors) or any(
-        service.scaling.may_depend_on_requesters for service in services
-    )
-
-
 def _with_inputs_not_in(app: Application, other: Application) -> Application:
     inputs = {}
     for role, topics in app.inputs.items():
-        known = {*other.inputs.get(role, ())}
-        inputs[role] = tuple(topic for topic in topics if topic not in known)
+        others = {*other.inputs.get(role, ())}
+        inputs[role] = tuple(topic for topic in topics if topic not in others)
     return app.with_inputs(inputs)
 
 
-def _has_same_place_and_version(before: World, after: World, subject: Subject) -> bool:
-    """Return whether an application has the same nodes, appdef and version in both worlds.
-
-    Return ``True`` for a connection, and for an application that only one world has.
-    """
-    if subject.kind is not SubjectKind.APPLICATION:
-        return True
-    one, other = before.ledger.application(subject.id), after.ledger.application(subject.id)
-    if not one or not other:
-        return True
-    versions = (running_version(world, subject.id) for world in (before, after))
-    return one.has_same_definition_and_nodes(other) and same_version(*versions)
-
-
 def all_keys(world: World) -> tuple[ReleaseKey, ...]:
-    """Return the key of every release that the ledger needs.
-
-    Raises:
-        Refused: if the definition of a claimed application is missing.
-    """
+    """Return the key of every release; raise ``Refused`` if a definition is missing."""
     subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
-    keys = (key for s in subjects for key in keys_of(world, s, strict=True))
+    keys = (key for subject in subjects for key in keys_of(world, subject, strict=True))
     return tuple(dict.fromkeys(keys))
 
 
 def services_of(config: Config, name: str) -> Services:
-    """Return the services of an application definition.
-
-    Raises:
-        Refused: if the state repo has no such definition.
-    """
     services = config.services.get(name)
     if services is None:
         message = f"'{name}' is in use, but appdefs/{name} is gone; restore it"

@@ -17,7 +17,7 @@ from demandops.ledger.kept_replicas import Kept, Steps
 class Autoscaler:
     """A HorizontalPodAutoscaler, which chooses a number of replicas from ``min`` to ``max``.
 
-    ``targets`` maps each resource to the usage, in percent, that the autoscaler aims at.
+    ``targets`` has the usage of each resource, in percent, that the autoscaler aims at.
     """
 
     min: int
@@ -29,7 +29,6 @@ class Autoscaler:
         return f"{self.min} to {self.max} by an autoscaler ({by})"
 
     def values(self) -> dict[str, int]:
-        """Return the bounds and targets as variables for a template of Helm values."""
         targets = {str(name): percent for name, percent in self.targets.items()}
         return {"min": self.min, "max": self.max} | targets
 
@@ -41,14 +40,7 @@ def replicas_of(
     claims: Collection[Claim],
     requesters: Collection[str],
 ) -> int | Autoscaler:
-    """Return how many replicas a service needs, or the autoscaler that chooses the number.
-
-    The definition derives the number from the service's parameters, input topics, claims or
-    requesters.
-
-    Raises:
-        Refused: if the value of ``scaling.sizes.parameter`` is none of the sizes.
-    """
+    """Return how many replicas a service needs, or the autoscaler that chooses the number."""
     if scaling.autoscaler:
         return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
     if scaling.sizes:
@@ -62,9 +54,9 @@ def replicas_of(
             raise Refused.at(f"parameters.{name}", message)
         return replicas
     for measure, share in (scaling.per or {}).items():
-        sources = {one.source for one in topics}
+        sources = {topic.source for topic in topics}
         counted = {"topics": topics, "sources": sources, "claims": claims, "requesters": requesters}
-        needed = -(-len(counted[measure]) // share)
+        needed = -(-len(counted[measure]) // share)  # rounded up
         return max(scaling.min, min(scaling.max, needed))
     return scaling.min
 
@@ -83,14 +75,15 @@ def with_kept(
     return (kept, steps[0]) if kept > needed else (needed, None)
 
 
-def overridden(replicas: int | Autoscaler, by: int) -> int | Autoscaler:
-    """Return ``by``, the number of replicas that an override sets.
-
-    If ``replicas`` is an autoscaler, return an autoscaler with ``by`` as both bounds.
-    """
-    return Autoscaler(by, by, replicas.targets) if isinstance(replicas, Autoscaler) else by
+def overridden(replicas: int | Autoscaler, number: int) -> int | Autoscaler:
+    """Return the replicas of a service for which an override sets the number."""
+    # Where an autoscaler owns the number, the GitOps controller ignores ``spec.replicas``. So the
+    # number is set as both bounds of the autoscaler.
+    if isinstance(replicas, Autoscaler):
+        return Autoscaler(number, number, replicas.targets)
+    return number
 
 
 def most_replicas(replicas: int | Autoscaler) -> int:
-    """Return the number of replicas, or the highest number that an autoscaler may choose."""
+    """Return the highest number of replicas that may run."""
     return replicas.max if isinstance(replicas, Autoscaler) else replicas

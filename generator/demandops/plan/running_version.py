@@ -2,8 +2,9 @@
 
 A claim on an application asks for a named version, or for the default version. A service that
 several applications share has the newest of the versions of these applications. So the order of
-the claims does not matter. :mod:`demandops.plan.checks.version_difference` decides whether a demand
-may ask for another version than the existing demands.
+the claims does not matter, and two demands that renew in turn do not restart the pods again and
+again. :mod:`demandops.plan.checks.version_difference` decides whether a demand may ask for another
+version than the existing demands.
 """
 
 from __future__ import annotations
@@ -24,19 +25,16 @@ def running_version(world: World, application: str) -> ApplicationVersion | None
     Return ``None`` if no claim holds the application, or if its appdef is missing.
     """
     app = world.ledger.application(application)
-    known = world.config.application_versions.get(app.appdef) if app else None
-    return newest_asked(world.ledger, application, known) if known else None
+    versions = world.config.application_versions.get(app.appdef) if app else None
+    return newest_asked(world.ledger, application, versions) if versions else None
 
 
 def newest_asked(
-    ledger: Ledger, application: str, known: Mapping[str, ApplicationVersion]
+    ledger: Ledger, application: str, versions: Mapping[str, ApplicationVersion]
 ) -> ApplicationVersion:
-    """Return the newest of the ``known`` versions that claims on an application ask for.
-
-    If no claim asks for a version, return the default version.
-    """
-    asked = ledger.versions_asked(application, known)
-    return max((known[word] for word in asked or ("",)), key=lambda version: version.rank)
+    """Return the newest of ``versions`` that claims on an application ask for, or the default."""
+    asked = ledger.versions_asked(application, versions)
+    return max((versions[word] for word in asked or ("",)), key=lambda version: version.rank)
 
 
 def same_version(one: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
@@ -49,23 +47,22 @@ def version_of_service(
 ) -> ApplicationVersion:
     """Return the version in which a service runs for the applications that share it.
 
-    If the applications have several appdefs, the appdef with the newest chart decides.
-
     At least one of the applications must have a version (:func:`running_version`).
 
     Raises:
         Refused: if another appdef has the same chart version, but different images.
     """
     newest: dict[str, ApplicationVersion] = {}
-    for found in filter(None, (running_version(world, id) for id in applications)):
-        known = newest.setdefault(found.appdef, found)
-        if found.rank > known.rank:
-            newest[found.appdef] = found
+    for running in filter(None, (running_version(world, id) for id in applications)):
+        if running.rank > newest.setdefault(running.appdef, running).rank:
+            newest[running.appdef] = running
+    # Ranks are comparable only within one appdef, and all versions of a service have its chart. So
+    # among several appdefs, the one with the newest chart decides.
     versions = [version for _, version in sorted(newest.items())]
     best = max(versions, key=lambda version: precedence(version.charts[service.chart].version))
     for other in versions:
         its, own = contents(other, service), contents(best, service)
-        if its[0] == own[0] and its != own:
+        if its[0] == own[0] and its != own:  # neither is the newest
             file = world.config.place_of(VERSIONS_FILE)
             message = (
                 f"application definitions '{best.appdef}' and '{other.appdef}' share "

@@ -25,38 +25,32 @@ def with_kept_replicas(
 ) -> tuple[Ledger, tuple[Instance, ...]]:
     """Return the updated ledger, and the service instances whose kept replicas changed.
 
-    Args:
-        before, after: the world before and after the demand.
-        keys: the keys of the releases that the demand may change.
-        now: when the demand was received.
-
-    Raises:
-        Refused: if a release cannot be planned in ``after``.
+    ``keys`` are the keys of the releases that the demand may change.
     """
     kept, changed = after.ledger.kept, list[Instance]()
     for key in keys:
         if not isinstance(key, ServiceKey):
             continue
-        known = kept.steps.get(key.instance) or ()
-        if not known and key.service not in after.config.services_with_down_after:
+        recorded = kept.steps.get(key.instance) or ()
+        if not recorded and key.service not in after.config.services_with_down_after:
             continue
-        steps = _steps(before, after, key, known, now)
-        if steps != known:
+        steps = _steps(before, after, key, recorded, now)
+        if steps != recorded:
             kept = kept.replace(key.instance, steps)
             changed.append(key.instance)
     return replace(after.ledger, kept=kept) if changed else after.ledger, tuple(changed)
 
 
-def _steps(before: World, after: World, key: ServiceKey, known: Steps, now: datetime) -> Steps:
+def _steps(before: World, after: World, key: ServiceKey, recorded: Steps, now: datetime) -> Steps:
     release = without_kept(after, key)
     kept_for = release.service.scaling.kept_for if release else None
     if release is None or kept_for is None:
-        return ()
+        return ()  # a service that nobody needs stops at once, as does one without ``downAfter``
     try:
         old = without_kept(before, key)
     except Refused:  # the release before the demand can no longer be planned
         old = None
-    return extended(known, _number(release), _number(old), now, now + kept_for)
+    return extended(recorded, _number(release), _number(old), now, now + kept_for)
 
 
 def _number(release: ServiceRelease | None) -> int:
@@ -64,7 +58,6 @@ def _number(release: ServiceRelease | None) -> int:
 
 
 def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
-    """Return the ledger without the steps of ``instance`` that have ended."""
     kept = world.ledger.kept
-    left = tuple(one for one in kept.steps.get(instance) or () if one.until > now)
-    return replace(world.ledger, kept=kept.replace(instance, left))
+    steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
+    return replace(world.ledger, kept=kept.replace(instance, steps))

@@ -105,7 +105,8 @@ def asking_for(request: Put, requirement: Requirement) -> Put:
 
 
 def chosen(request: Put, ledger: Ledger, config: Config) -> tuple[str, Put, list[str]]:
-    placed, faults = with_chosen_nodes(request, World(config, ledger), Usage())
+    world = World(config, ledger)
+    placed, faults = with_chosen_nodes(request, world, Usage(), None, lambda: None)
     (one,) = placed.demanded
     assert isinstance(one.held, Application) and isinstance(placed, Put)
     assert bool(one.held.node) != bool(faults)

@@ -25,16 +25,14 @@ class Facts(NamedTuple):
 
 
 class CompiledRule:
-    """The base class of the rules in this module."""
-
     def __init__(self, rule: Rule) -> None:
         self.name, self.subjects, self.sources = rule.name, rule.subjects, rule.sources
         self.dwell = float(seconds_of(rule.dwell))
+        # A bracket in a pattern stands for itself, but ``translate`` gives it a meaning.
         patterns = [pattern.replace("[", "[[]") for pattern in rule.entities]
         self._names = None if "*" in patterns else re.compile("|".join(map(translate, patterns)))
 
     def is_for(self, entity: str) -> bool:
-        """Return whether the rule's patterns match an entity's name."""
         return self._names is None or self._names.match(entity) is not None
 
     def takes(self, who: Who) -> bool:
@@ -42,16 +40,14 @@ class CompiledRule:
         return self.is_for(who[1])
 
     def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
-        """Return the entities that an event names, each with its source."""
+        # A rule on pairs from one source names this source once, but its events have two entities.
         return tuple(zip((*self.sources, *self.sources), subjects, strict=False))
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
         """Return the current facts of an event.
 
-        Args:
-            subjects: the names of the event's entities; ``seen`` has all these entities.
-            seen: the last observation of each entity.
-            count: how many entities the rule counts.
+        ``seen`` has the last observation of each of the event's entities. ``count`` is how many
+        entities the rule counts.
         """
         raise NotImplementedError
 
@@ -60,36 +56,28 @@ class CompiledRule:
 
 
 class HoursRule(CompiledRule):
-    """A rule whose condition holds during the hours of a schedule."""
-
     def __init__(self, rule: Rule, hours: Hours) -> None:
         super().__init__(rule)
         self.schedule = hours.schedule
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return facts with one value: the rule's name."""
         return Facts(self._named(subjects), "the hours of the schedule")
 
 
 class ThresholdRule(CompiledRule):
-    """A rule on a number that an entity reports."""
-
     def __init__(self, rule: Rule, limits: Threshold) -> None:
         super().__init__(rule)
         self.field, self._limits = limits.field, limits
 
     def starts(self, value: float) -> bool:
-        """Return whether the condition starts when an entity reports this value."""
         above, below = self._limits.above, self._limits.below
         return (above is not None and value > above) or (below is not None and value < below)
 
     def stops(self, value: float) -> bool:
-        """Return whether the condition stops when an entity reports this value."""
         is_low = value <= self._limits.stop
         return is_low if self._limits.above is not None else value >= self._limits.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return facts with the latest value that the entity reported for the rule's field."""
         value = seen[self.sources[0], subjects[0]].values.get(self.field, 0.0)
         named = {**self._named(subjects), "value": value}
         return Facts(named, f"{self.field} of {subjects[0]} is {value:g}")
@@ -106,7 +94,6 @@ class AreaRule(CompiledRule):
         self.stop: float = condition.radius if isinstance(condition, Count) else condition.stop
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return facts: the number of entities, or one's position and distance to the area."""
         named = self._named(subjects)
         if self.count is not None:
             return Facts({**named, "count": count}, f"{count} entities are in or near the area")
@@ -117,11 +104,9 @@ class AreaRule(CompiledRule):
 
 
 class PairRule(CompiledRule):
-    """A rule on the distance between two entities.
-
-    The map is divided into squares as wide as the distance at which the condition stops. The rule
-    looks for the partners of an entity in the entity's square and the squares around it.
-    """
+    # The map is divided into squares as wide as the distance at which the condition stops. So all
+    # partners of an entity are in the entity's square and the squares around it, and an entity is
+    # not compared with all others.
 
     def __init__(self, rule: Rule, condition: Together) -> None:
         super().__init__(rule)
@@ -129,34 +114,26 @@ class PairRule(CompiledRule):
         self._first, self._second = self.sources[0], self.sources[-1]
 
     def takes(self, who: Who) -> bool:
-        """Return whether an entity may be in a pair.
-
-        The patterns of the rule limit only the entities of the first source.
-        """
+        # The patterns of the rule limit only the entities of the first source.
         return who[0] != self._first or self.is_for(who[1])
 
     def key(self, one: Who, other: Who) -> Key:
-        """Return the key of a pair's event.
-
-        Two entities of the same source are sorted by name in the key. Of two entities of different
-        sources, the entity of the rule's first source comes first.
-        """
+        # A pair is one event, in whatever order its entities report.
         if self._first == self._second:
             return self.name, (min(one[1], other[1]), max(one[1], other[1]))
         return self.name, (one[1], other[1]) if one[0] == self._first else (other[1], one[1])
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return facts with the first entity's position and its distance to the second entity."""
         one, other = (seen[who] for who in self.entities_of(subjects))
         (x, y), away = one.position or (0.0, 0.0), distance(one, other)
         text = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
         return Facts({**self._named(subjects), "x": x, "y": y, "distance": away}, text)
 
-    def _cell(self, one: Observation | None) -> Cell | None:
-        if one is None or one.position is None:
+    def _cell(self, observation: Observation | None) -> Cell | None:
+        if observation is None or observation.position is None:
             return None
-        x, y = one.position
-        return self.name, one.source, floor(x / self.stop), floor(y / self.stop)
+        x, y = observation.position
+        return self.name, observation.source, floor(x / self.stop), floor(y / self.stop)
 
     def move(
         self,
@@ -167,8 +144,7 @@ class PairRule(CompiledRule):
     ) -> None:
         """Move an entity in ``cells`` from the square where it was to the square where it is now.
 
-        ``before`` and ``after`` are the entity's last and new observation. An entity without an
-        observation or without a position is in no square.
+        An entity without an observation or without a position is in no square.
         """
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
@@ -180,31 +156,26 @@ class PairRule(CompiledRule):
         if entered is not None:
             cells[entered] = cells.get(entered, frozenset()) | {entity}
 
-    def around(self, cells: Mapping[Cell, frozenset[str]], one: Observation) -> Iterator[Who]:
-        """Yield the possible partners of an entity, with their sources.
-
-        These are all entities that are near enough, and some that are too far away.
-        """
-        cell = self._cell(one)
+    def around(self, cells: Mapping[Cell, frozenset[str]], seen: Observation) -> Iterator[Who]:
+        """Yield all entities that are near enough, and some that are too far away."""
+        cell = self._cell(seen)
         if cell is None:
             return
-        source = self._second if one.source == self._first else self._first
+        source = self._second if seen.source == self._first else self._first
         _, _, at_x, at_y = cell
         for x in (at_x - 1, at_x, at_x + 1):
             for y in (at_y - 1, at_y, at_y + 1):
                 for entity in cells.get((self.name, source, x, y), ()):
-                    if (source, entity) != one.who:
+                    if (source, entity) != seen.who:
                         yield source, entity
 
 
 def distance(one: Observation, other: Observation) -> float:
-    """Return the metres between two entities that have positions."""
     assert one.position is not None and other.position is not None  # noqa: S101 - rules need them
     return hypot(one.position[0] - other.position[0], one.position[1] - other.position[1])
 
 
 def compiled(rule: Rule) -> CompiledRule:
-    """Return the :class:`CompiledRule` for a rule; its class depends on the kind of condition."""
     condition = rule.condition
     if isinstance(condition, Near | Count):
         return AreaRule(rule, condition)

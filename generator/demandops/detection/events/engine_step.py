@@ -1,7 +1,6 @@
 """One step of the engine, which collects the events that observations and passing time cause.
 
-A step changes a copy of the state, not the state itself. The copy costs little, because one step
-takes many observations, and because the copy is shallow: the values in the mappings are immutable.
+A step changes a copy of the state, not the state itself.
 """
 
 from __future__ import annotations
@@ -26,6 +25,8 @@ class EngineStep:
     """The work of one step: call its methods, then take ``events`` and :meth:`result`."""
 
     def __init__(self, engine: EventEngine, state: State) -> None:
+        # The copies cost little: one step takes many observations, and the values in the mappings
+        # are immutable, so they are not copied.
         self._engine, self._before = engine, state
         self._now, self._due, self._hours_due = state.now, state.due, state.hours_due
         self._seen, self._awaited = dict(state.seen), dict(state.awaited)
@@ -35,7 +36,6 @@ class EngineStep:
         self.events: list[Event] = []
 
     def result(self) -> State:
-        """Return the state after the step."""
         return replace(
             self._before,
             now=self._now,
@@ -53,7 +53,6 @@ class EngineStep:
     def resume(self, key: Key, settle_s: float) -> None:
         """Continue an event that started before a restart, and wait for its entities.
 
-        The wait is ``settle_s`` seconds, or the timeout of an entity's source if that is longer.
         An event that no rule is for is ignored.
         """
         rule = self._engine.rules.get(key[0])
@@ -63,20 +62,18 @@ class EngineStep:
         if all(map(rule.takes, entities)):
             self._enter(key, rule, Phase(self._now, lasts=True))
             for who in entities:
+                # A source that reports seldom may not have reported yet when the detector settles.
                 wait_s = max(settle_s, self._engine.timeouts[who[0]])
                 self._awaited[who] = self._before.now + wait_s
 
     # ---- time ----
 
     def pass_time(self, until: float) -> None:
-        """Advance the time to ``until``, and apply all changes that are due by then.
-
-        Such a change is due when a dwell time ends, when an entity has been silent for too long,
-        when a resumed event has waited long enough, or when a schedule begins or ends.
-        """
+        """Advance the time to ``until``, and apply all changes that are due by then."""
         while until >= self._due:
             self._due = inf
-            for at, act in sorted(self._all_due(), key=lambda one: one[0]):
+            # In the order of their times, so a long silence gives the same events as short ones.
+            for at, act in sorted(self._all_due(), key=lambda due: due[0]):
                 if at > min(until, self._due):  # an action may have made another change due before
                     break
                 self._now = max(self._now, at)
@@ -95,12 +92,13 @@ class EngineStep:
         if self._now < self._before.settled:
             yield self._before.settled, self._look_at_counts
         timeouts = self._engine.timeouts
-        for who, one in self._seen.items():
-            yield one.at + timeouts[one.source], partial(self._lose_silent, who, one)
+        for who, last in self._seen.items():
+            yield last.at + timeouts[last.source], partial(self._lose_silent, who, last)
         for who, until in self._awaited.items():
             yield until, partial(self._give_up, who)
 
     def _end_dwell(self, key: Key, phase: Phase) -> None:
+        # An action before this one may have ended the phase, or begun another.
         if self._phases.get(key) is phase:
             self._begin(key, self._engine.rules[key[0]])
 
@@ -113,7 +111,7 @@ class EngineStep:
 
     def _look_at_counts(self) -> None:
         for rule in self._engine.rules.values():
-            if isinstance(rule, AreaRule) and rule.count:
+            if isinstance(rule, AreaRule):
                 self._latch_count(rule)
 
     def _lose_silent(self, who: Who, last: Observation) -> None:
@@ -137,62 +135,66 @@ class EngineStep:
 
     # ---- observations ----
 
-    def observe(self, one: Observation) -> None:
-        """Apply an observation at the current time of the step."""
-        if one.at != self._now:
-            one = one._replace(at=self._now)
-        before = self._seen.get(one.who)
-        self._seen[one.who] = one
-        self._awaited.pop(one.who, None)
-        self._due = min(self._due, one.at + self._engine.timeouts[one.source])
-        for rule in self._engine.thresholds[one.source]:
-            value = one.values.get(rule.field)
-            if value is not None and rule.is_for(one.entity):
-                key = (rule.name, (one.entity,))
+    def observe(self, observation: Observation) -> None:
+        if observation.at != self._now:
+            observation = observation._replace(at=self._now)
+        who, source, entity = observation.who, observation.source, observation.entity
+        before = self._seen.get(who)
+        self._seen[who] = observation
+        self._awaited.pop(who, None)
+        self._due = min(self._due, observation.at + self._engine.timeouts[source])
+        for rule in self._engine.thresholds[source]:
+            value = observation.values.get(rule.field)
+            if value is not None and rule.is_for(entity):
+                key = (rule.name, (entity,))
                 self._latch(key, rule, rule.starts(value), rule.stops(value))
-        if one.position is not None:
-            self._compare_with_areas(one, *one.position)
-            for pair in self._engine.pairs[one.source]:
-                if pair.takes(one.who):
-                    pair.move(self._cells, one.entity, before, one)
-                    self._compare_with_others(pair, one)
+        if observation.position is not None:
+            self._compare_with_areas(observation, *observation.position)
+            for pair in self._engine.pairs[source]:
+                if pair.takes(who):
+                    pair.move(self._cells, entity, before, observation)
+                    self._compare_with_others(pair, observation)
 
-    def _compare_with_areas(self, one: Observation, x: float, y: float) -> None:
+    def _compare_with_areas(self, observation: Observation, x: float, y: float) -> None:
+        who, entity = observation.who, observation.entity
         compared, counted = set[str](), set[str]()
-        for rule in self._engine.areas[one.source].at(x, y):
-            if not rule.is_for(one.entity):
+        for rule in self._engine.areas[observation.source].at(x, y):
+            if not rule.is_for(entity):
                 continue
             away = rule.area.distance(x, y)
             if rule.count is None:
                 compared.add(rule.name)
-                near: Key = (rule.name, (one.entity,))
-                self._latch(near, rule, away <= rule.start, away > rule.stop)
+                key: Key = (rule.name, (entity,))
+                self._latch(key, rule, away <= rule.start, away > rule.stop)
             elif away <= rule.start:
                 counted.add(rule.name)
-        for key in sorted(self._engaged.get(one.who, _NONE)):
-            rule_left = self._engine.rules[key[0]]
-            if isinstance(rule_left, AreaRule) and key[0] not in compared:
-                self._latch(key, rule_left, False, True)
-        before = self._counted.get(one.who, _NO_RULES)
+        # The index does not yield the areas that the entity has left, so their events end here.
+        for key in sorted(self._engaged.get(who, _NONE)):
+            left = self._engine.rules[key[0]]
+            if isinstance(left, AreaRule) and key[0] not in compared:
+                self._latch(key, left, False, True)
+        before = self._counted.get(who, _NO_RULES)
         if counted != before:
-            self._counted[one.who] = frozenset(counted)
+            self._counted[who] = frozenset(counted)
             for name in sorted(counted ^ before):
                 self._count(name, 1 if name in counted else -1)
 
-    def _compare_with_others(self, rule: PairRule, one: Observation) -> None:
-        compared = set[Key]()
-        for other in sorted(rule.around(self._cells, one)):
-            key, away = rule.key(one.who, other), distance(one, self._seen[other])
+    def _compare_with_others(self, rule: PairRule, observation: Observation) -> None:
+        who, compared = observation.who, set[Key]()
+        for other in sorted(rule.around(self._cells, observation)):
+            key, away = rule.key(who, other), distance(observation, self._seen[other])
             compared.add(key)
             self._latch(key, rule, away <= rule.start, away > rule.stop)
-        for key in sorted(self._engaged.get(one.who, _NONE)):
+        # The squares around do not have the partners that are far away, so their events end here. A
+        # partner that is still awaited after a restart has no position yet.
+        for key in sorted(self._engaged.get(who, _NONE)):
             is_left = key[0] == rule.name and key not in compared
-            if is_left and all(who in self._seen for who in rule.entities_of(key[1])):
+            if is_left and all(entity in self._seen for entity in rule.entities_of(key[1])):
                 self._latch(key, rule, False, True)
 
-    def _count(self, name: str, more: int) -> None:
+    def _count(self, name: str, change: int) -> None:
         rule = self._engine.rules[name]
-        self._counts[name] = self._counts.get(name, 0) + more
+        self._counts[name] = self._counts.get(name, 0) + change
         if isinstance(rule, AreaRule):
             self._latch_count(rule)
 

@@ -30,7 +30,9 @@ class EventEngine:
 
     def __init__(self, file: RuleFile) -> None:
         self.rules: dict[str, CompiledRule] = {}
-        self.timeouts = {name: float(seconds_of(one.timeout)) for name, one in file.sources.items()}
+        self.timeouts = {
+            name: float(seconds_of(source.timeout)) for name, source in file.sources.items()
+        }
         self.hours: list[HoursRule] = []
         self.thresholds: dict[str, list[ThresholdRule]] = {name: [] for name in file.sources}
         self.pairs: dict[str, list[PairRule]] = {name: [] for name in file.sources}
@@ -54,43 +56,34 @@ class EventEngine:
     def start(self, now: float, held: Iterable[Key] = (), settle_s: float = 0.0) -> State:
         """Return the state with which the engine starts.
 
-        Args:
-            now: the time.
-            held: the events whose demands are already booked. Events that no rule is for are
-                left out.
-            settle_s: how many seconds the entities of these events may stay unseen until they count
-                as gone. If their source's timeout is longer, the timeout counts instead.
+        ``held`` are the events whose demands are already booked. Events that no rule is for are
+        left out. Their entities count as gone if they stay unseen for ``settle_s`` seconds, or for
+        the timeout of their source if that is longer.
         """
-        keys = tuple(held)
-        settled = now + max((settle_s, *map(self._timeout_of_count, keys)))
-        step = EngineStep(self, State(now, due=-inf, settled=settled, hours_due=now))
+        keys, settle = tuple(held), settle_s
+        # A count is complete only when each of its entities had the time to report.
+        for name, _ in keys:
+            rule = self.rules.get(name)
+            if isinstance(rule, AreaRule) and rule.count is not None:
+                settle = max(settle, self.timeouts[rule.sources[0]])
+        step = EngineStep(self, State(now, due=-inf, settled=now + settle, hours_due=now))
         for key in keys:
             step.resume(key, settle_s)
         return step.result()
-
-    def _timeout_of_count(self, key: Key) -> float:
-        """Return the timeout of the entities that the event's rule counts; 0 without a count."""
-        rule = self.rules.get(key[0])
-        is_count = isinstance(rule, AreaRule) and rule.count is not None
-        return self.timeouts[rule.sources[0]] if rule and is_count else 0.0
 
     def step(
         self, state: State, observations: Iterable[Observation], now: float
     ) -> tuple[State, tuple[Event, ...]]:
         """Return the new state, and the events that observations and passing time cause.
 
-        Args:
-            state: the state before the step; it is not changed.
-            observations: in the order in which they were made. An observation of a source that
-                the file lacks is left out. An observation earlier than
-                ``state.now`` counts as made at ``state.now``. An observation later than ``now``
-                counts as made at ``now``.
-            now: the time.
+        The observations are in the order in which they were made. One of a source that the file
+        lacks is left out. One earlier than ``state.now`` counts as made then, and one later than
+        ``now`` as made at ``now``.
         """
         step = EngineStep(self, state)
-        for one in observations:
-            if one.source in self.timeouts:
-                step.pass_time(min(one.at, now))
-                step.observe(one)
+        for observation in observations:
+            if observation.source in self.timeouts:
+                step.pass_time(min(observation.at, now))
+                step.observe(observation)
         step.pass_time(now)
         return step.result(), tuple(step.events)

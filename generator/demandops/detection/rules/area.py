@@ -6,8 +6,8 @@ import math
 from dataclasses import dataclass
 from functools import cached_property
 
+# x and y in metres, in the map frame of the positions.
 Point = tuple[float, float]
-"""x and y in metres, in the map frame of the positions."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,6 @@ class Area:
 
     @cached_property
     def bounds(self) -> tuple[float, float, float, float]:
-        """The lowest x and y, and the highest x and y."""
         xs, ys = zip(*self.corners, strict=True)
         return min(xs), min(ys), max(xs), max(ys)
 

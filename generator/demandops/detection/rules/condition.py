@@ -29,8 +29,8 @@ def _field_problem(path: str) -> str:
     return f"{quoted(path)} is not a field; write it like pose.position.x or ranges[0]"
 
 
+# A field of a message, such as ``pose.position.x`` or ``state.continuous_state[0]``.
 FieldPath = Annotated[str, without(_field_problem)]
-"""A field of a message, such as ``pose.position.x`` or ``state.continuous_state[0]``."""
 
 Number = Annotated[float, Field(ge=-1e12, le=1e12)]
 Metres = Annotated[float, Field(ge=0, le=1e6)]
@@ -51,7 +51,6 @@ class _InArea(CamelModel):
 
     @property
     def area(self) -> Area:
-        """The point or the polygon."""
         corners = self.polygon or ((self.point,) if self.point else ())
         return Area(tuple((corner.x, corner.y) for corner in corners))
 
@@ -175,6 +174,7 @@ class Hours(CamelModel):
     stop: Annotated[str, readable_by(_clock)]
     zone: Annotated[str, readable_by(_zone)] = "UTC"
 
+    # A span that ends when it starts could be a whole day or nothing.
     @field_validator("stop")
     @classmethod
     def _is_another_time(cls, stop: str, info: Any) -> str:  # noqa: ANN401 - pydantic's
@@ -184,6 +184,5 @@ class Hours(CamelModel):
 
     @property
     def schedule(self) -> Schedule:
-        """The hours as a schedule."""
         days = frozenset(DAYS.index(day) for day in self.days)
         return Schedule(days, _clock(self.start), _clock(self.stop), _zone(self.zone))

@@ -14,6 +14,7 @@ from demandops.quoting import quoted
 from demandops.settings import API_VERSION
 
 _HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
+# Values of the right types, with which the form of a demand is checked before any event.
 _SAMPLE: Values = {
     "rule": "rule",
     "entity": "entity",
@@ -31,42 +32,36 @@ def faults_of_demand(
 ) -> list[Fault]:
     """Return the faults of a rule's demand: of its names, else of its form, else of its ids.
 
-    Args:
-        template: the template of the demand.
-        field: the path of the demand in the file of rules.
-        subjects: the names by which the template refers to an event's entities.
-        momentary: the names of values that are known only when an event starts. A ``Demand`` may
-            use them, except in its id and its requesters. A ``DeploymentRequest`` may not.
+    ``field`` is the path of the demand in the file. ``subjects`` are the names by which the
+    template refers to an event's entities, ``momentary`` those of values that are known only when
+    an event starts.
     """
-    stable = {"rule", *subjects}
-    known = stable | (momentary if template.action == "demand" else set())
-    if found := rule_template.faults(template.data, field, known):
-        return found
+    # A ``DeploymentRequest`` is sent again to renew it and with ``shutdown`` to end it. It must be
+    # the same then, also after a restart, when momentary values are not known.
+    known = {"rule", *subjects, *(momentary if template.action == "demand" else ())}
+    if problems := rule_template.faults(template.data, field, known):
+        return problems
     data = filled(template.data, _SAMPLE)
     if template.action == "demand":
         fixed = [name for name in ("apiVersion", "kind", "operation") if name in data]
-        formed = demand_goal.form_faults({**_HEAD, **data})
+        malformed = demand_goal.form_faults({**_HEAD, **data})
     else:
         fixed = ["shutdown"] if "shutdown" in data else []
-        formed = deployment_request_goal.form_faults(data)
-    found = [fault(f"{field}.{name}", "is set by the detector; remove it") for name in fixed]
+        malformed = deployment_request_goal.form_faults(data)
+    problems = [fault(f"{field}.{name}", "is set by the detector; remove it") for name in fixed]
     written = dict(rule_template.texts(template.data, field))
-    for one in formed:
-        path = f"{field}.{one.field}" if one.field else field
-        is_text = one.message.startswith("must be text")
-        number = _message_for_number(written.get(path, "")) if is_text else ""
-        found.append(fault(path, number or one.message))
-    return found or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
-
-
-def _message_for_number(text: str) -> str:
-    """Return a message if a text of a rule, such as ``{x}``, becomes a number; else ``""``."""
-    if text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int):
-        return (
-            f"{quoted(text)} becomes a number, but this field needs text; write a word before "
-            f"{text}, such as 'near-{text}'"
-        )
-    return ""
+    for problem in malformed:
+        path = f"{field}.{problem.field}" if problem.field else field
+        text, message = written.get(path, ""), problem.message
+        # The writer wrote a text such as ``{x}``, which becomes a number.
+        is_number = text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int)
+        if is_number and message.startswith("must be text"):
+            message = (
+                f"{quoted(text)} becomes a number, but this field needs text; write a word before "
+                f"{text}, such as 'near-{text}'"
+            )
+        problems.append(fault(path, message))
+    return problems or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
 
 
 def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
@@ -75,11 +70,11 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
     ``needed`` are names in braces, such as ``{entity}``. They must be in the id of a ``Demand``, or
     in the requesters of each application and connection of a ``DeploymentRequest``.
     """
-    data = template.data
+    data: Any = template.data
     if template.action == "demand":
         yield from _missing(data, field, "demand", "requesters")
         why = "otherwise two events would share one demand"
-        listed = [("demand", [data.get("demand", "")], why)]
+        listed = [("demand", [data.get("demand", "")])]
         for name, what in (("demand", "id"), ("requesters", "requesters")):
             for path, text in rule_template.texts(data.get(name, ()), f"{field}.{name}"):
                 if changing := sorted(names(text) - {"rule", "entity", "other"}):
@@ -90,8 +85,16 @@ def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterat
     else:
         yield from _missing(data, field, "id")
         why = "a shutdown ends what its requesters hold, so each event needs its own requesters"
-        listed = [(path, who, why) for path, who in _requesters_by_field(data)]
-    for path, values, why in listed:
+        kind = "object_detection_fusion_app"
+        listed = [
+            (f"apps[{index}].{kind}.requester_ids", app.get(kind, {}).get("requester_ids", []))
+            for index, app in enumerate(data.get("apps", ()))
+        ]
+        listed += [
+            (f"connections[{index}].requester_ids", connection.get("requester_ids", []))
+            for index, connection in enumerate(data.get("connections", ()))
+        ]
+    for path, values in listed:
         missing = needed - {f"{{{name}}}" for value in values for name in names(value)}
         if missing and any(values):
             named = " and ".join(sorted(missing))
@@ -102,11 +105,3 @@ def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: A
     for name in needed:
         if not data.get(name):
             yield fault(f"{field}.{name}", "is missing; add it")
-
-
-def _requesters_by_field(data: Any) -> Iterator[tuple[str, list[str]]]:  # noqa: ANN401
-    for index, app in enumerate(data.get("apps", ())):
-        field = "object_detection_fusion_app"
-        yield f"apps[{index}].{field}.requester_ids", app.get(field, {}).get("requester_ids", [])
-    for index, connection in enumerate(data.get("connections", ())):
-        yield f"connections[{index}].requester_ids", connection.get("requester_ids", [])

@@ -1,7 +1,7 @@
 """What a rule demands: a template for goals of one of the two actions.
 
 The template makes the goals that start, renew and end a demand. It also recognizes which demands in
-the bookkeeping the rule has made.
+the bookkeeping the rule has made, so that a restart of the detector changes nothing.
 """
 
 from __future__ import annotations
@@ -19,8 +19,6 @@ Action = Literal["demand", "deployment_request"]
 
 @dataclass(frozen=True, slots=True)
 class Goal:
-    """A goal as plain data, and the action that takes it."""
-
     action: Action
     data: Mapping[str, Any]
 
@@ -31,7 +29,6 @@ class Goal:
 
     @property
     def requesters(self) -> tuple[str, ...]:
-        """All requesters that the goal names, sorted."""
         return tuple(sorted({*requesters_in(self.action, self.data)}))
 
     @property
@@ -46,16 +43,14 @@ class Goal:
         return {**head, **self.data}
 
     def ended(self) -> Goal:
-        """Return the goal that ends the demand that this goal starts."""
         if self.action == "deployment_request":
             return Goal(self.action, {**self.data, "shutdown": True})
         kept = {name: self.data[name] for name in ("demand", "requesters")}
         return Goal(self.action, {**kept, "operation": "release"})
 
     def renewed(self) -> Goal:
-        """Return the goal that renews the demand that this goal starts."""
         if self.action == "deployment_request":
-            return self
+            return self  # the same request again renews the leases of its claims
         kept = {name: self.data[name] for name in ("demand", "requesters")}
         return Goal(self.action, {**kept, "operation": "renew"})
 
@@ -64,8 +59,8 @@ class Goal:
 class BookedDemand:
     """A demand that the bookkeeping lists.
 
-    ``demand`` is the demand's id. For a demand by ``DeploymentRequest``, it is empty, and
-    ``request`` is the id of the request.
+    ``demand`` is the demand's id. It is empty for a demand by ``DeploymentRequest``, of which
+    ``request`` is the id.
     """
 
     demand: str
@@ -75,17 +70,13 @@ class BookedDemand:
 
 @dataclass(frozen=True)
 class RuleDemand:
-    """The template of a rule's demand."""
-
     action: Action
     data: Mapping[str, Any]
 
     def goal(self, values: Values) -> Goal:
-        """Return the goal that starts the demand."""
         return Goal(self.action, filled(self.data, values))
 
     def names(self) -> set[str]:
-        """Return the names in braces that the template uses, such as ``entity``."""
         return {name for _, text in texts(self.data, "") for name in names(text)}
 
     def outline(self, values: Values) -> Goal:
@@ -99,49 +90,36 @@ class RuleDemand:
         kept = {name: self.data[name] for name in ("demand", "requesters")}
         return Goal(self.action, filled(kept, values))
 
-    def _is(self, held: BookedDemand, values: Values) -> bool:
-        goal, is_own = self.outline(values), self.action == "demand"
-        if is_own != bool(held.demand):
-            return False
-        id = held.demand if is_own else held.request
-        return (goal.id, goal.requesters) == (id, tuple(sorted(held.requesters)))
-
     def subjects_of(
         self, held: BookedDemand, subjects: tuple[str, ...], rule: str
     ) -> Values | None:
         """Return the entities of the event for which the rule made a booked demand.
 
-        Args:
-            held: the demand in the bookkeeping.
-            subjects: the names by which the template refers to the event's entities.
-            rule: the name of the rule.
-
-        Returns:
-            The entity for each name in ``subjects``. ``None`` if the rule makes no demand with this
-            id and these requesters, or if the entities cannot be found. For example, the template
-            ``{entity}-{other}`` can give the id ``a-b-c`` in two ways.
+        ``subjects`` are the names by which the template refers to the event's entities. ``rule`` is
+        the name of the rule. Return ``None`` if the rule makes no demand with this id and these
+        requesters.
         """
         named = {*requesters_in(self.action, self.data)}
-        if len(held.requesters) > len(named):
+        is_own, held_id = self.action == "demand", held.demand or held.request
+        if len(held.requesters) > len(named) or is_own != bool(held.demand):
             return None
-        if self.action == "demand":
-            pairs = [(str(self.data["demand"]), held.demand)]
-        else:
-            pairs = [(str(self.data.get("id", "")), held.request)]
+        # The id alone may not tell the entities: ``{entity}-{other}`` can give ``a-b-c`` in two
+        # ways. So the requesters are read as well, and each combination is tried.
+        pairs = [(str(self.data["demand"] if is_own else self.data.get("id", "")), held_id)]
         pairs += product(sorted(named), held.requesters)
-        found: dict[str, set[str]] = {name: set() for name in subjects}
+        entities: dict[str, set[str]] = {name: set() for name in subjects}
         for template, text in pairs:
             for name, entity in candidates(template, text).items():
-                found.get(name, set()).add(entity)
-        for entities in product(*(sorted(found[name]) for name in subjects)):
-            values = dict(zip(subjects, entities, strict=True))
-            if self._is(held, {"rule": rule, **values}):
+                entities.get(name, set()).add(entity)
+        for combination in product(*(sorted(entities[name]) for name in subjects)):
+            values = dict(zip(subjects, combination, strict=True))
+            goal = self.outline({"rule": rule, **values})
+            if (goal.id, goal.requesters) == (held_id, tuple(sorted(held.requesters))):
                 return values
         return None
 
 
 def requesters_in(action: Action, data: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the requesters that the data of a goal, or of its template, names."""
     if action == "demand":
         yield from data.get("requesters", ())
         return

@@ -30,12 +30,12 @@ from demandops.errors import Fault, InvalidInput, fault, suggestion
 from demandops.field_lines import located_in
 from demandops.identifiers import message_type_problem
 
+# For some message types, the fields that have x and y; a source can name other fields instead.
 POSITIONS: Mapping[str, tuple[str, str]] = {
     "geometry_msgs/msg/PoseStamped": ("pose.position.x", "pose.position.y"),
     "nav_msgs/msg/Odometry": ("pose.pose.position.x", "pose.pose.position.y"),
     "perception_msgs/msg/EgoData": ("state.continuous_state[0]", "state.continuous_state[1]"),
 }
-"""For some message types, the fields that have x and y; a source can name other fields instead."""
 
 
 class Source(CamelModel):
@@ -69,7 +69,6 @@ class Source(CamelModel):
 
     @property
     def position(self) -> tuple[str, str] | None:
-        """The fields with x and y, or ``None`` if the entities have no position."""
         return (self.x, self.y) if self.x and self.y else POSITIONS.get(self.type)
 
 
@@ -117,10 +116,9 @@ class Rule(CamelModel):
 
     @property
     def condition(self) -> Near | Together | Count | Threshold | Hours:
-        """The condition of the rule; each rule has exactly one."""
-        found = self.near or self.together or self.count or self.threshold or self.schedule
-        assert found is not None  # noqa: S101 - validated above
-        return found
+        condition = self.near or self.together or self.count or self.threshold or self.schedule
+        assert condition is not None  # noqa: S101 - validated above
+        return condition
 
     @property
     def sources(self) -> tuple[str, ...]:
@@ -144,17 +142,13 @@ class Rule(CamelModel):
 
     @property
     def template(self) -> RuleDemand:
-        """The template of the rule's demand or deploymentRequest."""
         if self.demand is not None:
             return RuleDemand("demand", self.demand)
         return RuleDemand("deployment_request", self.deployment_request or {})
 
     def is_for(self, *entities: str) -> bool:
-        """Return whether the rule is for an event about these entities.
-
-        If the rule is for pairs from two sources, the rule's patterns limit only the entity of the
-        first source.
-        """
+        """Return whether the rule is for an event about these entities."""
+        # The patterns of a rule for pairs from two sources limit only the entity of the first.
         limited = entities[:1] if self.together and self.together.other else entities
         return all(matches(entity, self.entities) for entity in limited)
 
@@ -171,35 +165,35 @@ def read(text: str, file: str) -> RuleFile:
     """Return the rules in the text of a file.
 
     Raises:
-        InvalidInput: if the rules are not valid. The error has the faults that were found
-            together, each with its line. When they are mended, further ones may appear.
+        InvalidInput: with the faults that were found together, each with its line. When they are
+            mended, further ones may appear.
     """
     with located_in(text):
         rules = parse_file(RuleFile, text, file)
-        if found := list(_faults(rules)):
-            raise InvalidInput(one.within(file) for one in found)
+        if faults := list(_faults(rules)):
+            raise InvalidInput(each.within(file) for each in faults)
     return rules
 
 
 def _faults(rules: RuleFile) -> Iterator[Fault]:
-    seen: set[str] = set()
+    names: set[str] = set()
     ids: list[tuple[str, Rule]] = []
     for index, rule in enumerate(rules.rules):
         where = f"rules[{index}]"
-        if rule.name in seen:
+        if rule.name in names:
             message = f"'{rule.name}' appears twice; give each rule a name of its own"
             yield fault(f"{where}.name", message)
-        seen.add(rule.name)
+        names.add(rule.name)
         kind = next(name for name in CONDITIONS if getattr(rule, name) is not None)
         for part in ("source", "other"):
-            name = getattr(rule.condition, part, None)
-            if name is not None and name not in rules.sources:
-                known = suggestion(name, rules.sources)
-                yield fault(f"{where}.{kind}.{part}", f"'{name}' is not in sources{known}")
-            elif name is not None and kind != "threshold" and not rules.sources[name].position:
+            source = getattr(rule.condition, part, None)
+            if source is not None and source not in rules.sources:
+                hint = suggestion(source, rules.sources)
+                yield fault(f"{where}.{kind}.{part}", f"'{source}' is not in sources{hint}")
+            elif source is not None and kind != "threshold" and not rules.sources[source].position:
                 message = (
-                    f"source '{name}' has no position; name the fields of its position in "
-                    f"sources.{name}.x and y"
+                    f"source '{source}' has no position; name the fields of its position in "
+                    f"sources.{source}.x and y"
                 )
                 yield fault(f"{where}.{kind}.{part}", message)
         field = "demand" if rule.demand is not None else "deploymentRequest"
@@ -209,7 +203,12 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
         if rule.demand is not None:
             id = str(rule.demand.get("demand", "")).replace("{rule}", rule.name)
             for other_id, other in ids:
-                if id == other_id and _may_meet(rule, other):
+                # Two rules may have an event for one entity at the same time if they have a pattern
+                # in common, or if one of them has ``*``. Different patterns that match the same
+                # entity, such as ``car*`` and ``*1``, are not recognized.
+                own, others = {*rule.entities}, {*other.entities}
+                may_meet = "*" in own | others or not own.isdisjoint(others)
+                if id == other_id and may_meet:
                     message = (
                         f"is also the id of a demand of rule '{other.name}', so the event that "
                         "ends first would end the other event's demand; add {rule} to one of the "
@@ -218,12 +217,3 @@ def _faults(rules: RuleFile) -> Iterator[Fault]:
                     yield fault(f"{where}.demand.demand", message)
                     break
             ids.append((id, rule))
-
-
-def _may_meet(one: Rule, other: Rule) -> bool:
-    """Return whether two rules have a pattern in common, or one of them has the pattern ``*``.
-
-    Different patterns that match the same entity, such as ``car*`` and ``*1``, are not recognized.
-    """
-    patterns = {*one.entities}, {*other.entities}
-    return "*" in patterns[0] | patterns[1] or not patterns[0].isdisjoint(patterns[1])

@@ -1,8 +1,7 @@
 """The template of a rule's demand: plain data in whose texts ``{entity}`` stands for a value.
 
-Values are put in after parsing, so a value cannot change the structure of the demand. A text that
-is only a name in braces becomes the value itself, for example a number for ``{x}``. ``{{`` and
-``}}`` stand for single braces. A template has no expressions, attributes or formats.
+A text that is only a name in braces becomes the value itself, for example a number for ``{x}``.
+``{{`` and ``}}`` stand for single braces. A template has no expressions, attributes or formats.
 """
 
 from __future__ import annotations
@@ -13,16 +12,15 @@ from typing import Any
 
 from demandops.errors import Fault, fault, suggestion
 
+# The values of the names in a template.
 Values = Mapping[str, str | float]
-"""The values of the names in a template."""
 
 _TOKEN = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
+# The pattern of an entity's name.
 _ENTITY = r"[A-Za-z0-9_.-]+"
-"""The pattern of an entity's name."""
 
 
 def is_entity(name: str) -> bool:
-    """Return whether text can be the name of an entity."""
     return bool(re.fullmatch(_ENTITY, name))
 
 
@@ -32,32 +30,23 @@ def filled(template: Any, values: Values) -> Any:  # noqa: ANN401 - plain data
     Raises:
         KeyError: if a name has no value; :func:`faults` reports such names.
     """
+    # The template is parsed already, so a value cannot change the structure of the demand.
     if isinstance(template, str):
         alone = _TOKEN.fullmatch(template)
         if alone and alone[1] is not None:
             return values[alone[1]]
-        return _TOKEN.sub(lambda found: _written(found, values), template)
+        return _TOKEN.sub(
+            lambda token: token[0][0] if token[1] is None else str(values[token[1]]), template
+        )
     if isinstance(template, Mapping):
-        return {filled_text(key, values): filled(value, values) for key, value in template.items()}
+        return {str(filled(key, values)): filled(value, values) for key, value in template.items()}
     if isinstance(template, list | tuple):
         return [filled(item, values) for item in template]
     return template
 
 
-def filled_text(template: str, values: Values) -> str:
-    """Return a text in which values replace the names in braces."""
-    return str(filled(template, values))
-
-
-def _written(found: re.Match[str], values: Values) -> str:
-    return str(values[found[1]]) if found[1] is not None else found[0][0]
-
-
 def texts(template: Any, field: str) -> Iterator[tuple[str, str]]:  # noqa: ANN401
-    """Yield (path, text) for each text and each key in a template.
-
-    ``field`` is the path of the template itself.
-    """
+    """Yield (path, text) for each text and each key in a template at the path ``field``."""
     if isinstance(template, str):
         yield field, template
     elif isinstance(template, Mapping):
@@ -70,8 +59,7 @@ def texts(template: Any, field: str) -> Iterator[tuple[str, str]]:  # noqa: ANN4
 
 
 def names(text: str) -> set[str]:
-    """Return the names in braces in a text."""
-    return {found[1] for found in _TOKEN.finditer(text) if found[1] is not None}
+    return {token[1] for token in _TOKEN.finditer(text) if token[1] is not None}
 
 
 def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
@@ -79,24 +67,23 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
 
     A brace is stray if it is neither doubled nor part of a pair around a name.
     """
-    found = []
+    problems = []
     for path, text in texts(template, field):
         for token in _TOKEN.finditer(text):
             if token[0] in ("{", "}"):
                 message = f"has a single '{token[0]}'; write '{token[0] * 2}' for one brace"
-                found.append(fault(path, message))
+                problems.append(fault(path, message))
             elif token[1] is not None and token[1] not in known:
                 message = f"'{{{token[1]}}}' has no value here"
-                found.append(fault(path, message + suggestion(token[1], known)))
-    return found
+                problems.append(fault(path, message + suggestion(token[1], known)))
+    return problems
 
 
 def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return entities whose names turn the template into ``text``.
+    """Return entities whose names turn the template into ``text``, by the names in braces.
 
-    The result maps each name in braces to an entity. If several combinations of entities give this
-    text, the result is one of them. The result is empty if none does, or if the template has no
-    names in braces.
+    If several combinations of entities give this text, the result is one of them. The result is
+    empty if none does, or if the template has no names in braces.
     """
     seen: set[str] = set()
     pattern, end = "", 0

@@ -33,15 +33,13 @@ class Schedule:
         )
 
     def next_check(self, now: float) -> float:
-        """Return the time after ``now`` at which to call :meth:`is_on` again.
-
-        Before that time, the result of :meth:`is_on` changes only if summer time begins or ends.
-        To notice such a change soon, that time is at most an hour after ``now``.
-        """
+        """Return the time after ``now`` at which to call :meth:`is_on` again."""
         local = datetime.fromtimestamp(now, self.zone)
+        # The result of :meth:`is_on` changes at a start, at an end, and if summer time begins or
+        # ends. To notice the latter soon, an hour is the longest time.
         ahead = [now + 3600.0]
         for day in (0, 1):
+            date = local.date() + timedelta(days=day)
             for at in (self.start, self.end):
-                date = local.date() + timedelta(days=day)
                 ahead.append(datetime.combine(date, at, self.zone).timestamp())
         return min(moment for moment in ahead if moment > now)

@@ -12,7 +12,6 @@ _PART = r"(?P<entity>[A-Za-z0-9_]+)"
 
 
 def topic_pattern_problem(pattern: str) -> str:
-    """Return why a text is not a pattern of topics, or an empty string."""
     if pattern.count(ENTITY) > 1:
         return "has {entity} twice; name the entity once"
     example = pattern.replace(ENTITY, "entity")
@@ -24,8 +23,8 @@ def entity_in(pattern: str, topic: str) -> str | None:
 
     If the topic matches and the pattern has no ``{entity}``, the result is an empty text.
     """
-    before, found, after = pattern.partition(ENTITY)
-    if not found:
+    before, entity, after = pattern.partition(ENTITY)
+    if not entity:
         return "" if topic == pattern else None
     matched = re.fullmatch(f"{re.escape(before)}{_PART}{re.escape(after)}", topic)
     return matched["entity"] if matched else None

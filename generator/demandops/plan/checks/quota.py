@@ -27,33 +27,38 @@ def faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
     domain_of = after.config.domain_of
     booked = [change.after for change in changes.claims if change.after]
     holders = {(claim.held.home, who) for claim in booked for who in claim.requesters}
-    domains = {(found.name, who): found for node, who in holders if (found := domain_of.get(node))}
+    domains = {
+        (domain.name, who): domain for node, who in holders if (domain := domain_of.get(node))
+    }
     for (_, requester), domain in sorted(domains.items(), key=lambda pair: pair[0]):
-        yield from _claims(requester, before, after, domain)
-    touched = [claim for c in changes.claims if (claim := c.after or c.before)]
+        most = domain.quotas.claims_per_requester
+        # The ledger counts a requester's claims in all domains, so at least as many as those in
+        # this domain. It has this count at hand, so most demands need no search.
+        if most is None or after.ledger.count_of_requester(requester) <= most:
+            continue
+        count = _held(requester, after, domain)
+        if count > most and count > _held(requester, before, domain):
+            usage = f"'{requester}' would hold {count} claims"
+            yield _exceeded(domain, "claimsPerRequester", most, usage)
+    touched = [claim for change in changes.claims if (claim := change.after or change.before)]
     apps = [claim.application for claim in touched if claim.is_on_application]
     nodes = {node for app in apps for node in app.needed_nodes()}
+    # A service for a cluster runs at a node that only its definition names.
     nodes |= {
-        one.runs_at[app.node]
+        service.runs_at[app.node]
         for app in apps
-        for one in after.config.services.get(app.appdef, {}).values()
-        if app.node in one.runs_at
+        for service in after.config.services.get(app.appdef, {}).values()
+        if app.node in service.runs_at
     }
     for node in sorted(nodes):
-        yield from _services(node, before, after)
-
-
-def _claims(requester: str, before: World, after: World, domain: AccessDomain) -> Iterator[Fault]:
-    most = domain.quotas.claims_per_requester
-    if (
-        most is None or after.ledger.count_of_requester(requester) <= most
-    ):  # this counts the claims in all domains, so at least as many as those in this domain
-        return
-    count = _held(requester, after, domain)
-    if count > most and count > _held(requester, before, domain):
-        yield _exceeded(
-            domain, "claimsPerRequester", most, f"'{requester}' would hold {count} claims"
-        )
+        of_node = domain_of.get(node)
+        most = of_node.quotas.services_per_node if of_node else None
+        if of_node is None or most is None:
+            continue
+        count = _running(node, after)
+        if count > most and count > _running(node, before):
+            usage = f"'{node}' would run {count} services"
+            yield _exceeded(of_node, "servicesPerNode", most, usage)
 
 
 def _held(requester: str, world: World, domain: AccessDomain) -> int:
@@ -61,24 +66,14 @@ def _held(requester: str, world: World, domain: AccessDomain) -> int:
     return sum(world.config.domain_of.get(claim.held.home) is domain for claim in claims)
 
 
-def _services(node: str, before: World, after: World) -> Iterator[Fault]:
-    domain = after.config.domain_of.get(node)
-    most = domain.quotas.services_per_node if domain else None
-    if domain is None or most is None:
-        return
-    count = _running(node, after)
-    if count > most and count > _running(node, before):
-        yield _exceeded(domain, "servicesPerNode", most, f"'{node}' would run {count} services")
-
-
 def _running(node: str, world: World) -> int:
     world = without_suspended(world)
-    names = world.ledger.applications_at(node)
-    subjects = (Subject(SubjectKind.APPLICATION, name) for name in names)
+    ids = world.ledger.applications_at(node)
+    subjects = (Subject(SubjectKind.APPLICATION, id) for id in ids)
     keys = {key for subject in subjects for key in keys_of(world, subject)}
-    for name, one in world.config.definitions.items():
+    for name, service in world.config.definitions.items():
         key = ServiceKey(name, node, for_cluster=True)
-        if node in one.nodes.values() and is_needed(world, key):
+        if node in service.nodes.values() and is_needed(world, key):
             keys.add(key)
     return sum(isinstance(key, ServiceKey) and key.node == node for key in keys)
 

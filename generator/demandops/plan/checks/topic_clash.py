@@ -1,15 +1,15 @@
 """Topic clashes: a demand is refused if a node would have two sources of one topic.
 
-Topics are named as the reference names them, so two ids of nodes or applications may give the same
-topic, for example ``a/b`` and ``a-b``. A connection may also bring a topic to a node where a
-service publishes the same topic.
+A subscriber would mix the two, without an error. Topics are named as the reference names them, so
+two ids of nodes or applications may give the same topic, for example ``a/b`` and ``a-b``. A
+connection may also bring a topic to a node where a service publishes the same topic.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from itertools import islice
+from itertools import chain, islice
 
 from demandops import naming
 from demandops.config.appdef import Service
@@ -41,82 +41,69 @@ def faults(
 ) -> Iterator[Fault]:
     """Yield a fault for each new service, route or delivery that clashes with another source.
 
-    A service, route or delivery clashes if it would be a topic's second source on a node. Of a
-    service's outputs, only the first that clashes is reported.
-
-    Args:
-        request: the demand. If it adds no claims, there are no faults.
-        before, after: the world before and after the demand.
-        keys: the keys of the releases that the demand may change.
+    It clashes if it would be a topic's second source on a node. Of a service's outputs, only the
+    first that clashes is reported. ``keys`` are the keys of the releases that the demand may
+    change.
     """
     if not request.adds_claims:
         return
     for key in keys:
         if isinstance(key, ServiceKey) and not is_needed(before, key):
-            for service in _service(after, key):
-                yield from _of_service(request, after, key, service)
-    for one in request.demanded:
-        if isinstance(one.held, Connection):
-            yield from _of_connection(one, one.held, before, after)
+            yield from islice(_clashes_of_service(request, after, key), 1)
+    for item in request.demanded:
+        if isinstance(item.held, Connection):
+            yield from _clashes_of_connection(item, item.held, before, after)
         else:
-            yield from _of_flows(one, one.held, after)
+            yield from _clashes_of_flows(item, item.held, after)
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
-    """Yield the topic clashes that a claim would cause, each located in the claim's file."""
     keys = keys_of_claims(after, [claim])
-    for found in faults(request_for(claim), before, after, keys):
-        yield found.within(path_of(claim.key))
+    for clash in faults(request_for(claim), before, after, keys):
+        yield clash.within(path_of(claim.key))
 
 
-def _of_service(
-    request: DemandRequest, after: World, key: ServiceKey, service: Service
-) -> Iterator[Fault]:
-    clashes = (
-        (name, topic, *clash)
-        for name, topic in _topics(after, service, key).items()
-        for clash in _clashes(after, key, service, name, topic)
-    )
-    for name, topic, clash, remedy in islice(clashes, 1):
-        yield fault(
-            _field(request, key, service),
-            f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}",
-            code="conflict",
+def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -> Iterator[Fault]:
+    claim = next(iter(claims_needing(after, key)), None)
+    if claim is None:
+        return
+    first = after.ledger.application(claim.subject.id) or claim.application
+    service = after.config.services[first.appdef][key.service]
+    further = False
+    if service.root is not None:
+        booked = after.ledger.booked_input(service.root, str(key.source), str(key.topic))
+        further = bool(booked and booked.further)
+    for name, topic in outputs(after.config, service, key, further=further).items():
+        publishers = (
+            (f"{words(other)} already publishes this topic on", other)
+            for other in _publishers(after, key.node, topic, excluded=key)
         )
+        connections = (
+            (f"connection '{id}' already brings this topic to", None)
+            for id in after.ledger.connections_bringing(key.node, topic)
+        )
+        for clash, other in chain[tuple[str, ServiceKey | None]](publishers, connections):
+            remedy = _remedy(key, other, service, name, after.config)
+            yield fault(
+                _field(request, key, service),
+                f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}",
+                code="conflict",
+            )
 
 
-def _clashes(
-    world: World, key: ServiceKey, service: Service, output: str, topic: str
-) -> Iterator[tuple[str, str]]:
-    """Yield (clash, remedy) for each other source of ``topic`` on the node of ``key``.
-
-    The instance at ``key`` publishes ``topic`` as ``output``. Clash and remedy are parts of a
-    message. A clash is, for example, ``connection 'a' already brings this topic to``.
-    """
-    for other in _publishers(world, key.node, topic, excluded=key):
-        clash = f"{words(other)} already publishes this topic on"
-        yield clash, _remedy(key, other, service, output, world.config)
-    for id in world.ledger.connections_bringing(key.node, topic):
-        clash = f"connection '{id}' already brings this topic to"
-        yield clash, _remedy(key, None, service, output, world.config)
-
-
-def _of_connection(
-    one: Demanded, connection: Connection, before: World, after: World
+def _clashes_of_connection(
+    item: Demanded, connection: Connection, before: World, after: World
 ) -> Iterator[Fault]:
-    """Yield a fault for each new route that brings a topic to a node where a service publishes it.
-
-    A service that the demand starts or stops causes no fault here. So if an application moves, a
-    connection may bring the application's output back to the old node.
-    """
     for index, route in enumerate(connection.topics):
         _, node = route.sender_and_receiver(*connection.nodes)
         topic = route.written_topic
         if connection.id in before.ledger.connections_bringing(node, topic):
             continue
-        others = (one for one in _publishers(before, node, topic) if is_needed(after, one))
-        for other in islice(others, 1):
-            yield one.fault(
+        # Only services that run before and after the demand count. If an application moves, a
+        # connection may bring the application's output back to the old node.
+        staying = (key for key in _publishers(before, node, topic) if is_needed(after, key))
+        for other in islice(staying, 1):
+            yield item.fault(
                 f"topics[{index}].{'source' if route.reverse else 'target'}",
                 f"connection '{connection.id}' brings {topic} to '{node}', where "
                 f"{words(other)} already publishes this topic; use a connection that brings the "
@@ -125,15 +112,14 @@ def _of_connection(
             )
 
 
-def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
-    """Yield a fault for each output that the receiving node already gets from another source.
-
-    A topic that the demand lists as an input is never a fault, because the demand names the source.
-    """
-    apart = app.deliver or app.services or app.moved
-    for flow in flows(after.config, app) if apart else ():
-        ids = after.ledger.connections_bringing(flow.receiver, flow.target)
-        for id in ids if flow.delivery is not None or flow.is_output else ():
+def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterator[Fault]:
+    """Yield a fault for each output that the receiving node already gets from another source."""
+    has_outputs_elsewhere = app.deliver or app.services or app.moved
+    for flow in flows(after.config, app) if has_outputs_elsewhere else ():
+        # Of an input that the demand lists, the demand names the source, so it is no fault.
+        if flow.delivery is None and not flow.is_output:
+            continue
+        for id in after.ledger.connections_bringing(flow.receiver, flow.target):
             other = after.ledger.connection(id)
             elsewhere = other is not None and {*other.nodes} != {flow.sender, flow.receiver}
             if flow.delivery is None:
@@ -143,22 +129,21 @@ def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
                         f"and would also come from '{flow.sender}'; choose another node for the "
                         "service that reads this topic"
                     )
-                    yield one.fault("id", message, code="conflict")
+                    yield item.fault("id", message, code="conflict")
                 continue
             if elsewhere:
-                yield one.fault(
+                yield item.fault(
                     f"deliver[{flow.delivery}].output",
                     f"{flow.target} already comes to '{flow.receiver}' by connection '{id}'; leave "
                     "this delivery out",
                     code="conflict",
                 )
                 continue
-            routes = (
-                route for c in after.ledger.connection_claims(id) for route in c.connection.topics
-            )
-            read = {one.read_topic for one in routes if one.written_topic == flow.target}
+            claims = after.ledger.connection_claims(id)
+            routes = (route for claim in claims for route in claim.connection.topics)
+            read = {route.read_topic for route in routes if route.written_topic == flow.target}
             for topic in sorted(read - {flow.topic})[:1]:
-                yield one.fault(
+                yield item.fault(
                     f"deliver[{flow.delivery}].topic",
                     f"connection '{id}' already brings {topic} to '{flow.receiver}' as "
                     f"{flow.target}; choose another topic for this delivery",
@@ -166,56 +151,40 @@ def _of_flows(one: Demanded, app: Application, after: World) -> Iterator[Fault]:
                 )
 
 
-def _service(world: World, key: ServiceKey) -> Iterator[Service]:
-    """Yield the service at ``key``; yield nothing if no claim needs the instance at ``key``."""
-    for claim in claims_needing(world, key)[:1]:
-        first = world.ledger.application(claim.subject.id) or claim.application
-        yield world.config.services[first.appdef][key.service]
-
-
-def _topics(world: World, service: Service, key: ServiceKey) -> dict[str, str]:
-    input = (str(service.root), str(key.source), str(key.topic))
-    booked = world.ledger.booked_input(*input) if service.root else None
-    return outputs(world.config, service, key, further=bool(booked and booked.further))
-
-
 def _publishers(
     world: World, node: str, topic: str, *, excluded: ServiceKey | None = None
 ) -> Iterator[ServiceKey]:
     """Yield the keys of the service instances on a node that publish ``topic``.
 
-    The output patterns of the appdefs tell which instances would publish the topic. The instance
-    ``excluded`` and each instance that no claim needs are left out.
+    The instance ``excluded`` and each instance that no claim needs are left out.
     """
+    # The output patterns of the definitions tell which instances would publish the topic. So only
+    # these are looked up, and not the outputs of all services on the node.
     for services in world.config.services.values():
-        for name, service in services.items():
+        for service in services.values():
             for pattern in service.outputs.values():
                 first, *others = map(re.escape, pattern.split("{instance}"))
                 expression = first + "(.+)" + r"\1".join(others) if others else first
                 match = re.fullmatch(expression, topic)
                 if match is None:
                     continue
-                found = (
-                    _keys_called(world, node, name, service, match[1], excluded)
+                keys = (
+                    _keys_called(world, node, service, match[1], excluded)
                     if others
                     else _keys_on(world, node, service)
                 )
-                yield from (key for key in found if key != excluded and is_needed(world, key))
+                yield from (key for key in keys if key != excluded and is_needed(world, key))
 
 
 def _keys_called(
-    world: World,
-    node: str,
-    name: str,
-    service: Service,
-    instance: str,
-    excluded: ServiceKey | None,
+    world: World, node: str, service: Service, instance: str, excluded: ServiceKey | None
 ) -> Iterator[ServiceKey]:
     """Yield the keys of a service's instances on ``node`` that topic names show as ``instance``.
 
     Some of the instances may not run. The instance ``excluded`` may be left out.
     """
-    ledger, config, role = world.ledger, world.config, service.root
+    ledger, config = world.ledger, world.config
+    name, role = service.name, service.root
     if service.scope in ("node", "cluster"):
         if naming.topic_part(node) == instance:
             yield ServiceKey(name, node, for_cluster=service.scope == "cluster")
@@ -236,7 +205,7 @@ def _keys_called(
 
 
 def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys of the instances of a service on a node; some of them may not run."""
+    """Yield the keys of a service's instances on a node; some of them may not run."""
     name = service.name
     if service.scope == "cluster":
         yield ServiceKey(name, node, for_cluster=True)
@@ -248,7 +217,6 @@ def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
 
 
 def words(key: ReleaseKey) -> str:
-    """Return what a release is, in words for a message."""
     if isinstance(key, ClientKey):
         return f"connection '{key.id}'" if key.side else f"the {key.type.name} client of '{key.id}'"
     if key.application is not None:
@@ -261,7 +229,7 @@ def words(key: ReleaseKey) -> str:
 def _remedy(
     key: ServiceKey, other: ServiceKey | None, service: Service, output: str, config: Config
 ) -> str:
-    """Return how to resolve a clash; ``other`` is ``None`` if the clash is with a connection."""
+    """Return how to resolve a clash; ``other`` is ``None`` if it is with a connection."""
     is_named = "{instance}" in service.outputs[output]
     is_of_same = (
         other is not None
@@ -282,13 +250,12 @@ def _remedy(
 
 
 def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
-    """Return which field of the request makes a service run; empty if no field does."""
-    for one in request.demanded:
-        if not isinstance(one.held, Application):
+    for item in request.demanded:
+        if not isinstance(item.held, Application):
             continue
-        if one.held.id == key.application:
-            return one.place("id")
-        for index, topic in enumerate(one.held.inputs.get(str(service.root), ())):
+        if item.held.id == key.application:
+            return item.place("id")
+        for index, topic in enumerate(item.held.inputs.get(str(service.root), ())):
             if (topic.source, topic.topic) == (key.source, key.topic):
-                return one.place(f"inputs.{service.root}[{index}].topic")
+                return item.place(f"inputs.{service.root}[{index}].topic")
     return ""

@@ -16,7 +16,6 @@ from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Demanded, DemandRequest
 from demandops.errors import Fault
 from demandops.ledger.claim_changes import ClaimChange
-from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.release import Release, ServiceRelease
@@ -28,14 +27,11 @@ from demandops.plan.running_version import (
     same_version,
     version_of_service,
 )
-from demandops.subject import Subject
 
+# From the strictest to the least strict.
 _STRICTNESS: tuple[VersionPolicy, ...] = ("refuse", "separate", "update", "upgrade")
+# With ``separate`` each version is an application of its own, so only shared services can differ.
 _REFUSING = ("refuse", "separate")
-"""The values of ``versions`` that refuse a difference.
-
-With ``separate`` each version is an application of its own, so only shared services can differ.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,9 +39,9 @@ class Difference:
     """A difference: demands ask for different versions of one application or service.
 
     ``what`` describes this application or service. ``demanded`` is the version that the new demand
-    asks for. ``others`` is the newest version that the other demands ask for. ``policy`` is the
-    value of ``versions`` in the application definition ``appdef``. If two definitions share the
-    service, it is the stricter of their values.
+    asks for. ``others`` is the newest version that the other demands ask for; ``newer`` tells
+    whether ``demanded`` is newer. ``policy`` is the value of ``versions`` in the application
+    definition ``appdef``. If two definitions share the service, it is the stricter of their values.
     """
 
     what: str
@@ -54,21 +50,18 @@ class Difference:
     demanded: str
     others: str
     newer: bool
-    """Whether ``demanded`` is newer than ``others``."""
+    # To report if :attr:`is_refused`.
     fault: Fault
-    """The fault to report if :attr:`is_refused`."""
 
     def matters_to(self, asked: str) -> bool:
         """Return whether the difference concerns a demand that names the version ``asked``.
 
-        ``asked`` is empty if the demand names no version. Then the difference concerns the demand
-        only if :attr:`newer` or :attr:`is_refused` is true.
+        ``asked`` is empty if the demand names no version.
         """
         return bool(asked) or self.newer or self.is_refused
 
     @property
     def is_refused(self) -> bool:
-        """Whether :attr:`policy` refuses the difference."""
         return self.policy in _REFUSING
 
     def approval_reason(self) -> str:
@@ -76,8 +69,10 @@ class Difference:
 
         The result has no meaning if :attr:`is_refused`.
         """
-        same = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
-        if self.policy == "upgrade" or same:
+        # Another major version breaks what others get, in both directions. In 0.x, too, only the
+        # first number counts.
+        same_major = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
+        if self.policy == "upgrade" or same_major:
             return ""
         change = (
             f"the upgrade of {self.what} from version {self.others} to {self.demanded}"
@@ -87,10 +82,7 @@ class Difference:
         return f"application definition '{self.appdef}', for {change}"
 
     def warning(self) -> str:
-        """Return a warning that the deployed version is newer than the demanded version.
-
-        The result is an empty text if the demanded version is the newer one.
-        """
+        """Return a warning that a newer version than the demanded one is deployed, or ``""``."""
         others = f"{self.what} runs version {self.others}, which others ask for"
         return "" if self.newer else f"{others}, not {self.demanded}"
 
@@ -105,94 +97,73 @@ def differences(
     """Yield the differences between the versions that a demand and other demands ask for.
 
     A difference that existed before the demand is left out, and so is one that does not concern the
-    demand (:meth:`Difference.matters_to`).
-
-    Args:
-        request: the demand.
-        before, after: the world before and after the demand.
-        changes: the claims that the demand changes.
-        plans: the releases that the demand may change, as they are after the demand.
+    demand (:meth:`Difference.matters_to`). ``plans`` are the releases that the demand may change,
+    as they are after it.
     """
     if not request.adds_claims:
         return
-    listed = {one.held.subject: one for one in request.demanded}
-    own: dict[str, tuple[Demanded, str]] = {}
+    listed = {item.held.subject: item for item in request.demanded}
+    demanded: dict[str, tuple[Demanded, str]] = {}
     for change in changes:
-        one, claim, old = listed.get(change.key.subject), change.after, change.before
-        if one is None or claim is None or not claim.is_on_application:
+        item, claim, old = listed.get(change.key.subject), change.after, change.before
+        if item is None or claim is None or not claim.is_on_application:
             continue
-        own[claim.application.id] = one, claim.application.version
+        demanded[claim.application.id] = item, claim.application.version
         if old is None or old.application.version != claim.application.version:
-            yield from _of_application(one, claim, after)
+            yield from _of_application(item, claim, after)
     for release in plans.values():
         if isinstance(release, ServiceRelease) and len(release.applications) > 1:
-            yield from _of_service(release, own, before, without_suspended(after))
+            yield from _of_service(release, demanded, before, without_suspended(after))
 
 
-def _of_application(one: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
-    """Yield the difference between a claim's version and the newest one of the other claims."""
+def _of_application(item: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
     app, ledger = claim.application, after.ledger
-    known = after.config.application_versions[app.appdef]
-    if len({known[word].rank for word in ledger.versions_asked(app.id, known)}) < 2:
+    versions = after.config.application_versions[app.appdef]
+    # Two words may name one version, for example a channel and a number.
+    if len({versions[word].rank for word in ledger.versions_asked(app.id, versions)}) < 2:
         return
     others = ledger.replace(claim.key, None)
-    own, theirs = known.get(app.version, known[""]), newest_asked(others, app.id, known)
+    own, theirs = versions.get(app.version, versions[""]), newest_asked(others, app.id, versions)
     if same_version(own, theirs):
         return
-    holders, word = _first_asker(others, app.subject, theirs, known)
+    holders, held = "", ""
+    for other in others.claims_on(app.subject):
+        word = other.application.version
+        if same_version(versions.get(word, versions[""]), theirs):
+            holders, held = ", ".join(other.requesters), word if word in versions else ""
+            break
     message = (
-        f"{_words(app.version, own)} contradicts an existing claim: '{app.id}' is held by "
-        f"{holders} in {_words(word, theirs)}; request that version, or use another application id"
+        f"{_version_text(app.version, own)} contradicts an existing claim: '{app.id}' is held by "
+        f"{holders} in {_version_text(held, theirs)}; request that version, or use another "
+        "application id"
     )
-    found = Difference(
+    difference = Difference(
         f"application '{app.id}'",
         app.appdef,
         after.config.appdefs[app.appdef].versions,
         own.name,
         theirs.name,
         own.rank > theirs.rank,
-        one.fault("version", message, code="conflict"),
+        item.fault("version", message, code="conflict"),
     )
-    if found.matters_to(app.version):
-        yield found
+    if difference.matters_to(app.version):
+        yield difference
 
 
-def _first_asker(
-    ledger: Ledger,
-    subject: Subject,
-    version: ApplicationVersion,
-    known: Mapping[str, ApplicationVersion],
-) -> tuple[str, str]:
-    """Return (requesters, word) of the first claim on ``subject`` that asks for ``version``.
-
-    ``word`` is the version or channel that the claim names; it is empty for the default version.
-    """
-    for claim in ledger.claims_on(subject):
-        word = claim.application.version
-        if same_version(known.get(word, known[""]), version):
-            return ", ".join(claim.requesters), word if word in known else ""
-    return "", ""
-
-
-def _words(word: str, version: ApplicationVersion) -> str:
+def _version_text(word: str, version: ApplicationVersion) -> str:
     named = f"version '{word}'" if word else "the default version"
     return f"{named} ({version.name})" if version.name not in ("", word) else named
 
 
 def _of_service(
     release: ServiceRelease,
-    listed: Mapping[str, tuple[Demanded, str]],
+    demanded: Mapping[str, tuple[Demanded, str]],
     before: World,
     after: World,
 ) -> Iterator[Difference]:
-    """Yield a difference for each listed application whose version of a shared service differs.
+    """Yield a difference for each demanded application whose version of a shared service differs.
 
-    The version is compared with the one that the other applications need.
-
-    Args:
-        release: the release of the shared service.
-        listed: the applications of the demand by id, each with the version that it asks for.
-        before, after: the world before and after the demand.
+    ``demanded`` has the applications of the demand by id, each with the version that it asks for.
     """
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}
@@ -200,22 +171,23 @@ def _of_service(
         return
     for_what = f"for {key.topic} of '{key.source}'" if key.topic else f"on '{key.node}'"
     what = f"{key.service} {for_what}"
-    for id, (one, asked) in listed.items():
+    for id, (item, asked) in demanded.items():
         others = [other for other in versions if other != id]
         own, theirs = versions.get(id), version_of_service(after, service, others)
         if own is None or contents(own, service) == contents(theirs, service):
             continue
+        # The difference was there before the demand.
         if same_version(running_version(before, id), own) and any(
             claim.application.id == id for claim in claims_needing(before, key)
         ):
             continue
+        # Versions of two definitions have names of their own, so the charts are compared.
         by_name = own.appdef == theirs.appdef and own.name
         new, current = (
             version.name if by_name else version.charts[service.chart].version
             for version in (own, theirs)
         )
-        has_current = f"a version that has {key.service} {current}"
-        remedy = f"version {current}" if by_name else has_current
+        remedy = f"version {current}" if by_name else f"a version that has {key.service} {current}"
         sharing = ", ".join(f"'{other}'" for other in others[:3])
         message = (
             f"{what} would run in version {new}, but is shared with {sharing} in version "
@@ -223,14 +195,14 @@ def _of_service(
         )
         appdefs = (config.appdefs[version.appdef] for version in (own, theirs))
         strictest = min(appdefs, key=lambda appdef: _STRICTNESS.index(appdef.versions))
-        found = Difference(
+        difference = Difference(
             what,
             strictest.name,
             strictest.versions,
             new,
             current,
             precedence(new) > precedence(current),
-            one.fault("version", message, code="conflict"),
+            item.fault("version", message, code="conflict"),
         )
-        if found.matters_to(asked):
-            yield found
+        if difference.matters_to(asked):
+            yield difference

@@ -1,9 +1,7 @@
 """Capacity: how much the running services request of each node, and how much the node has.
 
 Each replica of a service requests resources of the node where the replica runs. The service's
-definition says how much. A shared service counts once. Communication clients request nothing. To
-update :class:`Usage`, the generator plans only the releases that a demand affects, so the cost of a
-demand depends on what the demand changes.
+definition says how much. A shared service counts once. Communication clients request nothing.
 """
 
 from __future__ import annotations
@@ -26,8 +24,8 @@ from demandops.plan.release_keys import ReleaseKey, affected_keys, keys_of, keys
 from demandops.plan.replicas import most_replicas
 from demandops.subject import Subject, SubjectKind
 
+# The ids of a node and of a resource, as in ``("edge", "cpu")``.
 Need = tuple[str, str]
-"""The ids of a node and of a resource, as in ``("edge", "cpu")``."""
 Plans = Mapping[ReleaseKey, Release | None]
 
 
@@ -35,26 +33,22 @@ Plans = Mapping[ReleaseKey, Release | None]
 class Usage:
     """What services request on each node, for each resource, in thousandths of a unit."""
 
+    # This map follows each demand by what the demand changes. Its copies share what stays the same.
     amounts: HashTrieMap[Need, int] = field(default_factory=HashTrieMap)
 
     def of(self, node: str, resource: str) -> int:
-        """Return what services request of a resource on a node, in thousandths of a unit."""
         return self.amounts.get((node, resource)) or 0
 
-    def plus(self, more: Mapping[Need, int]) -> Usage:
-        """Return the usage with the amounts of ``more`` added; a negative amount lowers it."""
+    def plus(self, growth: Mapping[Need, int]) -> Usage:
         amounts = self.amounts
-        for need, amount in more.items():
-            total = (amounts.get(need) or 0) + amount
+        for need, amount in growth.items():
+            total = self.of(*need) + amount
             amounts = amounts.insert(need, total) if total else amounts.discard(need)
         return Usage(amounts)
 
 
 def whole_usage(world: World) -> Usage:
-    """Return what all services request on each node; empty if no node declares a capacity.
-
-    A release that cannot be planned requests nothing.
-    """
+    """Return what all services request on each node; empty if no node declares a capacity."""
     if not world.config.limits_capacity:
         return Usage()
     keys: dict[ReleaseKey, None] = {}
@@ -65,24 +59,14 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return a map from (node, resource) to how much more ``after`` requests than ``before``.
-
-    A number is negative if ``after`` requests less. What stays the same is left out.
-    """
+    """Return how much more ``after`` requests than ``before``; what stays the same is left out."""
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return the growth of the services' requests when claims change, by (node, resource).
-
-    A release that cannot be planned requests nothing. The map is empty if no node declares a
-    capacity.
-
-    Raises:
-        Refused: if an application definition that ``after`` needs is missing.
-    """
+    """Return the growth of the services' requests when claims change."""
     if not after.config.limits_capacity:
         return {}
     keys = affected_keys(before, after, changes)
@@ -95,48 +79,41 @@ def _plan_leniently(world: World, keys: Iterable[ReleaseKey]) -> Plans:
     for key in keys:
         try:
             planned[key] = plan(world, key)
-        except Refused:
+        except Refused:  # a release that cannot be planned requests nothing
             planned[key] = None
     return planned
 
 
 def _requests(plans: Plans, config: Config) -> Counter[Need]:
-    """Return what releases request, as a map from (node, resource) to the amount.
-
-    If a node is in several access domains, the amounts in all these domains are added up.
-    """
     total: Counter[Need] = Counter()
     for release in plans.values():
         if isinstance(release, ServiceRelease) and release.service.requests:
-            replicas = most_replicas(release.replicas)
+            # A machine in several access domains has a node in each, but only one capacity.
+            host, replicas = config.host_of(release.node.id), most_replicas(release.replicas)
             for resource, quantity in release.service.requests.items():
-                total[config.host_of(release.node.id), resource] += amount_of(quantity) * replicas
+                total[host, resource] += amount_of(quantity) * replicas
     return total
 
 
 def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
     """Yield (node, reason) for each resource of which a node has too little for the growth.
 
-    A resource whose requests do not grow is left out, even if they exceed the capacity already.
-
-    Args:
-        usage: what services request before the growth.
-        grown: a map from (node, resource) to the growth of the requests.
-        config: the configuration, which has the capacities of the nodes.
+    ``usage`` is what services request before the growth.
     """
     for (id, resource), amount in sorted(grown.items()):
-        known = config.nodes.get(id)
-        most = known.most(resource) if known else None
+        node = config.nodes.get(id)
+        most = node.most(resource) if node else None
         used = usage.of(id, resource)
+        # Only growth is refused. If a person lowers a capacity below what is used, no demand is
+        # stopped that adds nothing there.
         if most is None or amount <= 0 or used + amount <= most:
             continue
-        free, all_of_it = (amount_text(each, resource) for each in (max(most - used, 0), most))
+        free, capacity = (amount_text(each, resource) for each in (max(most - used, 0), most))
         asked = amount_text(amount, resource)
-        yield id, f"has {free} of {all_of_it} {resource} free, but {asked} is asked for"
+        yield id, f"has {free} of {capacity} {resource} free, but {asked} is asked for"
 
 
 def faults(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[Fault]:
-    """Yield a fault for each capacity that the growth would exceed (:func:`excesses`)."""
     for node, excess in excesses(usage, grown, config):
         message = (
             f"'{node}' {excess}; choose another node, release something first, or ask "
@@ -156,48 +133,50 @@ class Room:
         self,
         world: World,
         usage: Usage,
-        given_back: Iterable[Claim],
+        given_back: Iterable[Claim] = (),
         checkpoint: Callable[[], None] = lambda: None,
     ) -> None:
         self._world, self._usage, self._checkpoint = world, usage, checkpoint
-        self._own: dict[tuple[Subject, str], dict[str, int]] = {}
+        self._least: dict[tuple[Subject, str], dict[str, int]] = {}
+        # How many applications and services were placed on each node so far.
         self.newly_placed: Counter[str] = Counter()
-        """How many applications and services were placed on each node so far."""
-        self._change((one for one in given_back if one.is_on_application), give_back=True)
+        self.book((claim for claim in given_back if claim.is_on_application), give_back=True)
 
     def take(self, claim: Claim) -> None:
         """Book a claim on an application, and count the application in :attr:`newly_placed`."""
         self.newly_placed[claim.application.node] += 1
         self.book([claim])
 
-    def book(self, claims: Iterable[Claim]) -> None:
-        """Reduce the room of the nodes by what these claims on applications need."""
-        self._change(claims)
+    def book(self, claims: Iterable[Claim], *, give_back: bool = False) -> None:
+        """Reduce the room of the nodes by what these claims on applications need.
+
+        With ``give_back``, the claims are released instead.
+        """
+        if self._world.config.limits_capacity:
+            self._world, grown = self._after(claims, give_back=give_back)
+            self._usage = self._usage.plus(grown)
 
     def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:
         """Return, in words, the resources of which a node has too little for an application.
 
-        The result is empty if the node has room, or if the application cannot be planned.
-
-        Args:
-            claims: the claims to book for the application, with ``node`` as its node.
-            node: the node.
-            service: if not empty, only the service of this name is placed on the node.
+        ``claims`` are those to book for the application on ``node``. If ``service`` is not empty,
+        only the service of this name is placed there. The result is empty if the node has room, or
+        if the application cannot be planned.
         """
-        known = self._world.config.nodes.get(node)
-        if known is None or known.capacity is None:
+        entry = self._world.config.nodes.get(node)
+        if entry is None or entry.capacity is None:
             return []
         claims, host = list(claims), self._world.config.host_of(node)
         least = {(host, resource): most for resource, most in self.least(claims, service).items()}
         short = [excess for _, excess in excesses(self._usage, least, self._world.config)]
         if short:
             return short
+        # What the application needs is tried, not estimated: it is booked in memory and planned.
         _, grown = self._after(claims)
-        found = excesses(self._usage, grown, self._world.config)
-        return [excess for id, excess in found if id == host]
+        exceeded = excesses(self._usage, grown, self._world.config)
+        return [excess for id, excess in exceeded if id == host]
 
     def is_full(self, node: Node, needed: Mapping[str, int]) -> bool:
-        """Return whether a node lacks room for what is needed (resource → amount)."""
         host = self._world.config.host_of(node.id)
         return any(
             most is not None and self._usage.of(host, resource) + amount > most
@@ -208,15 +187,15 @@ class Room:
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
         """Return what an application requests at least of its node, as resource → amount.
 
-        Services that the application shares do not count, and neither do services with a node of
-        their own. If ``service`` is not empty, only the service of this name counts. The result is
-        empty if overrides may make the amounts depend on the node. Callers use the amounts to rule
-        out full nodes quickly.
+        Services that it shares do not count, and neither do services with a node of their own. If
+        ``service`` is not empty, only the service of this name counts.
         """
         subject, world = claims[0].subject, self._world
-        if any(one.node or one.deny or one.replicas is not None for one in world.overrides):
+        # Planning for each node takes long. This amount is the same on all nodes, so it is planned
+        # once and rules out full nodes. It is unknown if overrides may make it depend on the node.
+        if any(each.node or each.deny or each.replicas is not None for each in world.overrides):
             return {}
-        if (subject, service) not in self._own:
+        if (subject, service) not in self._least:
             after, _ = self._booked(claims)
             apart = claims[0].application.services
             keys = [
@@ -227,16 +206,11 @@ class Room:
                 and (key.service == service if service else key.service not in apart)
             ]
             total: Counter[str] = Counter()
-            own = _requests(_plan_leniently(after, keys), after.config)
-            for (_, resource), amount in own.items():
+            requests = _requests(_plan_leniently(after, keys), after.config)
+            for (_, resource), amount in requests.items():
                 total[resource] += amount
-            self._own[subject, service] = dict(total)
-        return self._own[subject, service]
-
-    def _change(self, claims: Iterable[Claim], *, give_back: bool = False) -> None:
-        if self._world.config.limits_capacity:
-            self._world, grown = self._after(claims, give_back=give_back)
-            self._usage = self._usage.plus(grown)
+            self._least[subject, service] = dict(total)
+        return self._least[subject, service]
 
     def _booked(
         self, claims: Iterable[Claim], *, give_back: bool = False
@@ -251,10 +225,7 @@ class Room:
     def _after(
         self, claims: Iterable[Claim], *, give_back: bool = False
     ) -> tuple[World, Mapping[Need, int]]:
-        """Return the world with these claims booked, and what services then request in addition.
-
-        With ``give_back``, the claims are released instead of booked.
-        """
+        """Return the world after the booking, and what services then request in addition."""
         self._checkpoint()
         after, changes = self._booked(claims, give_back=give_back)
         try:

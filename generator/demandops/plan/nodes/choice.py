@@ -7,7 +7,7 @@ chosen if it fits. If it does not fit, the best other node that fits is chosen.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import fsum, inf
 from types import MappingProxyType
 
@@ -28,26 +28,22 @@ from demandops.demand.demand_request import Demanded
 from demandops.errors import Fault, suggestion
 from demandops.ledger.world import World
 from demandops.plan.nodes.capacity import Room
-from demandops.plan.overrides.claim_overrides import moved_by_overrides
+from demandops.plan.overrides.claim_overrides import with_overridden_nodes
 from demandops.quoting import quoted
 
 _MOST_SHOWN = 5
+# After a booking failed on so many nodes, no other node is tried, because each trial takes time.
+# The bound is a number and not a time, so every generator comes to the same end.
 MOST_TRIED = 20
-"""After a booking failed on so many nodes, no other node is tried; each trial takes time."""
+# The code of the fault if no node fits, but at least one node lacks only room. Such a demand may
+# wait.
 NO_ROOM = "no-room"
-"""The code of the fault if no node fits, but at least one node lacks only room."""
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """A chosen node, and the reason for the choice in words."""
-
     node: str
     why: str
-
-
-Positions = Mapping[str, Position]
-"""The positions that a demand gives, by node id; a position in the inventory has precedence."""
 
 
 def requirement_of(service: Service) -> Requirement:
@@ -62,7 +58,7 @@ def requirement_of(service: Service) -> Requirement:
 
 
 def on_node(app: Application, node: str, service: Service | None, world: World) -> Application:
-    """Return an application moved to ``node``; if ``service`` is given, only this service moves."""
+    """Return an application with ``service``, or with all of itself, moved to ``node``."""
     if service is None:
         app = replace(app, node=node)
     else:
@@ -70,20 +66,11 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
     return with_overridden_nodes(app, world)
 
 
-def with_overridden_nodes(app: Application, world: World) -> Application:
-    """Return an application with its services moved to the nodes that overrides name."""
-    return replace(app, moved=MappingProxyType(moved_by_overrides(app, world)))
-
-
 def shares(service: Service, one: Application, other: Application) -> bool:
-    """Return whether two applications share the instances of a service that runs for each topic.
-
-    They do if they have the same appdef and node. A separate instance shares only with separate
-    instances of the same version. If two applications share instances, the generator tries to place
-    the service on one node for both.
-    """
-    of = ((app.appdef, app.node, app.own_version) for app in (one, other))
-    return service.scope == "topic" and len({*of}) == 1
+    """Return whether two applications share the instances of a service for each topic."""
+    # A separate instance of an application shares only with separate instances of its version.
+    identities = {(app.appdef, app.node, app.own_version) for app in (one, other)}
+    return service.scope == "topic" and len(identities) == 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,50 +78,49 @@ class Choice:
     """The choice of a node for one application, or for one of its services.
 
     ``service`` is ``None`` if the node is for the whole application. ``claims`` are the claims that
-    the application would get; the chosen node replaces the node in them.
+    the application would get; the chosen node replaces the node in them. ``suits`` returns whether
+    the demand can be booked with the given application; without it, a node is chosen without this
+    check.
     """
 
-    one: Demanded
+    item: Demanded
     requirement: Requirement
     world: World
     room: Room
     claims: tuple[Claim, ...]
     service: Service | None = None
     suits: Callable[[Application], bool] | None = None
-    """A function that returns whether the demand can be booked with the given application.
-
-    ``None`` means that a node is chosen without this check.
-    """
+    # Those that the demand gives, by node id. A position in the inventory has precedence.
+    positions: Mapping[str, Position] = field(default_factory=dict)
 
     @property
     def config(self) -> Config:
-        """The configuration."""
         return self.world.config
 
     @property
     def app(self) -> Application:
-        """The application."""
-        assert isinstance(self.one.held, Application)  # noqa: S101 - only these are placed
-        return self.one.held
+        assert isinstance(self.item.held, Application)  # noqa: S101 - only these are placed
+        return self.item.held
 
     def fits(self, node: str) -> bool:
         """Return whether a node meets the requirement, accepts services and permits this demand."""
-        known = self.config.nodes.get(node)
-        if known is None or any(lacks(known, self.requirement)):
+        entry = self.config.nodes.get(node)
+        if entry is None or any(lacks(entry, self.requirement)):
             return False
-        return not self._closed(known) and self._is_permitted(known)
+        return not self._closed(entry) and self._is_permitted(entry)
 
-    def candidates(self, positions: Positions) -> Iterator[Chosen]:
+    def candidates(self) -> Iterator[Chosen]:
         """Yield the nodes that fit, have room and pass :attr:`suits`, the best first.
 
         The choice ends early if the demand cannot be booked on :data:`MOST_TRIED` nodes.
         """
         fitting = self._fitting()
-        centre = self._centre(positions)
-        fitting.sort(key=lambda node: self._rank(node, centre, positions))
+        centre = self._centre()
+        fitting.sort(key=lambda node: self._rank(node, centre))
         skipped: dict[str, None] = {}
         tried = 0
         least: Mapping[str, int] | None = None
+        # The checks that cost least come first. A trial of the whole booking comes last.
         for node in fitting:
             if node.capacity is not None and least is None:
                 least = self.room.least(self._claims_on(node), self._name)
@@ -152,7 +138,12 @@ class Choice:
                 if tried == MOST_TRIED:
                     return
             else:
-                merit = self._merit(node, centre, positions)
+                choose = self.config.repo_settings.placement
+                merit = f"the one with the {'most' if choose == 'pack' else 'fewest'} applications"
+                if self._is_home(node):
+                    merit = "the node of its application"
+                elif choose == "nearest" and self._distance(node, centre) < inf:
+                    merit = "the nearest to its sources"
                 only = f", counting only nodes {' and '.join(skipped)}" if skipped else ""
                 why = f"{merit} among {len(fitting)} nodes that fit{only}"
                 yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
@@ -162,8 +153,8 @@ class Choice:
 
         :attr:`suits` is not asked.
         """
-        known = self.config.nodes.get(node)
-        if known is None or not self.fits(node) or self._shortage(known):
+        entry = self.config.nodes.get(node)
+        if entry is None or not self.fits(node) or self._shortage(entry):
             return None
         return Chosen(node, why)
 
@@ -174,11 +165,12 @@ class Choice:
     def _fitting(self) -> list[Node]:
         required, config = self.requirement, self.config
         traits = (*((name,) for name in required.capabilities), *required.labels)
+        # Of the nodes with each required trait, only the shortest list is searched.
         pools = [config.nodes_with.get(trait, ()) for trait in traits]
         return [
             node
             for node in min((config.nodes_by_role.get(required.role, ()), *pools), key=len)
-            if not any(lacks(node, self.requirement)) and not self._closed(node)
+            if not any(lacks(node, required)) and not self._closed(node)
         ]
 
     def _shortage(self, node: Node) -> list[str]:
@@ -193,35 +185,20 @@ class Choice:
 
     def _claims_on(self, node: Node) -> list[Claim]:
         return [
-            replace(one, held=on_node(one.application, node.id, self.service, self.world))
-            for one in self.claims
+            replace(claim, held=on_node(claim.application, node.id, self.service, self.world))
+            for claim in self.claims
         ]
 
-    def _merit(self, node: Node, centre: Position | None, positions: Positions) -> str:
-        """Return, in words, why a node comes first, for example ``the nearest to its sources``."""
-        if self._is_home(node):
-            return "the node of its application"
-        choose = self.config.repo_settings.placement
-        if choose == "nearest" and self._distance(node, centre, positions) < inf:
-            return "the nearest to its sources"
-        return f"the one with the {'most' if choose == 'pack' else 'fewest'} applications"
-
     def _is_home(self, node: Node) -> bool:
-        """Return whether the choice is for a service and ``node`` is the application's node."""
+        # A service on its application's node needs no connection to it.
         return self.service is not None and node.id == self.app.node
 
-    def _rank(
-        self, node: Node, centre: Position | None, positions: Positions
-    ) -> tuple[bool, float, float, str]:
-        """Return the key by which nodes are sorted; the best node has the lowest key.
-
-        ``placement`` of the settings decides whether the distance or the number of applications
-        counts first.
-        """
-        distance = self._distance(node, centre, positions)
+    def _rank(self, node: Node, centre: Position | None) -> tuple[bool, float, float, str]:
+        distance = self._distance(node, centre)
         booked = self.world.ledger.applications_on.get(node.id) or 0
         booked += self.room.newly_placed[node.id]
         away = not self._is_home(node)
+        # The id comes last, so that every generator and every replay chooses the same node.
         match self.config.repo_settings.placement:
             case "spread":
                 return away, booked, distance, node.id
@@ -229,26 +206,25 @@ class Choice:
                 return away, -booked, distance, node.id
         return away, distance, booked, node.id
 
-    def _distance(self, node: Node, centre: Position | None, positions: Positions) -> float:
-        """Return a node's squared distance from ``centre``; infinity if a position is unknown."""
-        position = self._position(node.id, positions)
+    def _distance(self, node: Node, centre: Position | None) -> float:
+        position = self._position(node.id)
         if centre is None or position is None:
             return inf
+        # Squared, because every machine computes this alike.
         return (position.x - centre.x) ** 2 + (position.y - centre.y) ** 2
 
-    def _centre(self, positions: Positions) -> Position | None:
+    def _centre(self) -> Position | None:
         """Return the middle of the sources whose position is known; ``None`` if none is known."""
         sources = sorted({topic.source for _, topic in self.app.all_inputs()})
-        known = [found for source in sources if (found := self._position(source, positions))]
-        if not known:
+        placed = [at for source in sources if (at := self._position(source))]
+        if not placed:
             return None
-        x, y = (fsum(getattr(one, axis) for one in known) / len(known) for axis in "xy")
+        x, y = (fsum(getattr(at, axis) for at in placed) / len(placed) for axis in "xy")
         return Position(x=x, y=y)
 
-    def _position(self, node: str, positions: Positions) -> Position | None:
-        """Return a node's position from the inventory or, if it has none there, from the demand."""
-        listed = self.config.nodes.get(node)
-        return (listed.position if listed else None) or positions.get(node)
+    def _position(self, node: str) -> Position | None:
+        entry = self.config.nodes.get(node)
+        return (entry.position if entry else None) or self.positions.get(node)
 
     def _closed(self, node: Node) -> str:
         """Return why a node accepts no application at all, or an empty text."""
@@ -257,9 +233,9 @@ class Choice:
         return "" if node.id in self.config.domain_of else "is in no access domain"
 
     def _is_permitted(self, node: Node) -> bool:
-        return permission.may_place(self.one, self.app.appdef, node.id, self.config)
+        return permission.may_place(self.item, self.app.appdef, node.id, self.config)
 
-    def none_fits(self, positions: Positions) -> Fault:
+    def none_fits(self) -> Fault:
         """Return the fault for an application or a service that gets no node.
 
         Call this only if :meth:`candidates` yields no node. The fault lists some nodes and what
@@ -267,7 +243,7 @@ class Choice:
         """
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
-        centre, code = self._centre(positions), "no-node"
+        centre, code = self._centre(), "no-node"
         misses: list[tuple[int, tuple[bool, float, float, str], str]] = []
         places = {self.config.place_of(NODES_FILE): None}
         for node in self.config.nodes_by_role.get(self.requirement.role, ()):
@@ -286,7 +262,7 @@ class Choice:
                 reasons.append("meets the requirement, but the demand would be refused there")
             text = f"'{node.id}' {joined(reasons)}"
             count = len(missing) + len(reasons) - bool(missing)
-            misses.append((count, self._rank(node, centre, positions), text))
+            misses.append((count, self._rank(node, centre), text))
         shown = [text for _, _, text in sorted(misses)[:_MOST_SHOWN]]
         hidden = len(misses) - len(shown)
         more = [f"{hidden} more {'are' if hidden > 1 else 'is'} not shown"] if hidden else []
@@ -297,8 +273,8 @@ class Choice:
 
     def _fault(self, message: str, code: str) -> Fault:
         if self.service is None:
-            return self.one.fault("place", message, code=code)
-        return self.one.fault("appdef", f"{self.service.name}: {message}", code=code)
+            return self.item.fault("place", message, code=code)
+        return self.item.fault("appdef", f"{self.service.name}: {message}", code=code)
 
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
@@ -316,10 +292,10 @@ def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
         if condition is None:  # the form of the demand has a fault
             continue
         if condition.name not in kinds:
-            known = (
+            remedy = (
                 suggestion(condition.name, kinds) or f"; add it in {config.place_of(NODES_FILE)}"
             )
-            yield f"no node has the property {quoted(condition.name)}{known}"
+            yield f"no node has the property {quoted(condition.name)}{remedy}"
         elif problem := condition_problem(condition, kinds[condition.name][0]):
             yield problem
 
@@ -329,21 +305,20 @@ def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
     if requirement.role not in ("", node.type):
         yield f"the role {quoted(requirement.role)}"
     labels = node.labels() if requirement.labels else {}
-    for key, wanted in requirement.labels:
-        if labels.get(key) != wanted:
-            yield f"the label {quoted(f'{key}={wanted}')}"
+    for key, value in requirement.labels:
+        if labels.get(key) != value:
+            yield f"the label {quoted(f'{key}={value}')}"
     for capability in requirement.capabilities:
         if capability not in node.capabilities:
             yield f"the capability {quoted(capability)}"
     for text in requirement.properties:
         if not meets_condition(node.properties, text):
             condition = read_condition(text)
-            value = node.properties.get(condition.name) if condition else None
-            has = "" if value is None else f" (it has {strict_yaml.short_repr(value)})"
+            actual = node.properties.get(condition.name) if condition else None
+            has = "" if actual is None else f" (it has {strict_yaml.short_repr(actual)})"
             yield f"the property {quoted(text)}{has}"
 
 
 def joined(reasons: list[str]) -> str:
-    """Return the reasons as one text: ``a, b and c``."""
     *first, last = reasons
     return f"{', '.join(first)} and {last}" if first else last

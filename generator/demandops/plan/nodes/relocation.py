@@ -1,9 +1,7 @@
 """Relocation: applications and services leave a drained node, and overrides move services.
 
-An application leaves a drained node only if the generator placed it on this node. If a demand names
-the node or an override keeps the application, it stays. Claims and definitions contain what is
-required of a node, so the original demands are not needed. The connections of a moved application
-follow (:mod:`demandops.plan.nodes.moved_connections`).
+Claims and definitions contain what is required of a node, so the original demands are not needed.
+The connections of a moved application follow (:mod:`demandops.plan.nodes.moved_connections`).
 """
 
 from __future__ import annotations
@@ -16,7 +14,7 @@ from math import inf
 
 from demandops.config.appdef import Service
 from demandops.demand import admission, permission
-from demandops.demand.application import Requirement
+from demandops.demand.application import InputTopic, Requirement
 from demandops.demand.claim import Claim, ClaimKey, requesters_of
 from demandops.demand.demand_request import Demanded
 from demandops.errors import Fault, sentences
@@ -37,15 +35,12 @@ from demandops.plan.nodes.choice import (
     on_node,
     requirement_of,
     shares,
-    with_overridden_nodes,
 )
 from demandops.plan.nodes.moved_connections import Move, renaming, with_moved
-from demandops.plan.overrides.claim_overrides import suspended_by
+from demandops.plan.overrides.claim_overrides import suspended_by, with_overridden_nodes
 from demandops.plan.release_keys import affected_keys
 from demandops.quoting import quoted
 from demandops.subject import Subject, SubjectKind
-
-_ANY = Requirement()
 
 
 def with_moves(
@@ -53,15 +48,10 @@ def with_moves(
 ) -> Drain:
     """Return ``request`` with the moves of all applications and services that can leave the node.
 
-    Args:
-        request: the drain; its ``id`` is the node.
-        world: the claims and the configuration.
-        usage: what services request on each node in ``world``.
-        names: the names of all releases in ``world``.
-        most: after so many tried nodes, the other applications are left for another drain.
+    After ``most`` tried nodes, the other applications are left for another drain.
     """
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
-    room, tried, last = Room(world, usage, ()), 0, request.after
+    room, tried, last = Room(world, usage), 0, request.after
     for id in applications_of(world.ledger, request.id):
         if id <= request.after:
             continue
@@ -70,60 +60,56 @@ def with_moves(
         last = id
         for service in _placed_at(request.id, id, world):
             ids = _moving_with(id, service, request.id, world)
-            claims = tuple(one for each in ids for one in world.ledger.application_claims(each))
+            claims = tuple(claim for each in ids for claim in world.ledger.application_claims(each))
             what = [f"application '{each}'" for each in ids]
             what = [f"service '{service.name}' of {each}" for each in what] if service else what
-            fixed = (_why_fixed(one, request.id, service) for one in claims)
-            found: _Moved | str = next(filter(None, fixed), "")
+            fixed = (_why_fixed(claim, request.id, service) for claim in claims)
+            outcome: _Moved | str = next(filter(None, fixed), "")
             tried += 1
-            if not found:
-                found, count = _moved(world, claims, room, names, service)
+            if not outcome:
+                outcome, count = _moved(world, claims, room, names, service)
                 tried += count
-            if isinstance(found, str):
-                stays.append(f"{what[0]} stays, because {found}")
+            # What cannot move holds up nothing else.
+            if isinstance(outcome, str):
+                stays.append(f"{what[0]} stays, because {outcome}")
                 continue
-            world, chosen, touched, names = found
+            world, chosen, touched, names = outcome
             # ``world`` has the application on its new node, so ``room`` must count it on this node
             for each in ids:
                 room.book(world.ledger.application_claims(each))
             keys += touched
-            moved += [f"{one} is placed on {quoted(chosen.node)}, {chosen.why}" for one in what]
+            moved += [f"{each} is placed on {quoted(chosen.node)}, {chosen.why}" for each in what]
     else:
         last = ""
     moves = claim_changes(start.ledger, world.ledger, keys)
     return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays), last=last)
 
 
+# The world after a move, the chosen node, the keys of the changed claims, and the names after it.
 _Moved = tuple[World, Chosen, list[ClaimKey], Names]
 
 
 def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return the services of an application for which ``node`` was chosen or named.
-
-    If ``node`` is the application's own node, the first item is ``None``.
-    """
+    """Return the services of an application on ``node``, and ``None`` first for itself."""
     app = world.ledger.application(id)
     if app is None:
         return []
-    known = world.config.services.get(app.appdef, {})
-    services = [
-        known[one] for one, on in sorted(app.services.items()) if on == node and one in known
-    ]
-    return [*([None] if app.node == node else []), *services]
+    definitions = world.config.services.get(app.appdef, {})
+    names = sorted(name for name, at in app.services.items() if at == node and name in definitions)
+    return [*([None] if app.node == node else []), *(definitions[name] for name in names)]
 
 
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
-    """Return the ids of the applications that must move together with ``id``, including ``id``.
-
-    These are the applications that share the instances of ``service`` on the node.
-    """
+    """Return the ids of the applications that must move together with ``id``, including ``id``."""
     app = world.ledger.application(id)
     if service is None or service.scope != "topic" or app is None:
         return [id]
-    others = ((one, world.ledger.application(one)) for one in applications_of(world.ledger, node))
+    # They share the instances of the service on the node. If only some moved, the application's
+    # node would get the same outputs from two nodes.
+    others = {each: world.ledger.application(each) for each in applications_of(world.ledger, node)}
     return [
-        one
-        for one, other in others
+        each
+        for each, other in others.items()
         if other and other.services.get(service.name) == node and shares(service, app, other)
     ]
 
@@ -135,7 +121,7 @@ def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
         return f"demand '{claim.demand}' names the node" if service.name in app.named else ""
     if claim.keeping_override:
         return f"the override '{claim.keeping_override}' keeps it"
-    if app.place is None:
+    if app.place is None:  # a claim has this only if the generator chose the node
         return f"demand '{claim.demand}' names the node"
     here = [name for name in app.named if name not in app.services]
     return f"demand '{claim.demand}' names the node of {joined(here)}" if here else ""
@@ -152,28 +138,28 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
 def _moved(
     world: World, claims: tuple[Claim, ...], room: Room, names: Names, service: Service | None
 ) -> tuple[_Moved | str, int]:
-    """Return the world with an application, or only its ``service``, moved to the best other node.
+    """Return the move of an application, or only of its ``service``, to the best other node.
 
-    The result also has the chosen node, the keys of the changed claims, and the names after the
-    move. If no move is possible, the result is the reason as a text. The second value is how many
-    nodes were tried.
+    If no move is possible, the result is the reason as a text. The second value is how many nodes
+    were tried.
     """
-    required = reduce(Requirement.united, (one.application.place or _ANY for one in claims))
-    required = requirement_of(service) if service else required
-    roles = dict.fromkeys(role for one in claims for role in one.application.inputs)
-    inputs = {
-        role: tuple(dict.fromkeys(t for c in claims for t in c.application.inputs.get(role, ())))
-        for role in roles
-    }
-    app = claims[0].application.with_inputs(inputs)
+    places = (claim.application.place or Requirement() for claim in claims)
+    required = requirement_of(service) if service else reduce(Requirement.united, places)
+    inputs: dict[str, dict[InputTopic, None]] = {}
+    for claim in claims:
+        for role, topics in claim.application.inputs.items():
+            inputs.setdefault(role, {}).update(dict.fromkeys(topics))
+    united = {role: tuple(topics) for role, topics in inputs.items()}
+    app = claims[0].application.with_inputs(united)
     demanded = Demanded(app, requesters_of(claims), str)
     choice = Choice(demanded, required, world, room, claims, service)
     reasons: list[str] = []
+    # On the sender's own node, no connection would rename the topic.
     renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
-    for chosen in islice(choice.candidates({}), MOST_TRIED):
+    for chosen in islice(choice.candidates(), MOST_TRIED):
         if route := renamed.get(chosen.node):
-            topics = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
-            reasons.append(f"on {quoted(chosen.node)} {topics}")
+            problem = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
+            reasons.append(f"on {quoted(chosen.node)} {problem}")
             continue
         move = partial(on_node, node=chosen.node, service=service, world=world)
         after, changes = with_moved(world, claims, move)
@@ -183,20 +169,16 @@ def _moved(
             keys = [change.key for change in changes]
             return (after, chosen, keys, moved_names), len(reasons) + 1
         reasons.append(f"on {quoted(chosen.node)} {fault.message}")
-    return sentences(reasons) or choice.none_fits({}).message, len(reasons)
+    return sentences(reasons) or choice.none_fits().message, len(reasons)
 
 
 @dataclass(frozen=True, slots=True)
 class LedgerAfterMoves:
-    """The ledger after services have moved to the nodes that overrides name.
-
-    ``keys`` are the keys of the claims that may have changed.
-    """
-
     ledger: Ledger
+    # those of the claims that may have changed
     keys: tuple[ClaimKey, ...]
+    # (file, message) for each override that cannot move a service of an application
     stays: tuple[tuple[str, str], ...]
-    """(file, message) for each override that cannot move a service of an application."""
 
 
 def following_overrides(
@@ -205,44 +187,43 @@ def following_overrides(
     """Return the ledger after services have moved to the nodes that overrides name.
 
     The connections follow the services. A service also moves back when no override moves it any
-    longer. A service stays if the move would cause a fault.
-
-    Args:
-        world: the claims and the configuration.
-        subjects: the subjects whose claims changed; ``None`` means all applications.
+    longer. A service stays if the move would cause a fault. ``subjects`` are the subjects whose
+    claims changed; ``None`` means all applications.
     """
-    ids = [one.id for one in subjects or () if one.kind is SubjectKind.APPLICATION]
+    ids = [subject.id for subject in subjects or () if subject.kind is SubjectKind.APPLICATION]
     if subjects is None:
         ids = [*world.ledger.moved_applications()]
-        if any(one.node for one in world.overrides):
+        if any(override.node for override in world.overrides):
             ids = sorted(world.ledger.subjects(SubjectKind.APPLICATION))
     change = partial(with_overridden_nodes, world=world)
-    wanted = [
+    moving = [
         id
         for id in dict.fromkeys(ids)
         for app in [world.ledger.application(id)]
         if app is not None and change(app) != app
     ]
-    together, left = wanted, list[str]()
-    names = name_clash.all_names(world) if wanted else name_clash.NONE
+    together, alone = moving, list[str]()
+    names = name_clash.all_names(world) if moving else name_clash.NONE
     while together:  # applications that share a service must move at the same time
         after, changes, moved_names = _all_moved(world, together, change, names)
-        wrong = [
-            id for id, of in changes.items() if next(_faults(world, after, of, moved_names), None)
+        faulty = [
+            id for id, own in changes.items() if next(_faults(world, after, own, moved_names), None)
         ]
-        if not wrong:
+        if not faulty:
             break
-        together, left = [id for id in together if id not in wrong], [*left, *wrong]
+        together, alone = [id for id in together if id not in faulty], [*alone, *faulty]
     keys, stays = list[ClaimKey](), list[tuple[str, str]]()
-    for ids in filter(None, (together, *([one] for one in left))):
+    # A fault of one application may have come from another that did not move in the end. So each
+    # that caused a fault is tried again, alone, after the others have moved.
+    for ids in filter(None, (together, *([id] for id in alone))):
         after, changes, moved_names = _all_moved(world, ids, change, names)
         faults = (
-            found for of in changes.values() for found in _faults(world, after, of, moved_names)
+            fault for own in changes.values() for fault in _faults(world, after, own, moved_names)
         )
         fault = None if ids is together else next(faults, None)
         if fault is None:
             world, names = after, moved_names
-            keys += [one.key for of in changes.values() for one in of]
+            keys += [each.key for own in changes.values() for each in own]
         else:
             stays += _unmoved(ids[0], world, fault)
     return LedgerAfterMoves(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
@@ -253,9 +234,8 @@ def with_restored_moves(request: Restoration, world: World) -> Restoration:
 
     A service whose move would cause a fault among these claims is not adapted.
     """
-    moves = any(one.node for one in world.overrides)
-    if not moves and not any(
-        one.is_on_application and one.application.moved for one in request.claims
+    if not any(override.node for override in world.overrides) and not any(
+        claim.is_on_application and claim.application.moved for claim in request.claims
     ):
         return request
     ledger = Ledger(ended=world.ledger.ended)
@@ -270,21 +250,19 @@ def _all_moved(
     world, changes = before, dict[str, tuple[ClaimChange, ...]]()
     for id in applications:
         world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
-    every = [one for of in changes.values() for one in of]
-    keys = affected_keys(before, world, every)
+    keys = affected_keys(before, world, [each for own in changes.values() for each in own])
     return world, changes, name_clash.followed(names, before, world, keys)
 
 
 def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
-    """Yield (file, message) for each override that cannot move a service of an application."""
     app = world.ledger.application(id)
     assert app is not None  # noqa: S101 - it is claimed
-    wanted = with_overridden_nodes(app, world).moved
-    changed = {name for name in {*wanted, *app.moved} if wanted.get(name) != app.moved.get(name)}
-    nodes = {wanted[name] for name in changed if name in wanted}
+    moved = with_overridden_nodes(app, world).moved
+    changed = {name for name in {*moved, *app.moved} if moved.get(name) != app.moved.get(name)}
+    nodes = {moved[name] for name in changed if name in moved}
     for override in world.overrides:
         if override.node in nodes:
-            services = " and ".join(sorted(n for n in changed if wanted.get(n) == override.node))
+            services = " and ".join(sorted(n for n in changed if moved.get(n) == override.node))
             yield (
                 override.path,
                 f"does not move {services} of application '{app.id}' to '{override.node}': "
@@ -303,10 +281,10 @@ def _faults(
         claim = change.after
         if claim is None:
             continue
-        wanted, others = request_for(claim), after.ledger.replace(claim.key, None)
-        yield from admission.faults(wanted, after.config)
-        yield from permission.faults(wanted, after.config)
-        yield from conflicts(wanted.demanded[0], others)
+        request, others = request_for(claim), after.ledger.replace(claim.key, None)
+        yield from admission.faults(request, after.config)
+        yield from permission.faults(request, after.config)
+        yield from conflicts(request.demanded[0], others)
         override = suspended_by(claim, after)
         if override and change.before and not suspended_by(change.before, before):
             yield Fault("denied", "", f"{claim.subject} would be denied by {override.path}")
@@ -320,30 +298,31 @@ def _faults(
 
 
 def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
-    """Yield a fault for each topic that two connections bring to a node from different senders.
-
-    ``claim`` is the claim on one of the two connections. A topic that a demand lists as an input is
-    never a fault, because the demand names the source.
-    """
+    """Yield a fault for each topic that two connections bring to a node from different senders."""
     if claim.is_on_application:
         return
-    apps = (
-        one.application
-        for one in after.ledger.claims_of_demand(claim.demand)
-        if one.is_on_application
-    )
-    inputs = {(topic.source, topic.topic) for app in apps for _, topic in app.all_inputs()}
+    ledger = after.ledger
+    inputs = {
+        (topic.source, topic.topic)
+        for held in ledger.claims_of_demand(claim.demand)
+        if held.is_on_application
+        for _, topic in held.application.all_inputs()
+    }
     for route in claim.connection.topics:
         sender, receiver = route.sender_and_receiver(*claim.connection.nodes)
-        if (sender, route.read_topic) not in inputs:
-            for other in _senders(after.ledger, receiver, route.written_topic) - {sender}:
-                topic = quoted(route.written_topic)
-                words = f"{topic} would come from {quoted(sender)} and from {quoted(other)}"
-                yield Fault("conflict", "", words)
-
-
-def _senders(ledger: Ledger, receiver: str, topic: str) -> set[str]:
-    connections = map(ledger.connection, ledger.connections_bringing(receiver, topic))
-    routes = ((one, route) for one in connections if one for route in one.topics)
-    ends = ((*route.sender_and_receiver(*one.nodes), route.written_topic) for one, route in routes)
-    return {sender for sender, *target in ends if target == [receiver, topic]}
+        # Of an input that the demand lists, the demand names the source.
+        if (sender, route.read_topic) in inputs:
+            continue
+        target = (receiver, route.written_topic)
+        senders = {
+            from_node
+            for connection in map(ledger.connection, ledger.connections_bringing(*target))
+            if connection is not None
+            for other in connection.topics
+            for from_node, to_node in [other.sender_and_receiver(*connection.nodes)]
+            if (to_node, other.written_topic) == target
+        }
+        for other_sender in senders - {sender}:
+            topic = quoted(route.written_topic)
+            words = f"{topic} would come from {quoted(sender)} and from {quoted(other_sender)}"
+            yield Fault("conflict", "", words)

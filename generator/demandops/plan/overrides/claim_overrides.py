@@ -1,8 +1,7 @@
 """The effects of overrides on claims: ``deny`` suspends claims, ``keep`` books further claims.
 
 A suspended claim stays booked, but nothing runs for it. The planner reads the ledger through a view
-that leaves out suspended claims. The view checks each claim when the claim is read, so there is no
-second ledger to keep up to date.
+that leaves out suspended claims.
 
 When the last claim on a subject is released, ``keep`` books a claim with the same content for the
 owner of the override. A later demand for the subject replaces this kept claim. Bookkeeping and
@@ -14,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
+from types import MappingProxyType
 
 from demandops.config.config import Config
 from demandops.config.override import Override, Selector
@@ -43,29 +43,30 @@ class Traits:
     service: str = ""
 
 
-def moved_by_overrides(app: Application, world: World) -> dict[str, str]:
-    """Return the services of an application that overrides move, as a map to their new nodes."""
-    moving = [one for one in world.overrides if one.node]
-    found: dict[str, str] = {}
+def with_overridden_nodes(app: Application, world: World) -> Application:
+    """Return an application with its services moved to the nodes that overrides name."""
+    moving = [override for override in world.overrides if override.node]
+    nodes: dict[str, str] = {}
     for service in world.config.services.get(app.appdef, {}).values() if moving else ():
-        nodes = (app.chosen_node(service.name),)
-        traits = Traits(nodes, None, (app.id,), (app.appdef,), service=service.name)
-        for override in moving if service.is_movable else ():
-            if override.node and selects(override, traits, world.config):
-                found[service.name] = override.node
-    return found
+        if service.is_movable:
+            # A selector is compared with the node before any move. Otherwise an override that
+            # selects this node would no longer select the service after the move.
+            chosen = (app.chosen_node(service.name),)
+            traits = Traits(chosen, None, (app.id,), (app.appdef,), service=service.name)
+            for override in moving:
+                if override.node and selects(override, traits, world.config):
+                    nodes[service.name] = override.node
+    return replace(app, moved=MappingProxyType(nodes))
 
 
-def traits_of(one: Claim | Demanded) -> Traits:
-    """Return the values of a claim or a demand with which selectors are compared."""
-    held = one.held
+def traits_of(item: Claim | Demanded) -> Traits:
+    held = item.held
     if isinstance(held, Application):
-        return Traits(held.nodes, one.requesters, (held.id,), (held.appdef,))
-    return Traits(held.nodes, one.requesters, connections=(held.id,))
+        return Traits(held.nodes, item.requesters, (held.id,), (held.appdef,))
+    return Traits(held.nodes, item.requesters, connections=(held.id,))
 
 
 def fits(selector: Selector, traits: Traits, config: Config) -> bool:
-    """Return whether ``traits`` match every field of ``selector``."""
     fields = (
         (selector.applications, traits.applications),
         (selector.appdefs, traits.appdefs),
@@ -83,14 +84,12 @@ def fits(selector: Selector, traits: Traits, config: Config) -> bool:
 
 
 def has_labels(selector: Selector, node: str, config: Config) -> bool:
-    """Return whether a node has all labels of a selector."""
-    known = config.nodes.get(node)
-    labels = known.labels() if known else {}
+    entry = config.nodes.get(node)
+    labels = entry.labels() if entry else {}
     return all(labels.get(key) == value for key, value in (selector.labels or {}).items())
 
 
 def selects(override: Override, traits: Traits, config: Config) -> bool:
-    """Return whether one of an override's selectors matches ``traits``."""
     return any(fits(selector, traits, config) for selector in override.select)
 
 
@@ -98,36 +97,31 @@ def selects(override: Override, traits: Traits, config: Config) -> bool:
 class UnsuspendedClaims(Ledger):
     """A read-only view of a ledger, in which suspended claims are missing."""
 
+    # A claim is checked when it is read, so there is no second ledger to keep up to date.
     world: World | None = field(default=None, compare=False)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
-        """Return the claims on ``subject`` that are not suspended, sorted by demand id."""
         return tuple(claim for claim in Ledger.claims_on(self, subject) if self._is_active(claim))
 
     def first_claim(self, subject: Subject) -> Claim | None:
-        """Return the first claim on ``subject`` that is not suspended, or ``None``."""
         first = Ledger.first_claim(self, subject)
         if first is None or self._is_active(first):
             return first
         return next(iter(self.claims_on(subject)), None)
 
     def get(self, key: ClaimKey) -> Claim | None:
-        """Return the claim at ``key``, or ``None`` if it is suspended or does not exist."""
         claim = Ledger.get(self, key)
         return claim if claim and self._is_active(claim) else None
 
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
-        """Return the ``known`` versions that unsuspended claims on an application ask for.
-
-        The result also has an empty text if an unsuspended claim asks for no version, or for an
-        unknown version.
-        """
         booked = Ledger.versions_asked(self, application, known)
         asked = {
             word
             for word in booked
             if any(self.get(key) for key in self.index.get(("version", application, word)) or ())
         }
+        # The ledger only counts the claims that ask for none of the known versions. Suspended
+        # claims must not count, so each of these claims is looked at.
         claims = self.claims.get(Subject(SubjectKind.APPLICATION, application)) or ()
         if "" in booked and any(
             claim.application.version not in booked - {""} and self._is_active(claim)
@@ -137,7 +131,6 @@ class UnsuspendedClaims(Ledger):
         return asked
 
     def is_carried_to(self, target: str, topic: str) -> bool:
-        """Return whether a claimed connection brings ``topic`` to the node ``target``."""
         return bool(self.connections_bringing(target, topic))
 
     def _ids(self, *entry: str) -> tuple[str, ...]:
@@ -151,7 +144,7 @@ class UnsuspendedClaims(Ledger):
 def without_suspended(world: World) -> World:
     """Return the world with a view of its ledger that leaves out suspended claims."""
     ledger = world.ledger
-    if isinstance(ledger, UnsuspendedClaims) or not any(one.deny for one in world.overrides):
+    if isinstance(ledger, UnsuspendedClaims) or not any(each.deny for each in world.overrides):
         return world
     parts = (getattr(ledger, part.name) for part in fields(Ledger))
     view = replace(UnsuspendedClaims(*parts), world=world)
@@ -159,18 +152,15 @@ def without_suspended(world: World) -> World:
 
 
 def suspended_by(claim: Claim, world: World) -> Override | None:
-    """Return the override that suspends a claim, or ``None``.
-
-    If several overrides do, return the one with the highest rank.
-    """
+    """Return the override of the highest rank that suspends a claim, or ``None``."""
     return denied_by(traits_of(claim), world) if world.overrides else None
 
 
 def denied_by(traits: Traits, world: World) -> Override | None:
     """Return the override that denies a claim, demand or release with these traits, or ``None``.
 
-    If several overrides do, return the one with the highest rank. For the release of a service,
-    only selectors that name services count. For a claim or a demand, only the others count.
+    For the release of a service, only selectors that name services count. For a claim or a demand,
+    only the others count.
     """
     for override in reversed(world.overrides):
         if override.deny and any(
@@ -183,16 +173,15 @@ def denied_by(traits: Traits, world: World) -> Override | None:
 
 def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
     """Yield (claim, suspending override) for each suspended claim, sorted by subject."""
-    if not any(one.deny for one in world.overrides):
+    if not any(override.deny for override in world.overrides):
         return
-    for claim in sorted(world.ledger, key=lambda one: (str(one.subject), one.demand)):
+    for claim in sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand)):
         override = suspended_by(claim, world)
         if override is not None:
             yield claim, override
 
 
 def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
-    """Return the ledger without the kept claims on these subjects."""
     for subject in subjects:
         ledger = ledger.without(ledger.kept_claims(subject))
     return ledger
@@ -203,12 +192,12 @@ def with_kept_claims(
 ) -> tuple[Ledger, Changes]:
     """Update the kept claims after a booking; return the ledger and all changes.
 
-    Only the kept claims on ``subjects`` and on the subjects that the booking changed are updated.
+    ``subjects`` are updated as well, although the booking may not have changed them.
     """
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
-    ledger, more = update_kept_claims(before, after, touched, now)
-    return ledger, replace(changes, claims=claim_changes(before, ledger, [*keys, *more]))
+    ledger, kept = update_kept_claims(before, after, touched, now)
+    return ledger, replace(changes, claims=claim_changes(before, ledger, [*keys, *kept]))
 
 
 def update_kept_claims(
@@ -217,12 +206,7 @@ def update_kept_claims(
     """Return the ledger in which ``subjects`` have exactly the kept claims that overrides want.
 
     The second value has the keys of all kept claims on ``subjects``, before and after the update.
-
-    Args:
-        before: the ledger before a change.
-        after: the world after the change.
-        subjects: the subjects that changed.
-        now: the booking time of each claim that an override books.
+    ``now`` is the booking time of each claim that an override books.
     """
     keys, ledger = list[ClaimKey](), after.ledger
     for subject in subjects:
@@ -239,32 +223,26 @@ def update_kept_claims(
 
 
 def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
-    """Return every subject with a kept claim, sorted."""
     return tuple(dict.fromkeys(claim.subject for claim in ledger.kept_claims()))
 
 
 def _kept_claim(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the claim by which an override keeps a subject, or ``None`` if no override does.
+    """Return the claim by which an override keeps a subject that no demand holds, or ``None``.
 
-    Call this only for a subject that no demand holds. The claim is one of ``existing``, or a new
-    claim. A subject whose last claim is suspended gets no new claim.
-
-    Args:
-        existing: the kept claims on the subject before the update.
-        before: all claims on the subject before the change.
-        world: the world after the change.
-        now: the booking time of a new claim.
+    It is one of ``existing``, the kept claims before the update, or a copy of the last of the
+    claims that were on the subject ``before`` the change.
     """
     for claim in existing:
-        if any(one.name == claim.keeping_override for one in keeping_overrides(claim, world)):
+        keeping = keeping_overrides(claim, world)
+        if any(override.name == claim.keeping_override for override in keeping):
             return claim
     if not before:
         return None
     last = max(before, key=lambda claim: (claim.booked, claim.demand))
     if suspended_by(last, world) is not None:
-        return None
+        return None  # nothing ran for this claim, so there is nothing to keep
     for override in keeping_overrides(last, world):
         name = OVERRIDE_PREFIX + override.name
         return replace(
@@ -281,13 +259,11 @@ def _kept_claim(
 
 
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:
-    """Return the overrides that keep the subject of a claim, the highest in rank first.
-
-    A kept claim names only the override's owner, not the requesters of the demand. So
-    ``requesters`` of a selector is ignored for a kept claim.
-    """
+    """Return the overrides that keep the subject of a claim, the highest in rank first."""
     traits = traits_of(claim)
     if claim.keeping_override is not None:
+        # A kept claim names only the override's owner, not the requesters of the demand. So
+        # ``requesters`` of a selector is not compared.
         traits = replace(traits, requesters=None)
-    keeping = (one for one in reversed(world.overrides) if one.keep)
-    return [one for one in keeping if selects(one, traits, world.config)]
+    keeping = (override for override in reversed(world.overrides) if override.keep)
+    return [override for override in keeping if selects(override, traits, world.config)]

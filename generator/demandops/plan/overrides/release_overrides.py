@@ -18,10 +18,7 @@ from demandops.plan.replicas import overridden
 
 
 def apply_overrides(release: Release, world: World) -> Release | None:
-    """Return a release with the effects of all overrides, or ``None`` if one of them denies it.
-
-    The node of the release stays, because claims already record the moves by overrides.
-    """
+    """Return a release with the effects of all overrides, or ``None`` if one of them denies it."""
     if not world.overrides:
         return release
     config, claims = world.config, claims_of(release, world.ledger)
@@ -33,7 +30,9 @@ def apply_overrides(release: Release, world: World) -> Release | None:
     for override in world.overrides:
         effects = effects_on(release, override, config) if selects(override, traits, config) else ()
         if override.node != release.node.id:
-            effects = tuple(one for one in effects if one != "node")
+            # The claims record a move by an override, so a moved release is on its new node
+            # already. A release that is elsewhere was not moved by this override.
+            effects = tuple(effect for effect in effects if effect != "node")
         if override.keep and override.name in kept:
             effects = (*effects, "keep")
         if effects:
@@ -42,8 +41,8 @@ def apply_overrides(release: Release, world: World) -> Release | None:
 
 
 def service_denied_by(release: Release, world: World) -> Override | None:
-    """Return the override that denies the release of a service, or ``None``."""
-    if not isinstance(release, ServiceRelease) or not any(one.deny for one in world.overrides):
+    denies = any(override.deny for override in world.overrides)
+    if not isinstance(release, ServiceRelease) or not denies:
         return None
     return denied_by(_traits(release, claims_of(release, world.ledger)), world)
 
@@ -55,9 +54,6 @@ def apply_effects(
 
     ``by`` has pairs of an override and the names of its effects on the release. The effects on
     images and Helm values are only recorded, in :attr:`ServiceRelease.shaping`.
-
-    Raises:
-        Refused: if an override moves the release to a node that is unknown or in no access domain.
     """
     by = tuple(by)
     if not by:
@@ -65,13 +61,13 @@ def apply_effects(
     release = replace(release, shaping=Shaping(by))
     if not isinstance(release, ServiceRelease):
         return release
-    planned = release.replicas
     for override, effects in by:
         if "version" in effects:
             chart = config.charts[release.service.chart].at(str(override.version))
             release = replace(release, chart=chart or release.chart)
         if "replicas" in effects and override.replicas is not None:
-            release = replace(release, replicas=overridden(planned, override.replicas), keeps=None)
+            replicas = overridden(release.replicas, override.replicas)
+            release = replace(release, replicas=replicas, keeps=None)
         if "node" in effects:
             node, domain = config.node_and_domain(str(override.node))
             release = replace(release, node=node, domain=domain)
@@ -85,9 +81,9 @@ def effects_on(release: Release, override: Override, config: Config) -> tuple[st
     """
     possible = {"hold"}
     if isinstance(release, ServiceRelease):
-        known = config.charts[release.service.chart].versions()
+        versions = config.charts[release.service.chart].versions()
         possible |= {"values", "replicas"} | ({"node"} if release.service.is_movable else set())
-        possible |= {"version"} if override.version in known else set()
+        possible |= {"version"} if override.version in versions else set()
     elif override.patches_clients():
         possible |= {"values"}
     possible |= {"images"} if {*release.images} & {*(override.images or ())} else set()
@@ -99,7 +95,7 @@ def _traits(release: Release, claims: tuple[Claim, ...]) -> Traits:
     if isinstance(release, ServiceRelease):
         appdefs = {claim.application.appdef for claim in claims}
         if release.service.is_movable:  # a selector is compared with the node before any move
-            chosen = {one.application.chosen_node(release.key.service) for one in claims}
+            chosen = {claim.application.chosen_node(release.key.service) for claim in claims}
             nodes = tuple(sorted(chosen)) or nodes
         return Traits(
             nodes,

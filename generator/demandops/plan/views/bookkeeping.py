@@ -6,9 +6,8 @@ whenever it is shown, and is stored nowhere.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
-from datetime import datetime
 from typing import Any, Literal, TypeAlias
 
 from demandops.config.inventory import amount_text
@@ -23,8 +22,8 @@ from demandops.plan.views import release_causes
 from demandops.subject import Subject, SubjectKind
 
 _LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
+# Topic → the requesters of the topic, sorted.
 _Requesters: TypeAlias = dict[str, list[str]]
-"""Topic → the requesters of the topic, sorted."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +51,7 @@ class ServiceEntry:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEntry:
-    """One connection and its requesters; ``topics`` has the requesters of each source topic."""
+    """One connection and its requesters, also those of each source topic."""
 
     type: str
     source: str
@@ -63,8 +62,6 @@ class ConnectionEntry:
 
 @dataclass(frozen=True, slots=True)
 class SuspendedEntry:
-    """A booked claim that is not planned, and the override that suspends it."""
-
     kind: str
     id: str
     demand: str
@@ -75,8 +72,6 @@ class SuspendedEntry:
 
 @dataclass(frozen=True, slots=True)
 class WaitingEntry:
-    """A demand that waits for room, and since when."""
-
     demand: str
     requesters: list[str]
     since: str
@@ -104,10 +99,9 @@ class DemandEntry:
 class Bookkeeping:
     """The whole view: services by release name, connections and demands by id, all sorted.
 
-    ``demands`` includes demands whose claims are suspended. ``suspended`` are the claims that
-    overrides suspend; no service or connection counts them. ``nodes`` are the nodes that declare a
-    capacity, each with its resources. ``waiting`` are the demands that wait for room, in the order
-    in which the generator tries to book them.
+    ``demands`` includes demands whose claims are suspended. No service or connection counts the
+    claims in ``suspended``. ``nodes`` are the nodes that declare a capacity. ``waiting`` is in the
+    order in which the generator tries to book.
     """
 
     services: dict[str, ServiceEntry]
@@ -119,14 +113,20 @@ class Bookkeeping:
 
 
 def bookkeeping(world: World) -> Bookkeeping:
-    """Return what runs and who requests it.
-
-    Raises:
-        Refused: for the same reasons as :func:`demandops.plan.planner.plan`.
-    """
     active = without_suspended(world)
-    services = {
-        release.name: ServiceEntry(
+    services = {}
+    for release in release_causes.releases(world):
+        if not isinstance(release, ServiceRelease):
+            continue
+        inputs = {
+            role: {topic.topic: set[str]() for topic in topics}
+            for role, topics in release.inputs.items()
+        }
+        for claim in claims_of(release, active.ledger):
+            for role, topic, key in demanded_inputs(active, release, claim.application):
+                if topic in inputs[role]:  # a claim that a person wrote may name another topic
+                    inputs[role][topic].update(claim.holders(key))
+        services[release.name] = ServiceEntry(
             applications=list(release.applications),
             service=release.key.service,
             node=release.node.id,
@@ -136,22 +136,23 @@ def bookkeeping(world: World) -> Bookkeeping:
             application_version=release.version.name or None,
             versions_asked=release_causes.versions_asked(release, active.ledger),
             parameters=dict(release.parameters),
-            inputs=_requesters_of_inputs(release, active),
+            inputs={role: _sorted(topics) for role, topics in inputs.items()},
             requesters=list(release.requesters),
         )
-        for release in release_causes.releases(world)
-        if isinstance(release, ServiceRelease)
-    }
     connections = {}
     for id in world.ledger.subjects(SubjectKind.CONNECTION):
         first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
         if first is None or not claims:
             continue
+        holders = {route.source: set[str]() for route in connection_topics(claims)}
+        for claim in claims:
+            for key in claim.held.topic_keys():
+                holders[key[0]].update(claim.holders(key))
         connections[id] = ConnectionEntry(
             type=first.type.word if first.type else "",
             source=first.source,
             target=first.target,
-            topics=_requesters_of_topics(claims),
+            topics=_sorted(holders),
             requesters=list(requesters_of(claims)),
         )
     suspended = [
@@ -166,8 +167,13 @@ def bookkeeping(world: World) -> Bookkeeping:
         for claim, override in suspended_claims(world)
     ]
     waiting = [
-        WaitingEntry(one.demand, list(one.requesters), _time(one.since), one.priority)
-        for one in in_turn(world.ledger.waiting)
+        WaitingEntry(
+            demand.demand,
+            list(demand.requesters),
+            demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            demand.priority,
+        )
+        for demand in in_turn(world.ledger.waiting)
     ]
     return Bookkeeping(
         dict(sorted(services.items())),
@@ -179,62 +185,39 @@ def bookkeeping(world: World) -> Bookkeeping:
     )
 
 
-def _time(moment: datetime) -> str:
-    return moment.strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
 def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
-    usage = whole_usage(world)
-    found: dict[str, dict[str, ResourceEntry]] = {}
-    machines = {id: one for id, one in world.config.nodes.items() if id not in world.config.hosts}
+    usage, config = whole_usage(world), world.config
+    nodes: dict[str, dict[str, ResourceEntry]] = {}
+    # A machine that is in several access domains is one entry, because it has one capacity.
+    machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
     for id, node in sorted(machines.items()):
-        listed = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
-        limits = ((name, node.most(name)) for name in sorted(listed))
+        names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
+        limits = ((name, node.most(name)) for name in sorted(names))
         resources = {
             name: ResourceEntry(amount_text(usage.of(id, name), name), amount_text(most, name))
             for name, most in limits
             if most is not None
         }
-        found |= {id: resources} if resources else {}
-    return found
+        if resources:
+            nodes[id] = resources
+    return nodes
 
 
 def _demands(world: World) -> dict[str, DemandEntry]:
-    """Return an entry for each demand that holds claims, by demand id.
-
-    Claims that overrides keep belong to no demand, so they are left out.
-    """
-    found: dict[str, list[Claim]] = {}
+    by_demand: dict[str, list[Claim]] = {}
     for kind in SubjectKind:
         for id in world.ledger.subjects(kind):
             for claim in world.ledger.claims_on(Subject(kind, id)):
-                if claim.keeping_override is None:
-                    found.setdefault(claim.demand, []).append(claim)
+                if claim.keeping_override is None:  # a claim that an override keeps is of no demand
+                    by_demand.setdefault(claim.demand, []).append(claim)
     return {
         demand: DemandEntry(
             "DeploymentRequest" if claims[0].joined else "Demand",
             claims[0].request,
             list(requesters_of(claims)),
         )
-        for demand, claims in sorted(found.items())
+        for demand, claims in sorted(by_demand.items())
     }
-
-
-def _requesters_of_topics(claims: Iterable[Claim]) -> _Requesters:
-    found = {route.source: set[str]() for route in connection_topics(claims)}
-    for claim in claims:
-        for key in claim.held.topic_keys():
-            found[key[0]].update(claim.holders(key))
-    return _sorted(found)
-
-
-def _requesters_of_inputs(release: ServiceRelease, active: World) -> dict[str, _Requesters]:
-    found = {role: {one.topic: set[str]() for one in of} for role, of in release.inputs.items()}
-    for claim in claims_of(release, active.ledger):
-        for role, topic, key in demanded_inputs(active, release, claim.application):
-            if topic in found[role]:  # a claim that a person wrote may name another topic
-                found[role][topic].update(claim.holders(key))
-    return {role: _sorted(topics) for role, topics in found.items()}
 
 
 def _sorted(topics: dict[str, set[str]]) -> _Requesters:
@@ -268,10 +251,9 @@ class EntryChange:
 
 
 def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
-    """Return the changes of services, then those of connections, each sorted by name."""
     return (
-        *_changes("service", dict(old.services), dict(new.services)),
-        *_changes("connection", dict(old.connections), dict(new.connections)),
+        *_changes("service", old.services, new.services),
+        *_changes("connection", old.connections, new.connections),
     )
 
 
@@ -279,7 +261,7 @@ _Entry = ServiceEntry | ConnectionEntry
 
 
 def _changes(
-    kind: Literal["service", "connection"], old: dict[str, _Entry], new: dict[str, _Entry]
+    kind: Literal["service", "connection"], old: Mapping[str, _Entry], new: Mapping[str, _Entry]
 ) -> Iterator[EntryChange]:
     for name in sorted({*old, *new}):
         if name not in new:
@@ -294,7 +276,6 @@ def _changes(
 
 
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
-    """Yield the facts about ``entry``; the caller compares them with the facts about ``other``."""
     yield from (f"requester {requester}" for requester in entry.requesters)
     if isinstance(entry, ConnectionEntry):
         yield f"from {entry.source} to {entry.target}"
@@ -308,13 +289,18 @@ def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
         for version, requesters in entry.versions_asked.items():
             yield f"version {version} for {', '.join(requesters)}"
         yield from (f"{name} = {value}" for name, value in sorted(entry.parameters.items()))
-    topics, known = _topics(entry), _topics(other)
-    for what, who in sorted(topics.items()):
-        yield what
+    others = _topics(other)
+    for topic, requesters in sorted(_topics(entry).items()):
+        yield topic
         # a requester that ``other`` lacks is not repeated here, because it is a fact above
-        yield from (f"{what} for {one}" for one in who if what in known and one in other.requesters)
+        lasting = (who for who in requesters if topic in others and who in other.requesters)
+        yield from (f"{topic} for {who}" for who in lasting)
 
 
 def _topics(entry: _Entry) -> _Requesters:
     inputs = {"topic": entry.topics} if isinstance(entry, ConnectionEntry) else entry.inputs
-    return {f"{role} {topic}": who for role, of in inputs.items() for topic, who in of.items()}
+    return {
+        f"{role} {topic}": requesters
+        for role, topics in inputs.items()
+        for topic, requesters in topics.items()
+    }

@@ -19,16 +19,13 @@ from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import suspended_by
 from demandops.subject import SubjectKind
 
+# The state of a claim or of a demand. A claim is held by its demand, kept by an override, or
+# suspended by an override. A demand has the state of its claims. If the states of its claims
+# differ, the demand is partly suspended. If it waits for room, it has no claims.
 State = Literal["held", "kept", "suspended", "partly suspended", "waiting"]
-"""The state of a claim or of a demand.
-
-A claim is held by its demand, kept by an override, or suspended by an override. A demand has the
-state of its claims. If the states of its claims differ, the demand is partly suspended. If it waits
-for room, it is waiting and has no claims.
-"""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HeldDemand:
     """A demand and what it holds. Of the demand's leases, ``lease`` is the first that ends."""
 
@@ -36,17 +33,16 @@ class HeldDemand:
     state: State
     requests: tuple[str, ...]
     requesters: tuple[str, ...]
-    applications: tuple[str, ...]
-    connections: tuple[str, ...]
-    nodes: tuple[str, ...]
-    domains: tuple[str, ...]
+    applications: tuple[str, ...] = ()
+    connections: tuple[str, ...] = ()
+    nodes: tuple[str, ...] = ()
+    domains: tuple[str, ...] = ()
     since: datetime
-    lease: Lease | None
-    suspended_by: tuple[str, ...]
+    lease: Lease | None = None
+    suspended_by: tuple[str, ...] = ()
 
 
 def state_of(claim: Claim, world: World) -> State:
-    """Return whether a claim is held, kept or suspended."""
     if suspended_by(claim, world) is not None:
         return "suspended"
     return "kept" if claim.keeping_override else "held"
@@ -60,32 +56,28 @@ def domains_of(nodes: Iterable[str], config: Config) -> tuple[str, ...]:
 def nodes_of(claim: Claim) -> tuple[str, ...]:
     """Return the nodes that a claim needs, sorted.
 
-    An application needs its node, the sources of its inputs and the nodes to which it delivers. A
-    connection needs the nodes at its ends and the node of its broker.
+    These include the sources of its inputs, the nodes to which it delivers, and its broker's node.
     """
     held = claim.held
     if claim.is_on_application:
         sources = (topic.source for _, topic in claim.application.all_inputs())
-        delivered = (one.node for one in claim.application.deliver)
+        delivered = (delivery.node for delivery in claim.application.deliver)
         return tuple(sorted({*held.nodes, *sources, *delivered}))
     return tuple(sorted({*held.nodes, *filter(None, (claim.connection.broker,))}))
 
 
 def demands(world: World) -> list[HeldDemand]:
-    """Return every demand that holds something or waits for room, the oldest first.
-
-    The result also has an entry for each override that keeps claims.
-    """
+    """Return every demand, and each override that keeps claims, the oldest first."""
     by_demand: defaultdict[str, list[Claim]] = defaultdict(list)
     for claim in world.ledger:
         by_demand[claim.demand].append(claim)
-    found = [held_demand(claims, world) for claims in by_demand.values()]
-    found += [waiting_demand(one) for one in world.ledger.waiting.values()]
-    return sorted(found, key=lambda one: (one.since, one.name))
+    entries = [held_demand(claims, world) for claims in by_demand.values()]
+    entries += [waiting_demand(demand) for demand in world.ledger.waiting.values()]
+    return sorted(entries, key=lambda entry: (entry.since, entry.name))
 
 
 def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
-    """Return the entry in the list for a demand; ``claims`` are all claims that it holds."""
+    """Return the entry for a demand; ``claims`` are all claims that it holds."""
     states = {state_of(claim, world) for claim in claims}
     (state,) = states if len(states) == 1 else ("partly suspended",)
     suspending = filter(None, (suspended_by(claim, world) for claim in claims))
@@ -106,23 +98,15 @@ def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
     )
 
 
-def waiting_demand(one: WaitingDemand) -> HeldDemand:
-    """Return the entry in the list for a waiting demand, which holds nothing yet."""
+def waiting_demand(demand: WaitingDemand) -> HeldDemand:
     return HeldDemand(
-        name=one.demand,
+        name=demand.demand,
         state="waiting",
-        requests=(one.request,),
-        requesters=tuple(sorted(one.requesters)),
-        applications=(),
-        connections=(),
-        nodes=(),
-        domains=(),
-        since=one.since,
-        lease=None,
-        suspended_by=(),
+        requests=(demand.request,),
+        requesters=tuple(sorted(demand.requesters)),
+        since=demand.since,
     )
 
 
 def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> Iterator[str]:
-    """Yield the ids of the claimed applications, or of the claimed connections, sorted."""
     yield from sorted(claim.subject.id for claim in claims if claim.subject.kind is kind)

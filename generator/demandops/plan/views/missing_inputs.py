@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from demandops.config.config import Config
 from demandops.demand.application import Application
 from demandops.errors import Fault, fault
 from demandops.ledger import claim_file
@@ -21,10 +20,7 @@ from demandops.plan.overrides.claim_overrides import without_suspended
 
 @dataclass(frozen=True, slots=True)
 class MissingInput:
-    """A topic that does not arrive, or an output that is no longer delivered.
-
-    It has the application, the file of the claim, and the reason.
-    """
+    """A topic that does not arrive, or an output that is no longer delivered."""
 
     application: str
     file: str
@@ -32,23 +28,20 @@ class MissingInput:
 
     @property
     def warning(self) -> Fault:
-        """The missing input as a warning, located in the claim's file."""
         return fault(f"application '{self.application}'", self.reason).within(self.file)
 
 
 def missing_inputs(world: World) -> list[MissingInput]:
-    """Return the topics that do not arrive, sorted by application.
-
-    Suspended claims need no topics, and suspended connections carry none.
-    """
+    """Return the topics that do not arrive, sorted by application."""
+    # Suspended claims need no topics, and suspended connections carry none.
     active = without_suspended(world)
-    found = {
+    missing = {
         MissingInput(claim.application.id, claim_file.path_of(claim.key), reason)
         for claim in active.ledger
         if claim.is_on_application
         for reason in _reasons(claim.application, active)
     }
-    return sorted(found, key=lambda one: (one.application, one.reason, one.file))
+    return sorted(missing, key=lambda each: (each.application, each.reason, each.file))
 
 
 def _reasons(app: Application, active: World) -> Iterator[str]:
@@ -58,11 +51,13 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
             where = f"'{topic.source}' is not in the inventory"
             yield f"{role} {topic.topic} does not arrive: {where}"
     for flow in flows(config, app):
+        sender = config.nodes.get(flow.sender)
         carried = active.ledger.is_carried_to(flow.receiver, flow.target)
-        bridged = flow.topic == flow.target and _is_bridged(
-            flow.topic, flow.sender, flow.receiver, config
-        )
-        if flow.sender in config.nodes and not carried and not bridged:
+        if sender is None or carried:
+            continue
+        # The initial deployment keeps topic names, so it carries no flow that renames a topic.
+        bridged = sender.bridged.get(flow.receiver, ())
+        if flow.topic != flow.target or flow.topic not in bridged:
             yield (
                 f"{flow.name} {flow.topic} does not arrive: no connection carries it from "
                 f"'{flow.sender}' to '{flow.receiver}'"
@@ -75,8 +70,3 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
                 f"{delivery.output} is no longer delivered to '{delivery.node}': the application "
                 f"definition '{app.appdef}' has no such output"
             )
-
-
-def _is_bridged(topic: str, sender: str, receiver: str, config: Config) -> bool:
-    node = config.nodes.get(sender)
-    return node is not None and topic in node.bridged.get(receiver, ())

@@ -18,21 +18,20 @@ from demandops.ledger import claim_file
 from demandops.ledger.world import World
 
 _WORD = re.compile(r"[A-Za-z]+")
+# In words with fewer letters, one other letter often makes another correct word.
 _SHORT = 4
 
 
 def notes(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each misspelled topic in a request that adds claims."""
     if request.adds_claims:
         known = _KnownTopics(world)
-        for one in request.demanded:
-            yield from known.notes_on(one.held)
+        for item in request.demanded:
+            yield from known.notes_on(item.held)
 
 
 def warnings(world: World) -> Iterator[Fault]:
-    """Yield a warning for each misspelled topic in the claims of a world."""
     known = _KnownTopics(world)
-    for claim in sorted(world.ledger, key=lambda one: claim_file.path_of(one.key)):
+    for claim in sorted(world.ledger, key=lambda claim: claim_file.path_of(claim.key)):
         for note in known.notes_on(claim.held):
             yield fault("", note).within(claim_file.path_of(claim.key))
 
@@ -49,9 +48,14 @@ class _KnownTopics:
     def notes_on(self, held: Application | Connection) -> Iterator[str]:
         """Yield a warning for each misspelled topic that an earlier call did not report."""
         if isinstance(held, Application):
-            for role, one in held.all_inputs():
-                known = (self._of(one.source), self._usual(role, one.source))
-                yield from self._notes(f"application '{held.id}'", one.source, one.topic, *known)
+            what = f"application '{held.id}'"
+            for role, input in held.all_inputs():
+                place = (role, input.source)
+                if place not in self._booked:
+                    booked = self._world.ledger.usual_topics(*place, excluded="")
+                    self._booked[place] = frozenset(booked)
+                known = (self._of(input.source), self._booked[place])
+                yield from self._notes(what, input.source, input.topic, *known)
             return
         for route in held.topics:
             sender, _ = route.sender_and_receiver(held.source, held.target)
@@ -60,52 +64,41 @@ class _KnownTopics:
 
     def _notes(self, what: str, node: str, topic: str, *known: frozenset[str]) -> Iterator[str]:
         # not united: a demand may list thousands of topics, and all of them may be known
-        if (node, topic) in self._told or any(topic in some for some in known):
+        if (node, topic) in self._told or any(topic in topics for topics in known):
             return
-        near = min(
-            (one for some in known for one in some if _is_misspelling(topic, one)), default=""
-        )
+        near = [each for topics in known for each in topics if _is_misspelling(topic, each)]
         if near:
             self._told.add((node, topic))
-            yield f"{what}: '{node}' is not known to publish {topic}; did you mean '{near}'?"
+            yield f"{what}: '{node}' is not known to publish {topic}; did you mean '{min(near)}'?"
 
     def _of(self, node: str) -> frozenset[str]:
         if node not in self._listed:
             entry = self._world.config.nodes.get(node)
-            bridged = entry.bridged.values() if entry else ()
-            self._listed[node] = frozenset(
-                (*entry.topics.values(), *entry.types, *(one for some in bridged for one in some))
-                if entry
-                else ()
-            )
+            topics = set[str]()
+            if entry:
+                topics = {*entry.topics.values(), *entry.types}.union(*entry.bridged.values())
+            self._listed[node] = frozenset(topics)
         return self._listed[node]
 
-    def _usual(self, role: str, source: str) -> frozenset[str]:
-        if (role, source) not in self._booked:
-            found = self._world.ledger.usual_topics(role, source, excluded="")
-            self._booked[role, source] = frozenset(found)
-        return self._booked[role, source]
 
+def _is_misspelling(topic: str, other: str) -> bool:
+    """Return whether ``topic`` may be a misspelling of ``other``.
 
-def _is_misspelling(one: str, other: str) -> bool:
-    """Return whether ``one`` may be a misspelling of ``other``.
-
-    It is one if both differ only in a word of at least four letters. In this word, ``one`` must
+    It is one if both differ only in a word of at least four letters. In this word, ``topic`` must
     have one wrong, missing or additional letter, or two letters in the wrong order.
     """
-    if abs(len(one) - len(other)) > 1:
+    if abs(len(topic) - len(other)) > 1:
         return False
-    start = _common(one, other)
-    end = _common(one[start:][::-1], other[start:][::-1])
-    rest, known = one[start : len(one) - end], other[start : len(other) - end]
-    if sorted(rest) != sorted(known) and max(len(rest), len(known)) > 1:
+    start = _common(topic, other)
+    end = _common(topic[start:][::-1], other[start:][::-1])
+    written, correct = topic[start : len(topic) - end], other[start : len(other) - end]
+    if sorted(written) != sorted(correct) and max(len(written), len(correct)) > 1:
         return False
-    if len(rest) > len("ab") or not (rest + known).isalpha():
+    if len(written) > len("ab") or not (written + correct).isalpha():
         return False
-    word = next(found for found in _WORD.finditer(other + " a") if found.end() >= start)
+    word = next(match for match in _WORD.finditer(other + " a") if match.end() >= start)
     return len(word[0]) >= _SHORT and word.start() <= start
 
 
 def _common(one: str, other: str) -> int:
-    """Return how many characters are the same at the start of two texts."""
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))

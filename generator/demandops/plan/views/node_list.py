@@ -19,9 +19,8 @@ from demandops.subject import SubjectKind
 class UsedNode:
     """A node of the inventory or of a claim, and what uses the node.
 
-    ``releases`` are the releases that run on the node. ``applications``, ``connections`` and
-    ``requesters`` come from the claims that need the node. These include claims on applications
-    that only read an input from the node.
+    ``applications``, ``connections`` and ``requesters`` come from the claims that need the node.
+    These include claims on applications that only read an input from the node.
     """
 
     name: str
@@ -39,10 +38,7 @@ class UsedNode:
 
 
 def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
-    """Return every node, sorted by id.
-
-    ``releases`` are all releases that run.
-    """
+    """Return every node, sorted by id; ``releases`` are all releases that run."""
     running: defaultdict[str, list[str]] = defaultdict(list)
     for release in releases:
         running[release.node.id].append(release.name)
@@ -50,11 +46,12 @@ def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
     for claim in world.ledger:
         for id in nodes_of(claim):
             needing[id].append(claim)
-    known = world.config.nodes
-    found = []
-    for id in sorted({*known, *needing}):
-        node, domain, claims = known.get(id), world.config.domain_of.get(id), needing[id]
-        found.append(
+    inventory = world.config.nodes
+    used = []
+    # A claim may need a node that a person removed from the inventory.
+    for id in sorted({*inventory, *needing}):
+        node, domain, claims = inventory.get(id), world.config.domain_of.get(id), needing[id]
+        used.append(
             UsedNode(
                 name=id,
                 type=node.type if node else None,
@@ -70,4 +67,4 @@ def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
                 requesters=requesters_of(claims),
             )
         )
-    return found
+    return used

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from itertools import groupby, islice
 
 from demandops.charts import chart_files
@@ -27,70 +27,56 @@ from demandops.plan.nodes.choice import lacks, requirement_of, unmet
 from demandops.plan.nodes.relocation import following_overrides, with_moves
 from demandops.quoting import quoted
 
+# Kinds are read line by line, because a template of Helm is no YAML before it is rendered.
 _KIND = re.compile(r"kind:[ \t]*(?P<kind>[^#]*)")
 _PLAIN = re.compile(r"\"?([A-Z][A-Za-z0-9]*)\"?")
 _TEMPLATE = re.compile(r"(.*/)?templates/(?!tests/).*\.(ya?ml|tpl)")
-_MOST_NODES = 3
 _CRDS = re.compile(r"(.*/)?crds/.*")
+_MOST_NODES = 3
 
 
 def warnings(world: World) -> Iterator[Fault]:
-    """Yield each warning, located in the file that causes it."""
     config = world.config
-    yield from _charts(config)
+    yield from _kinds_of_charts(config)
     yield from _open_by_host_network(config)
     yield from _connections_no_longer_allowed(world)
-    yield from _above_capacity(world)
-    yield from _drained(world)
+    for node, excess in overcommitted(world, whole_usage(world)):
+        message = (
+            f"{excess}; these services stay on the node, but no demand gets more of this resource "
+            "there; raise the capacity, or move something to another node"
+        )
+        file = config.file_of(NODES_FILE, node.id)
+        yield fault("", f"'{node.id}': {message}").within(file)
+    for id in config.drained_nodes:
+        if world.ledger.applications_on.get(id):
+            drain = with_moves(Drain(id), world, whole_usage(world), all_names(world))
+            file = config.file_of(NODES_FILE, config.host_of(id))
+            for text in (*drain.moved, *drain.stays):
+                yield fault("", f"'{id}' is drained: {text}").within(file)
     yield from _unfit_places(config)
     for path, text in following_overrides(world).stays:
         yield fault("node", text).within(path)
 
 
-def _drained(world: World) -> Iterator[Fault]:
-    """Yield a warning for each application or service that is placed on a drained node.
-
-    The warning says where the application or service moves, or why it stays.
-    """
-    for node in world.config.drained_nodes:
-        if world.ledger.applications_on.get(node):
-            drain = with_moves(Drain(node), world, whole_usage(world), all_names(world))
-            file = world.config.file_of(NODES_FILE, world.config.host_of(node))
-            for text in (*drain.moved, *drain.stays):
-                yield fault("", f"'{node}' is drained: {text}").within(file)
-
-
 def _unfit_places(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each requirement of a service that no node meets."""
-    services = {
+    placed = {  # a shared service is in several definitions, but in one file
         (service.file, service.name): service
-        for of in config.services.values()
-        for service in of.values()
+        for services in config.services.values()
+        for service in services.values()
         if service.place
     }
-    for (file, name), service in sorted(services.items()):
+    for (file, name), service in sorted(placed.items()):
         field = "place" if service.shared else f"services.{name}.place"
-        asked = requirement_of(service)
-        problems = [*unmet(asked, config)]
-        if not problems and all(any(lacks(node, asked)) for node in config.nodes.values()):
+        requirement = requirement_of(service)
+        problems = [*unmet(requirement, config)]
+        if not problems and all(any(lacks(node, requirement)) for node in config.nodes.values()):
             problems = [f"no node in {config.place_of(NODES_FILE)} meets all requirements"]
         for problem in problems:
             message = f"{problem}, so demands that need '{name}' are refused"
             yield fault(field, message).within(file)
 
 
-def _above_capacity(world: World) -> Iterator[Fault]:
-    for node, excess in overcommitted(world, whole_usage(world)):
-        message = (
-            f"{excess}; these services stay on the node, but no demand gets more of this resource "
-            "there; raise the capacity, or move something to another node"
-        )
-        file = world.config.file_of(NODES_FILE, node.id)
-        yield fault("", f"'{node.id}': {message}").within(file)
-
-
 def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
-    """Yield a warning for each pair of access domains with connections that no rule allows now."""
     counts: Counter[tuple[str, str]] = Counter()
     for claim in world.ledger:
         if isinstance(claim.held, Connection):
@@ -111,23 +97,23 @@ def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
-    """Yield warnings of access domains that are open because pods use the host's network.
-
-    One kind of warning says that ``network: namespace`` has no effect. The other kind says which
-    access domains share a ROS domain in one cluster.
-    """
+    """Yield warnings of access domains that are open because pods use the host's network."""
     nodes = [
         (config.domain_of[node.id].name, node)
         for node in config.nodes.values()
         if node.host_network and node.id in config.domain_of
     ]
-    nodes.sort(key=lambda one: (one[0], one[1].id))
-    for name, group in groupby(nodes, key=lambda one: one[0]):
+    nodes.sort(key=lambda pair: (pair[0], pair[1].id))
+    # Kubernetes applies a NetworkPolicy only to pods with their own network.
+    for name, group in groupby(nodes, key=lambda pair: pair[0]):
         if config.domains[name].network == "namespace":
             ids = [node.id for _, node in group]
+            listed = ", ".join(f"'{id}'" for id in ids[:_MOST_NODES])
+            if len(ids) > _MOST_NODES:
+                listed += f" and {len(ids) - _MOST_NODES} more"
             message = (
                 f"'network: namespace' of access domain '{name}' has no effect on nodes whose pods "
-                f"use the host's network: {_listed(ids)}; set hostNetwork: false for these nodes, "
+                f"use the host's network: {listed}; set hostNetwork: false for these nodes, "
                 "or separate their network yourself"
             )
             yield fault("", message).within(config.file_of(DOMAINS_FILE, name))
@@ -136,7 +122,7 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
         graphs.setdefault((node.cluster, node.ros.domain_id), {})[name] = None
     for (cluster, number), names in sorted(graphs.items()):
         if len(names) > 1:
-            listed = " and ".join(f"'{one}'" for one in names)
+            listed = " and ".join(f"'{name}'" for name in names)
             message = (
                 f"access domains {listed} share ROS domain {number} on the network of the hosts "
                 f"of cluster '{cluster}', so each may read and write the topics of the others; "
@@ -145,41 +131,17 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
             yield fault("", message).within(config.file_of(DOMAINS_FILE, next(iter(names))))
 
 
-def _listed(ids: list[str]) -> str:
-    shown = ", ".join(f"'{id}'" for id in ids[:_MOST_NODES])
-    return shown if len(ids) <= _MOST_NODES else f"{shown} and {len(ids) - _MOST_NODES} more"
-
-
-def _charts(config: Config) -> Iterator[Fault]:
+def _kinds_of_charts(config: Config) -> Iterator[Fault]:
     """Yield a warning for each Kubernetes kind in a chart that an access domain does not allow.
 
     There is also a warning for each kind that cannot be read from the chart's files. Only charts
     and libraries in the state repo are read.
     """
-    paths = sorted(config.files)
-    for folder, domains in sorted(_domains_of_charts(config).items()):
-        yield from _dependencies(folder, config.files)
-        for path in chart_files.below(folder, paths):
-            name = path.removeprefix(f"{folder}/")
-            if _CRDS.fullmatch(name):
-                yield from _refused(path, None, "CustomResourceDefinition", domains, config)
-            elif _TEMPLATE.fullmatch(name):
-                template = _template(path, config.files[path], domains, config)
-                found = [*islice(template, MOST_FAULTS + 1)]
-                yield from found[:MOST_FAULTS]
-                if len(found) > MOST_FAULTS:
-                    yield Fault("more", "", "has more objects of such kinds", path)
-
-
-def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return a map from the folder of each chart to the access domains in which the chart may run.
-
-    A chart may run in an access domain that has no rules, or in which a rule allows an application
-    that uses the chart.
-    """
-    found: dict[str, list[AccessDomain]] = {}
+    # A chart may run in an access domain that has no rules, or in which a rule allows an
+    # application that uses the chart.
+    domains_of: dict[str, list[AccessDomain]] = {}
     for appdef, services in config.services.items():
-        domains = [
+        allowing = [
             domain
             for domain in config.domains.values()
             if not domain.rules or any(matches(appdef, rule.applications) for rule in domain.rules)
@@ -188,9 +150,32 @@ def _domains_of_charts(config: Config) -> dict[str, list[AccessDomain]]:
             for source in config.charts[service.chart].sources():
                 top = source.folder
                 for folder in chart_files.folders(top, config.files) if top else ():
-                    known = found.setdefault(folder, [])
-                    known += [domain for domain in domains if domain not in known]
-    return found
+                    domains = domains_of.setdefault(folder, [])
+                    domains += [domain for domain in allowing if domain not in domains]
+    paths = sorted(config.files)
+    for folder, domains in sorted(domains_of.items()):
+        for chart in chart_files.dependencies(folder, config.files):
+            if (
+                chart.folder is None
+                and f"{folder}/charts/{chart.name}/Chart.yaml" not in config.files
+            ):
+                message = (
+                    f"subchart {quoted(chart.name)} is not unpacked in charts/, so the kinds of "
+                    "its objects are not known; check yourself that the access domain allows these "
+                    "kinds"
+                )
+                yield fault(f"dependencies[{chart.index}]", message).within(f"{folder}/Chart.yaml")
+        for path in chart_files.below(folder, paths):
+            name = path.removeprefix(f"{folder}/")
+            if _CRDS.fullmatch(name):
+                yield from _refused(path, None, "CustomResourceDefinition", domains, config)
+            elif _TEMPLATE.fullmatch(name):
+                # A pull request of a stranger may have a template with any number of kinds.
+                faults = _template(path, config.files[path], domains, config)
+                shown = [*islice(faults, MOST_FAULTS + 1)]
+                yield from shown[:MOST_FAULTS]
+                if len(shown) > MOST_FAULTS:
+                    yield Fault("more", "", "has more objects of such kinds", path)
 
 
 def _template(path: str, text: str, domains: list[AccessDomain], config: Config) -> Iterator[Fault]:
@@ -222,14 +207,3 @@ def _refused(
                 "from the chart"
             )
             yield fault("", message, line=line).within(path)
-
-
-def _dependencies(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
-    """Yield a warning for each subchart whose files are not in the state repo."""
-    for one in chart_files.dependencies(folder, files):
-        if one.folder is None and f"{folder}/charts/{one.name}/Chart.yaml" not in files:
-            message = (
-                f"subchart {quoted(one.name)} is not unpacked in charts/, so the kinds of its "
-                "objects are not known; check yourself that the access domain allows these kinds"
-            )
-            yield fault(f"dependencies[{one.index}]", message).within(f"{folder}/Chart.yaml")

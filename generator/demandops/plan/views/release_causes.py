@@ -17,59 +17,44 @@ from demandops.subject import Subject
 
 
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
-    """Yield the releases that run; with ``subject``, only those that claims on ``subject`` need.
-
-    Raises:
-        Refused: for the same reasons as :func:`demandops.plan.planner.plan`.
-    """
+    """Yield the releases that run, or only those that claims on ``subject`` need."""
     keys = keys_of(world, subject) if subject else all_keys(world)
     yield from filter(None, (plan(world, key) for key in keys))
 
 
 def release_named(world: World, name: str) -> Release | None:
-    """Return the running release that is called ``name``, or ``None`` if there is none."""
-    return next((one for one in releases(world) if one.name == name), None)
+    return next((release for release in releases(world) if release.name == name), None)
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
-    """Return the claims that need a release, sorted by their booking time.
+    """Return the claims that need a running release, sorted by their booking time.
 
-    Args:
-        ledger: the ledger without suspended claims.
-        release: the release that runs.
+    ``ledger`` has no suspended claims.
     """
     return by_booking(claim for claim in claims_of(release, ledger) if needs(claim, release))
 
 
 def by_booking(claims: Iterable[Claim]) -> list[Claim]:
-    """Return the claims sorted by their booking time."""
     return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
 
 
 def needs(claim: Claim, release: Release) -> bool:
-    """Return whether a claim needs a release.
-
-    Callers pass only claims on an application or connection of the release.
-    """
+    """Return whether a claim on an application or connection of a release needs the release."""
     if not isinstance(release, ServiceRelease):
         return True
     return takes(claim.application, release.service, release.key)
 
 
 def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
-    """Return a map from version to requesters, for each version that a claim names.
-
-    The claims are those on the applications of the service.
-    """
-    found: dict[str, set[str]] = {}
+    """Return the versions that claims on a service's applications name, with requesters."""
+    asking: dict[str, set[str]] = {}
     for claim in claims_of(release, ledger):
         if claim.application.version:
-            found.setdefault(claim.application.version, set()).update(claim.requesters)
-    return {version: sorted(requesters) for version, requesters in sorted(found.items())}
+            asking.setdefault(claim.application.version, set()).update(claim.requesters)
+    return {version: sorted(requesters) for version, requesters in sorted(asking.items())}
 
 
 def how_to_release(claim: Claim) -> str:
-    """Return, in words, how the holders of a claim release it."""
     if claim.keeping_override is not None:
         return f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
     if is_released_by_demand_id(claim):
@@ -78,7 +63,7 @@ def how_to_release(claim: Claim) -> str:
 
 
 def is_released_by_demand_id(claim: Claim) -> bool:
-    """Return whether :func:`how_to_release` tells people to release a claim by its demand id."""
+    # A goal of the reference's action has no demand id. The generator derives it from the request.
     is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
     return claim.keeping_override is None and not is_of_a_request
 
@@ -96,8 +81,8 @@ def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]
         (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
         *release.shaping_entries(config),
         *(
-            (file_of(IMAGES_FILE, name), f"images.{name}", one.reference())
-            for name, one in images.items()
+            (file_of(IMAGES_FILE, name), f"images.{name}", image.reference())
+            for name, image in images.items()
         ),
         (file_of(NODES_FILE, node.id), node.id, f"in cluster {node.cluster}"),
         (file_of(DOMAINS_FILE, domain.name), domain.name, f"namespace {domain.namespace}"),
@@ -105,9 +90,5 @@ def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]
 
 
 def denied_release_named(world: World, name: str) -> tuple[Release, Override] | None:
-    """Return the denied release that is called ``name``, and the override that denies it.
-
-    Return ``None`` if no denied release has this name.
-    """
     denied = (denied_release(world, key) for key in all_keys(world))
-    return next((found for found in denied if found and found[0].name == name), None)
+    return next((pair for pair in denied if pair and pair[0].name == name), None)

@@ -9,7 +9,7 @@ the other releases are planned again. The generator instead predicts which relea
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from types import SimpleNamespace
 from typing import Any, TypeAlias, TypeVar, cast
 
 from demandops.config.config import Config
@@ -28,15 +28,12 @@ Unit = TypeVar("Unit", bound="_Unit")
 _Unit: TypeAlias = "Subject | ReleaseKey"
 _Read: TypeAlias = "Subject | tuple[str, ...]"
 
+# Records a read of the whole ledger.
 _ALL: _Read = ("all",)
-"""The entry that records a read of the whole ledger."""
 
 
 class TracedPlan:
-    """The plan of one configuration, for one ledger after another.
-
-    All these ledgers have the same ended overrides.
-    """
+    """The plan of one configuration, for ledgers that have the same ended overrides."""
 
     def __init__(self, config: Config) -> None:
         self._config = config
@@ -49,37 +46,33 @@ class TracedPlan:
     ) -> dict[ReleaseKey, Release | None]:
         """Plan the releases that the changes may affect; the first call plans all releases.
 
-        Args:
-            ledger: the ledger after the changes.
-            changes: every claim that changed.
-            kept: every service instance whose kept replicas changed.
-
-        Returns:
-            A map from the key of each planned release to the release, or to ``None`` if the release
-            does not run.
-
-        Raises:
-            Refused: for the same reasons as :func:`demandops.plan.planner.plan`. Then this object
-                is out of date and must not be used again.
+        ``kept`` are the service instances whose kept replicas changed. A release that does not run
+        any longer is ``None``. If this raises ``Refused``, the plan is out of date and must not be
+        used again.
         """
-        stale = {
-            unit for read in (*_changed(changes), *kept) for unit in self._readers.pop(read, ())
-        }
+        # The reads whose result may differ now.
+        reads: set[_Read] = {_ALL, *kept}
+        for change in changes:
+            entries = index_entries(change.before), index_entries(change.after)
+            reads |= {change.key.subject}.union(*entries)
+        stale = {unit for read in reads for unit in self._readers.pop(read, ())}
+
+        def keys_needed(world: World, subject: Subject) -> tuple[ReleaseKey, ...]:
+            return tuple(keys_of(world, subject, strict=True))
+
         for subject in ledger.claims:
             if subject in stale or subject not in self._keys:
-                self._keys[subject] = self._traced(
-                    ledger, subject, lambda seen, of: tuple(keys_of(seen, of, strict=True))
-                )
+                self._keys[subject] = self._traced(ledger, subject, keys_needed)
         for subject in [unit for unit in stale if unit in self._keys]:
             if subject not in ledger.claims:
                 del self._keys[subject]
         needed = {key for keys in self._keys.values() for key in keys}
         gone = self._planned - needed
-        found: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
+        planned: dict[ReleaseKey, Release | None] = dict.fromkeys(gone)
         for key in sorted(needed - self._planned | (needed & stale), key=repr):
-            found[key] = self._traced(ledger, key, plan)
+            planned[key] = self._traced(ledger, key, plan)
         self._planned = needed
-        return found
+        return planned
 
     def _traced(self, ledger: Ledger, unit: Unit, work: Callable[[World, Unit], T]) -> T:
         reads: set[_Read] = set()
@@ -88,27 +81,13 @@ class TracedPlan:
             cast(Any, _Recording(ledger.index, reads)),
             cast(Any, None),  # planning does not read the ends of leases
             ledger.ended,
-            kept=cast(Any, _RecordingKept(_Recording(ledger.kept.steps, reads))),
+            # of the kept replicas, planning reads only the steps
+            kept=cast(Any, SimpleNamespace(steps=_Recording(ledger.kept.steps, reads))),
         )
         result = work(World(self._config, traced), unit)
         for read in reads:
             self._readers.setdefault(read, set()).add(unit)
         return result
-
-
-def _changed(changes: Iterable[ClaimChange]) -> set[_Read]:
-    """Return the reads whose result may differ after the changes."""
-    reads: set[_Read] = {_ALL}
-    for change in changes:
-        reads |= {change.key.subject, *index_entries(change.before), *index_entries(change.after)}
-    return reads
-
-
-@dataclass(frozen=True)
-class _RecordingKept:
-    """Stands for the ledger's kept replicas; planning reads only their :attr:`steps`."""
-
-    steps: _Recording
 
 
 class _Recording:
