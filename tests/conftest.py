@@ -18,6 +18,7 @@ import pytest
 import yaml
 from demandops.service import Generator
 from demandops.staterepo.pull_request.helm import HELM_BIN
+from hypothesis import HealthCheck, settings
 
 from tests.kit import repo, sync
 from tests.kit.cli import Ran, Run, runner
@@ -43,6 +44,10 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     if (unsteady := os.environ.get("UNSTEADY")) and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SecondTry(Path(unsteady)))
+    # By default an example that takes 200 ms fails, and so do slow strategies. On a busy machine any
+    # example may take that long.
+    settings.register_profile("steady", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.load_profile("steady")
     sync.force(False)
     gc.disable()  # until everything is imported and collected
     _keep_files_in_memory()

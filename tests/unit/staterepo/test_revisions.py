@@ -217,7 +217,7 @@ _PIECES = [
 
 
 @given(st.one_of(st.text(), st.lists(st.sampled_from(_PIECES), max_size=12).map("".join)))
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_the_text_it_is_a_commit_or_refused(repo: pygit2.Repository, text: str) -> None:
     with suppress(StateRepoError):
         assert isinstance(commit_of(repo, text), pygit2.Commit)
