@@ -44,8 +44,8 @@ def pytest_configure(config: pytest.Config) -> None:
     )
     if (unsteady := os.environ.get("UNSTEADY")) and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SecondTry(Path(unsteady)))
-    # By default an example that takes 200 ms fails, and so do slow strategies. On a busy machine any
-    # example may take that long.
+    # By default an example that takes 200 ms fails, and so do slow strategies. Any example may take
+    # that long on a busy machine.
     settings.register_profile("steady", deadline=None, suppress_health_check=[HealthCheck.too_slow])
     settings.load_profile("steady")
     sync.force(False)
