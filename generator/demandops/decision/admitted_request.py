@@ -28,10 +28,10 @@ from demandops.plan.nodes.choice import NO_ROOM
 _SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
 
+# A function that yields faults if a request comes too soon after others of its requesters
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
-"""A function that yields faults if a request comes too soon after others of its requesters."""
+# A function that is called often during a decision, and raises ``OverBudget`` to end it
 Checkpoint = Callable[[], None]
-"""A function that is called often during a decision, and raises ``OverBudget`` to end it."""
 
 
 def admitted(

@@ -57,6 +57,8 @@ from demandops.render.changes.changeset import FileReader, ReleaseChange
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "restored", "unchanged", "waiting"]
 
+# The outcome in the receipt, by operation. The outcome of an operation that is not listed is
+# ``released``.
 _OUTCOMES: dict[str, Outcome] = {
     "join": "booked",
     "put": "booked",
@@ -65,10 +67,6 @@ _OUTCOMES: dict[str, Outcome] = {
     "rollback": "restored",
     "wait": "waiting",
 }
-"""The outcome in the receipt, by operation.
-
-The outcome of an operation that is not listed is ``released``.
-"""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +86,10 @@ class Decision:
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
     approval: tuple[str, ...] = ()
+    # The paths of the overrides that change the content of the rendered files
     overrides: tuple[str, ...] = ()
-    """The paths of the overrides that change the content of the rendered files."""
+    # Whether room becomes free on a node, because services now request less of the node
     frees: bool = False
-    """Whether room becomes free on a node, because services now request less of the node."""
 
     @property
     def placed(self) -> tuple[str, ...]:
@@ -210,18 +208,16 @@ def _searched(
         raise
 
 
+# The codes of faults that might not occur if other nodes were chosen for the demand
 _BY_NODE = frozenset(
     ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
 )
-"""The codes of faults that might not occur if other nodes were chosen for the demand."""
 
 
+# How many bookings one demand, or one drain of a node, may try while nodes are looked for. Each
+# trial books all that is placed so far. So the trials of one demand together may also book no more
+# items than the largest demand may list.
 MOST_TRIALS = 64
-"""How many bookings one demand, or one drain of a node, may try while nodes are looked for.
-
-Each trial books all that is placed so far. So the trials of one demand together may also book no
-more items than the largest demand may list.
-"""
 
 
 class _Trials:

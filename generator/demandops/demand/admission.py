@@ -65,8 +65,8 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
             yield replace(each, field=one.place(each.field))
 
 
+# Fields of goals whose lists have no items of their own (items_of)
 _NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
-"""Fields of goals whose lists have no items of their own (:func:`items_of`)."""
 _FIELDS_OF_ITEM = 10
 _ITEMS = (
     "items (applications, connections, topics, requesters and so on, also of the connections that "

@@ -26,8 +26,8 @@ from demandops.errors import Fault
 from demandops.subject import Subject
 
 Held = Application | Connection
+# Returns the application or connection that a subject's first claim holds, or ``None``
 Booked = Callable[[Subject], "Held | None"]
-"""Returns the application or connection that a subject's first claim holds, or ``None``."""
 
 
 def with_chosen_domains(

@@ -13,8 +13,8 @@ from demandops.demand.application import Application
 from demandops.demand.lease import Lease
 from demandops.subject import Subject, SubjectKind, TopicKey
 
+# The prefix of the demand ids of claims that overrides make; no other demand may use it
 OVERRIDE_PREFIX = "override:"
-"""The prefix of the demand ids of claims that overrides make; no other demand may use it."""
 
 
 @dataclass(frozen=True, slots=True)

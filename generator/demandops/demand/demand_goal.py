@@ -123,12 +123,9 @@ def _lease_form(value: object) -> object:
     )
 
 
+# A duration or a number of seconds. The validator _lease_form checks this, because for a wrong
+# value of a union, pydantic reports one fault for each type in the union.
 Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
-"""A duration or a number of seconds.
-
-The validator :func:`_lease_form` checks this, because for a wrong value of a union, pydantic
-reports one fault for each type in the union.
-"""
 
 
 class DemandGoal(FrozenModel):
@@ -148,17 +145,13 @@ class DemandGoal(FrozenModel):
     answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
 
 
+# How many levels a parameter's value may have. The value is a part of a claim's file, and the whole
+# file may have 100 levels.
 _DEEPEST = 50
-"""How many levels a parameter's value may have.
-
-The value is a part of a claim's file, and the whole file may have 100 levels.
-"""
 _TOO_DEEP = f"is nested deeper than {_DEEPEST} levels; make it flatter"
+# How many characters a key in a parameter's value may have. YAML reads keys of at most 1024
+# characters, in which an escape counts as several.
 _LONGEST_KEY = 128
-"""How many characters a key in a parameter's value may have.
-
-YAML reads keys of at most 1024 characters, in which an escape counts as several.
-"""
 _LISTS_OF_TEXT = ("requesters", "labels", "capabilities", "properties")
 
 

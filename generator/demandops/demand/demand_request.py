@@ -19,11 +19,9 @@ from demandops.errors import Fault, Refused, fault
 from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
+# Takes a field's path in an application or connection, and returns the field's path in the goal.
+# For example, ``inputs.ego_data[2].source`` becomes ``applications[0].inputs.ego_data[2].source``.
 Place = Callable[[str], str]
-"""Takes a field's path in an application or connection, and returns the field's path in the goal.
-
-For example, ``inputs.ego_data[2].source`` becomes ``applications[0].inputs.ego_data[2].source``.
-"""
 
 
 def place_in(field: str) -> Place:
@@ -39,12 +37,12 @@ class Demanded:
     requesters: tuple[str, ...]
     place: Place
     term: Term | None = None
+    # The type of derived connections of an application; ``auto``: any type, ``none``: none
     connect: str = "none"
-    """The type of derived connections of an application; ``auto``: any type, ``none``: none."""
+    # How a connection differs from the requested one; the receipt has this text as a warning
     note: str = ""
-    """How a connection differs from the requested one; the receipt has this text as a warning."""
+    # A sentence for each placed application or service: which node was chosen, and why
     placed: tuple[str, ...] = ()
-    """A sentence for each placed application or service: which node was chosen, and why."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
         """Return a fault for the field at ``path`` in this item.
@@ -70,12 +68,12 @@ class DemandRequest:
     demand: str = ""
     own_requesters: tuple[str, ...] = ()
 
+    # The operation's name in commits and files
     operation: ClassVar[str]
-    """The operation's name in commits and files."""
+    # Whether the request can add claims
     adds_claims: ClassVar[bool] = False
-    """Whether the request can add claims."""
+    # Whether the request is a goal of the reference's action, which names no demand
     is_reference: ClassVar[bool] = False
-    """Whether the request is a goal of the reference's action, which names no demand."""
 
     def requesters(self) -> tuple[str, ...]:
         """Return all requesters, each once, in the order of the request."""

@@ -21,13 +21,13 @@ from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest,
 from demandops.demand.lease import Term
 from demandops.errors import Fault, fault
 
+# Pairs of a rule's field, such as ``nodes``, and a value that this field must allow
 Access = list[tuple[str, str]]
-"""Pairs of a rule's field, such as ``nodes``, and a value that this field must allow."""
 
+# The field of a rule that lists the access domains to which connections may lead
 PEERS = "peers"
-"""The field of a rule that lists the access domains to which connections may lead."""
+# For a domain whose policy has no rules: everybody may demand everything inside of the domain
 _NO_RULES = (Rule(name="everything"),)
-"""For a domain whose policy has no rules: everybody may demand everything inside of the domain."""
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:

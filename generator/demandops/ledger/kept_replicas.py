@@ -35,11 +35,9 @@ from demandops.settings import LEDGER_API_VERSION
 
 REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
 
+# The key of a service instance: the text ``replicas``, then the values of ``_FIELDS``. The text
+# tells the key apart from the entries of the ledger's index.
 Instance: TypeAlias = "tuple[str, ...]"
-"""The key of a service instance: the text ``replicas``, then the values of ``_FIELDS``.
-
-The text tells the key apart from the entries of the ledger's index.
-"""
 
 _FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
 
@@ -51,11 +49,9 @@ class Kept(NamedTuple):
     until: datetime
 
 
+# The steps in which one service scales down. Each step has fewer replicas and a later end than the
+# previous step.
 Steps: TypeAlias = "tuple[Kept, ...]"
-"""The steps in which one service scales down.
-
-Each step has fewer replicas and a later end than the previous step.
-"""
 
 
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:

@@ -30,18 +30,15 @@ from demandops.settings import LEDGER_API_VERSION
 
 SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
 
+# How long after a shutdown the same shutdown counts as a repeat, not as a new one
 REMEMBERED = timedelta(minutes=15)
-"""How long after a shutdown the same shutdown counts as a repeat, not as a new one."""
 
+# How old a record must be before forget removes it because of its age. This is longer than
+# REMEMBERED, because a repeat that was received in time may wait in a journal before it is decided.
 _KEPT = timedelta(hours=1)
-"""How old a record must be before :meth:`RecentShutdowns.forget` removes it because of its age.
 
-This is longer than :data:`REMEMBERED`, because a repeat that was received in time may wait in a
-journal before it is decided.
-"""
-
+# The highest number of old records that one request removes
 _FORGOTTEN = 10
-"""The highest number of old records that one request removes."""
 
 _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 

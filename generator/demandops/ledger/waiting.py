@@ -55,8 +55,8 @@ class WaitingDemand:
         return -self.priority, self.since, self.demand
 
 
+# A map from demand id to waiting demand
 WaitingDemands: TypeAlias = "HashTrieMap[str, WaitingDemand]"
-"""A map from demand id to waiting demand."""
 
 
 @dataclass(frozen=True, slots=True)

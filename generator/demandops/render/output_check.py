@@ -20,8 +20,8 @@ import jsonschema_rs
 from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput, fault, field_path
 
+# The version of Kubernetes whose schemas are used to check objects of built-in kinds
 KUBERNETES_VERSION = "1.36.0"
-"""The version of Kubernetes whose schemas are used to check objects of built-in kinds."""
 
 OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
 

@@ -18,11 +18,9 @@ from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.templating.values import Evaluate
 
 _START = "# override overrides/"
+# The effects of overrides that change only a release's comments, and not the body. The comments on
+# these effects are updated even in a held file.
 _OUTSIDE_BODY = frozenset({"hold", "keep"})
-"""The effects of overrides that change only a release's comments, and not the body.
-
-The comments on these effects are updated even in a held file.
-"""
 _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 

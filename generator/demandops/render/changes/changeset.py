@@ -29,11 +29,11 @@ from demandops.templating.values import Evaluate
 
 Change = Literal["start", "change", "stop"]
 
+# The kinds of changes, in the order in which lists of changes show them
 CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
-"""The kinds of changes, in the order in which lists of changes show them."""
 
+# A function that returns the text of a state repo's file, or None if the file is missing
 FileReader = Callable[[str], str | None]
-"""A function that returns the text of a state repo's file, or None if the file is missing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,17 +61,15 @@ class Changeset:
 
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
+    # The paths of the overrides that have an effect on the written files, ``hold`` included
     overrides: tuple[str, ...] = ()
-    """The paths of the overrides that have an effect on the written files, ``hold`` included."""
+    # A warning for each release that a ``hold`` override keeps from changing
     blocked: tuple[str, ...] = ()
-    """A warning for each release that a ``hold`` override keeps from changing."""
+    # Each release that the change may affect, as it is after the change; None if it is gone
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """Each release that the change may affect, as it is after the change; None if it is gone."""
+    # Each release of ``plans``, as it was before the change. None if there was no such release, or
+    # if it could not be planned.
     former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """Each release of ``plans``, as it was before the change.
-
-    None if there was no such release, or if it could not be planned.
-    """
 
 
 def build_changeset(  # noqa: PLR0913 - each is an input of its own

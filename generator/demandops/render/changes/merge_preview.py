@@ -28,8 +28,8 @@ from demandops.templating.values import Evaluate
 
 _MOST_FACTS = 20
 
+# Marks a missing value
 ABSENT = object()
-"""Marks a missing value."""
 
 
 @dataclass(frozen=True, slots=True)

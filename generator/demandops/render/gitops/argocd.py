@@ -25,8 +25,8 @@ from demandops.render.gitops.paths import (
 from demandops.settings import MAIN_BRANCH
 from demandops.templating import engine
 
+# The address by which Argo CD reaches the cluster that it runs in
 IN_CLUSTER = "https://kubernetes.default.svc"
-"""The address by which Argo CD reaches the cluster that it runs in."""
 
 
 def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
