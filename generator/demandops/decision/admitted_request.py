@@ -195,7 +195,7 @@ def _refuse(faults: Iterable[Fault]) -> None:
 def form_faults(goal: object) -> list[Fault]:
     """Return the faults in a goal's form that need no configuration, such as unknown fields."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
-        return demand_goal.form_faults(goal)
+        return demand_goal.parse(goal)[1]
     return deployment_request_goal.form_faults(goal)
 
 
