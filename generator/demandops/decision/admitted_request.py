@@ -143,7 +143,7 @@ def admit(
         and malformed.isdisjoint(_with_parents(each.field))
         and not (unread and each.code == "empty")
     ]
-    # last, because a refused request must not count against its requesters
+    # last, because a goal with faults does not count against the limits of its requesters
     faults = faults or list(throttle(request, config))
     if faults:
         # the faults of one application or connection are reported together

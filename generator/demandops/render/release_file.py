@@ -18,21 +18,14 @@ from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.templating.values import Evaluate
 
 _START = "# override overrides/"
-# The effects of overrides that change only a release's comments, and not the body. The comments on
-# these effects are updated even in a held file.
+# These effects change only a release's comments, which are updated even in a held file.
 _OUTSIDE_BODY = frozenset({"hold", "keep"})
 _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
 def release_text(release: Release, config: Config, evaluate: Evaluate, current: str | None) -> str:
-    """Return the text of a release's file. A held release keeps the body of ``current``.
-
-    Args:
-        release: the release.
-        config: the configuration with which the release was planned.
-        evaluate: computes the values of services.
-        current: the file's text in the state repo; ``None`` if there is no file.
+    """Return the text of a release's file, whose text in the state repo is ``current``.
 
     Raises:
         Refused, InvalidInput: if the release cannot be rendered.
@@ -48,6 +41,7 @@ def release_text(release: Release, config: Config, evaluate: Evaluate, current: 
     if current is None:
         return _join([*outside, *of_body], manifests.render(release, config, evaluate))
     comments, body = split_comments(current)
+    # overrides that shaped the body when the hold started may have ended, so their comments stay
     frozen = [comment for comment in comments if not _UPDATED_COMMENT.match(comment)]
     return _join([*outside, *frozen], body)
 
@@ -57,7 +51,6 @@ def _join(comments: list[str], body: str) -> str:
 
 
 def override_comment(override: Override, effects: tuple[str, ...]) -> str:
-    """Return the comment that names an override and its effects."""
     until = f"until {format_time(override.end)}; " if override.end else ""
     return (
         f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
@@ -79,16 +72,11 @@ def kept_charts(
 ) -> dict[str, str]:
     """Return, by path, the chart sources that stay because a held release may still use them.
 
-    The source of a chart in a folder of the state repo is not kept, because it would fetch the
-    newest version of the folder.
-
-    Args:
-        files: the new generated files.
-        current: the generated files in the state repo.
-        world: the world, whose overrides say whether a release is held.
+    ``files`` are the new generated files, and ``current`` are those in the state repo.
     """
     if not any(override.hold for override in world.overrides):
         return {}
+    # not that of a chart in a folder of the state repo: it would fetch the folder's newest version
     return {
         path: text
         for path, text in current.items()
