@@ -91,7 +91,6 @@ def admit(
     """
     config, ledger = state.config, state.ledger
     limits = config.repo_settings.limits
-    not_placed: list[Fault] = []
     if isinstance(goal, dict) and Decommission.is_goal(goal):
         decommission = Decommission.parse(goal)
         return replace(decommission, nodes=config.nodes_of(decommission.id))
@@ -106,18 +105,15 @@ def admit(
         parsed = separate_instance.with_separate_instances(parsed, config)
         parsed, unclear = chosen_domain.with_chosen_domains(parsed, config, ledger.held)
         request = output_topics.with_further_topics(parsed, ledger, config)
-        request, not_placed = placement.with_chosen_nodes(
-            request, state, state.usage(), trial, checkpoint
-        )
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
         _refuse(admission.size_faults(wired, limits))
-        wired, unclear = chosen_domain.with_chosen_domains(wired, config, ledger.held)
-        request, not_placed = placement.with_chosen_nodes(
-            wired, state, state.usage(), trial, checkpoint
-        )
+        request, unclear = chosen_domain.with_chosen_domains(wired, config, ledger.held)
+    request, not_placed = placement.with_chosen_nodes(
+        request, state, state.usage(), trial, checkpoint
+    )
     # what was booked must be released, however long that takes
     checkpoint = checkpoint if request.adds_claims else lambda: None
     checkpoint()

@@ -76,14 +76,14 @@ class Decision:
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
     approval: tuple[str, ...] = ()
-    # The paths of the overrides that change the content of the rendered files
+    # the paths of the overrides that change the content of the rendered files
     overrides: tuple[str, ...] = ()
     # whether services now request less of a node, so that waiting demands are tried again
     frees: bool = False
 
     @property
     def placed(self) -> tuple[str, ...]:
-        """One text for each placed application or service: the chosen node and the reason."""
+        """A sentence for each placed application or service: the chosen node and the reason."""
         if isinstance(self.request, Drain):
             return self.request.moved
         return tuple(text for item in self.request.demanded for text in item.placed)
@@ -140,7 +140,7 @@ def decide(
     if isinstance(goal, DemandRequest):
         return _decided(state, goal, now, read, on_stage)
     try:
-        return _searched(state, goal, now, read, on_stage, throttle, checkpoint)
+        return _decide_goal(state, goal, now, read, on_stage, throttle, checkpoint)
     except OverBudget as spent:
         raise Refused([_too_large(spent)]) from None
 
@@ -149,7 +149,7 @@ def _too_large(spent: OverBudget) -> Fault:
     return fault("", str(spent), code="too-large")
 
 
-def _searched(
+def _decide_goal(
     state: State,
     goal: object,
     now: datetime,

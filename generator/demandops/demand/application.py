@@ -15,15 +15,13 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 class InputTopic(NamedTuple):
-    """An input topic of an application, and the node that publishes it.
-
-    ``further`` is true if this topic was not the node's usual topic when it was booked
-    (:mod:`demandops.plan.output_topics`).
-    """
+    """An input topic of an application, and the node that publishes it."""
 
     topic: str
     source: str
     type: str = ""
+    # It was not the usual topic of its source when it was booked. The claim says so, because a name
+    # that is made from it must not change while it is demanded (plan/output_topics.py).
     further: bool = False
 
     def part_in(self, version: str) -> str:
@@ -41,10 +39,7 @@ class InputTopic(NamedTuple):
 
 
 class Delivery(NamedTuple):
-    """An output (``<service>.<output>``) that is brought to a node.
-
-    Without ``topic``, the output has the same topic name there.
-    """
+    """An output (``<service>.<output>``) that is brought to a node, as ``topic`` if that is set."""
 
     output: str
     node: str
@@ -53,11 +48,7 @@ class Delivery(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """Requirements on a node: its role, labels, capabilities and properties.
-
-    ``labels`` are pairs of key and value. ``properties`` are texts like ``memoryGiB>=8``
-    (:mod:`demandops.config.node_property`).
-    """
+    """Requirements on a node; ``properties`` are texts like ``memoryGiB>=8``."""
 
     role: str = ""
     labels: tuple[tuple[str, str], ...] = ()
@@ -69,10 +60,7 @@ class Requirement:
         return len(self.labels) + len(self.capabilities) + len(self.properties)
 
     def united(self, other: Requirement) -> Requirement:
-        """Return the requirement that a node meets if it meets both this one and ``other``.
-
-        If both name a role, they must name the same role. The lists of the result are sorted.
-        """
+        """Return the requirement that a node meets if it meets both; two roles must be the same."""
         return Requirement(
             self.role or other.role,
             tuple(sorted({*self.labels, *other.labels})),
@@ -83,30 +71,25 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
-    """One application: its appdef, its node, and its inputs by role.
-
-    ``appdef`` is ``#<number>`` if a goal gives the application's type as a number that no appdef
-    has. In a claim, the inputs of each role are sorted by topic (:meth:`booked`). ``place`` has the
-    requirements on the node; it is ``None`` if the demand names the node. ``separate`` says that
-    this version runs at the same time as other versions, and that the id ends in the version
-    (:mod:`demandops.demand.separate_instance`).
-
-    ``services`` maps service names to nodes, for services that have a node of their own. ``named``
-    lists the services for which the demand itself names the node; the generator chose the nodes of
-    the other services. ``moved`` maps service names to nodes, for services that an override moves.
-    """
+    """One application: its appdef, its node, and its inputs by role."""
 
     id: str
+    # ``#<number>`` if a goal gives the application's type as a number that no appdef has
     appdef: str
     node: str
     inputs: Mapping[str, tuple[InputTopic, ...]]
     parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     version: str = ""
     deliver: tuple[Delivery, ...] = ()
+    # the requirements on the node, kept to choose again; None if the demand names the node
     place: Requirement | None = None
+    # this version runs beside others, and the id ends in it (demand/separate_instance.py)
     separate: bool = False
+    # the nodes of services that have one of their own, by service
     services: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    # the nodes to which an override moves services, by service
     moved: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    # the services whose node the demand itself names; the generator chose the nodes of the others
     named: tuple[str, ...] = ()
     _further: dict[tuple[str, str], list[InputTopic]] = field(
         default_factory=dict, init=False, repr=False, compare=False
@@ -143,9 +126,8 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
-        """Return the inputs of a role with this source and topic.
-
-        The inputs of the role must be sorted, as they are in a claim.
+        """Return the inputs of a role with this source and topic; they must be sorted as in a
+        claim.
         """
         inputs = self.inputs.get(role, ())
         start = bisect_left(inputs, InputTopic(topic, source))
@@ -155,8 +137,9 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the inputs of a role for which ``part`` stands in topic names. Only a separate
-        instance also has its usual inputs there.
+        """Return the inputs of a role for which ``part`` stands in topic names.
+
+        Usual inputs are among them only for a separate instance.
         """
         if not self._further:  # computed only once, because the plans of many services need it
             for each, topic in self.all_inputs():
@@ -175,10 +158,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return {*self.chosen_nodes, *self.moved.values(), *sources}
 
     def chosen_node(self, service: str) -> str:
-        """Return the node that the demand or the generator chose for a service. The service may run
-        elsewhere if an override moves it, if it runs at its sources, or if it runs once for each
-        cluster.
-        """
+        """Return the node that was chosen for a service, which an override may have moved away."""
         return self.services.get(service, self.node)
 
     @property
@@ -220,9 +200,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def matches_listed(self, listed: object) -> bool:
-        """Return whether a shutdown that lists ``listed``, with the same id, means this
-        application.
-        """
+        """Return whether a shutdown that lists ``listed``, with the same id, means this."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -241,9 +219,9 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield ()
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield (text, keys) for each input that a shutdown lists in ``listed``. ``keys`` are the
-        keys of this application's inputs that match it. A listed input without a source matches
-        that topic of any source.
+        """Yield (text, keys) for each input that a shutdown lists in ``listed``.
+
+        ``keys`` are the keys of this application's inputs that match it.
         """
         assert isinstance(listed, Application)  # noqa: S101 - see matches_listed
         by_name: dict[TopicKey, list[TopicKey]] = {}
@@ -251,6 +229,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             by_name.setdefault(key[:2], []).append(key)
         for role, topic in listed.all_inputs():
             named = by_name.get((role, topic.topic), [])
+            # listed without a source, a topic is that of any source
             keys = [key for key in named if topic.source in ("", key[2])]
             yield f"{role} {topic.topic} of {topic.source}", keys
 
@@ -264,6 +243,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     def without_node(self, node: str) -> Application | None:
         """Return the application without its inputs from ``node`` and its deliveries to ``node``.
+
         Return ``None`` if no input is left, or if the application or a service runs on the node.
         """
         if node in self.chosen_nodes or node in self.moved.values():
@@ -288,6 +268,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             if topic.further or self.separate:
                 yield ("further", topic.part_in(self.own_version))
             if not topic.further:
+                # with and without the topic, so that the claims with another topic can be counted
                 yield ("usual", topic.source, role)
                 yield ("usual", topic.source, role, topic.topic)
         if self.version:

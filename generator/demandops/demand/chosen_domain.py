@@ -26,7 +26,7 @@ from demandops.errors import Fault
 from demandops.subject import Subject
 
 Held = Application | Connection
-# Returns the application or connection that a subject's first claim holds, or ``None``
+# returns the application or connection that a subject's first claim holds
 Booked = Callable[[Subject], "Held | None"]
 
 

@@ -87,9 +87,7 @@ class Claim:
     def with_holders(
         self, held: Application | Connection, holders: Mapping[TopicKey, tuple[str, ...]]
     ) -> Claim:
-        """Return the claim with ``held`` as its content; ``holders`` maps each of its topics to the
-        sorted requesters that hold it.
-        """
+        """Return the claim with other content; ``holders`` maps each topic to sorted requesters."""
         requesters = tuple(sorted({who for names in holders.values() for who in names}))
         partial = {topic: names for topic, names in holders.items() if names != requesters}
         return replace(self, held=held, requesters=requesters, partial=partial)
@@ -97,6 +95,7 @@ class Claim:
     def extending(self, current: Claim) -> Claim:
         """Return the claim with everything added that ``current``, the claim so far, holds."""
         held = current.held.extended(self.held).booked()  # type: ignore[arg-type]  # of one kind
+        # a shutdown may have taken holds: only what is listed again is held by all requesters
         holders = dict.fromkeys(held.topic_keys(), self.requesters)
         listed = {*self.held.topic_keys()}
         kept = {topic: current.holders(topic) for topic in holders if topic not in listed}
@@ -105,9 +104,7 @@ class Claim:
     def without_holds(
         self, requester: str, topics: Container[TopicKey] | None = None
     ) -> Claim | None:
-        """Return the claim without a requester's holds on ``topics``, or on all topics. A topic
-        that no requester holds any longer leaves the claim.
-        """
+        """Return the claim without a requester's holds on ``topics``, or on all topics."""
         holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
         for topic in self.held.topic_keys():
             names = self.holders(topic)
@@ -115,7 +112,7 @@ class Claim:
                 names = tuple(who for who in names if who != requester)
             if names:
                 holders[topic] = names
-            else:
+            else:  # nobody holds the topic any longer, so the claim loses it
                 gone.add(topic)
         held = self.held.without_topics(gone) if gone else self.held
         return None if held is None else self.with_holders(held, holders)

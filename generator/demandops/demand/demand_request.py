@@ -36,11 +36,11 @@ class Demanded:
     requesters: tuple[str, ...]
     place: Place
     term: Term | None = None
-    # The type of derived connections of an application; ``auto``: any type, ``none``: none
+    # the type of an application's derived connections; ``auto``: any type, ``none``: none
     connect: str = "none"
-    # How a connection differs from the requested one; the receipt has this text as a warning
+    # how a connection differs from the requested one, for a warning in the receipt
     note: str = ""
-    # A sentence for each placed application or service: which node was chosen, and why
+    # a sentence for each placed application or service: which node was chosen, and why
     placed: tuple[str, ...] = ()
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
@@ -62,11 +62,9 @@ class DemandRequest:
     demand: str = ""
     own_requesters: tuple[str, ...] = ()
 
-    # The operation's name in commits and files
-    operation: ClassVar[str]
-    # Whether the request can add claims
+    operation: ClassVar[str]  # as in commits and files
     adds_claims: ClassVar[bool] = False
-    # Whether the request is a goal of the reference's action, which names no demand
+    # the request is a goal of the reference's action, which names no demand
     is_reference: ClassVar[bool] = False
 
     def requesters(self) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from demandops import strict_yaml
 from demandops.config.base_model import faults_of
 from demandops.errors import MOST_FAULTS, Fault, Refused, fault, field_path
 
-# How deeply a goal may be nested: as deeply as a YAML file of the state repo
+# how deeply a goal may be nested: as deeply as a YAML file of the state repo
 _DEEPEST = 100
 
 Goal = TypeVar("Goal", bound=BaseModel)

@@ -21,12 +21,12 @@ from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest,
 from demandops.demand.lease import Term
 from demandops.errors import Fault, fault
 
-# Pairs of a rule's field, such as ``nodes``, and a value that this field must allow
+# pairs of a rule's field, such as ``nodes``, and a value that this field must allow
 Access = list[tuple[str, str]]
 
-# The field of a rule that lists the access domains to which connections may lead
+# the field of a rule that lists the access domains to which connections may lead
 PEERS = "peers"
-# For a domain whose policy has no rules: everybody may demand everything inside of the domain
+# without rules in a domain's policy, everybody may demand everything inside of the domain
 _NO_RULES = (Rule(name="everything"),)
 
 
@@ -188,12 +188,12 @@ def approval_reasons(
 
 
 def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:
-    """Yield why an access to a domain needs approval, if no rule grants it without approval."""
     rules = [
         rule
         for rule in domain.rules
         if matches(requester, rule.requesters) and first_uncovered(rule, access) is None
     ]
+    # one rule that grants the access without approval is enough
     if any((rule.approval or domain.approval) == "none" for rule in rules):
         return
     own = [rule for rule in rules if rule.approval == "required"]

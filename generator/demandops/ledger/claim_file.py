@@ -1,10 +1,8 @@
 """Claim files: one YAML file for each claim, with a schema version.
 
-The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. The subjects are
-spread over many folders ``hh``, because a Git tree with 100,000 entries adds 100 ms to each commit.
-``subject`` and ``demand`` are slugs with a hash of the exact id. The file contains the exact ids,
-so a file that was moved to another path is noticed. A demand is refused if the path of its claim is
-that of another claim's file (:mod:`demandops.plan.checks.name_clash`).
+The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. ``subject`` and
+``demand`` are slugs with a hash of the exact id, which the file contains. A demand is refused if
+the path of its claim is that of another claim's file (:mod:`demandops.plan.checks.name_clash`).
 """
 
 from __future__ import annotations
@@ -48,6 +46,7 @@ def path_of(key: ClaimKey) -> str:
 
 def folder_of(subject: Subject) -> str:
     """Return the folder of all claims on an application or a connection."""
+    # many folders, because a Git tree with 100,000 entries adds 100 ms to each commit
     fan = naming.hash_of(subject.id, 2)
     return f"{LEDGER_ROOT}/{subject.kind.value}/{fan}/{segment(subject.id)}"
 
@@ -84,8 +83,7 @@ def _end_of_lease(text: str) -> str:
 
 
 _EndOfLease = Annotated[str, AfterValidator(_end_of_lease)]
-
-
+# a person may list one twice or in another order
 _Requesters = Annotated[tuple[str, ...], AfterValidator(lambda names: tuple(sorted(set(names))))]
 
 
@@ -122,9 +120,10 @@ class _Route(RouteOptions):
     requesters: _Requesters = Field(default=(), strict=False)
 
 
-def _plain_route(value: object) -> object:
-    # most routes are written as /a: /b, because they have no options
-    return {"target": value} if isinstance(value, str) else value
+# most routes are written as /a: /b, because they have no options
+_RouteEntry = Annotated[
+    _Route, BeforeValidator(lambda value: {"target": value} if isinstance(value, str) else value)
+]
 
 
 class _Lease(FrozenModel):
@@ -234,7 +233,7 @@ class _ConnectionFile(_Claim):
     source: str
     target: str
     broker: str = ""
-    topics: dict[str, Annotated[_Route, BeforeValidator(_plain_route)]] = Field(min_length=1)
+    topics: dict[str, _RouteEntry] = Field(min_length=1)
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
         for source, route in self.topics.items():
@@ -366,6 +365,7 @@ def read(text: str, path: str) -> Claim:
     if faults := [each.within(path) for each in file.faults()]:
         raise InvalidInput(faults)
     claim = file.claim()
+    # a file that was moved would be a second claim with the same key
     if path_of(claim.key) != path:
         message = (
             f"the ids in this file belong to {path_of(claim.key)}; move the file to that path, or "

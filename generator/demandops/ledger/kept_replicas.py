@@ -1,12 +1,10 @@
 """Kept replicas: those that a service keeps for a while although its demands need fewer.
 
 A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service has
-the highest number of replicas that its demands needed within this time. A service instance with
-kept replicas has one record, the file ``ledger/replicas/<hh>/<name>.yaml``. The record lists each
-number of replicas above the present need, with the time until which the service keeps this number.
-When that time passes, the generator publishes a commit that removes the number from the record.
-The replicas depend on the record, never on the clock, so ``demandops verify`` computes the same
-bytes again.
+the highest number of replicas that its demands needed within this time. Its record, the file
+``ledger/replicas/<hh>/<name>.yaml``, lists each number above the present need, with the time until
+which it is kept. When that time passes, the generator removes the number by a commit. The replicas
+depend on the record, never on the clock, so ``demandops verify`` computes the same bytes again.
 """
 
 from __future__ import annotations
@@ -36,8 +34,7 @@ from demandops.settings import LEDGER_API_VERSION
 
 REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
 
-# The key of a service instance: the text ``replicas``, then the values of ``_FIELDS``. The text
-# tells the key apart from the entries of the ledger's index.
+# the key of a service instance: the text ``replicas``, then the values of _FIELDS
 Instance: TypeAlias = "tuple[str, ...]"
 
 _FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
@@ -50,8 +47,7 @@ class Kept(NamedTuple):
     until: datetime
 
 
-# The steps in which one service scales down. Each step has fewer replicas and a later end than the
-# previous step.
+# each step has fewer replicas and a later end than the previous one
 Steps: TypeAlias = "tuple[Kept, ...]"
 
 

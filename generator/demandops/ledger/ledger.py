@@ -1,8 +1,6 @@
 """The ledger: which demand holds which subject, as a set of persistent maps.
 
-A :class:`Ledger` never changes, because each request makes a new one. How long that takes depends
-on the size of the request and on the number of claims on its subjects, not on the number of all
-claims.
+A :class:`Ledger` never changes, because each request makes a new one.
 """
 
 from __future__ import annotations
@@ -44,6 +42,8 @@ class Ledger:
     # They are a tuple, because the planner asks for all of them at each join, and a persistent map
     # would make and sort them anew each time.
     claims: HashTrieMap[Subject, tuple[Claim, ...]] = field(default_factory=HashTrieMap)
+    # The keys of the claims that have an entry. What a request costs then depends on its claims and
+    # not on all claims.
     index: Index = field(default_factory=HashTrieMap)
     # each minute in which a lease and its slack end: the next end is found without a scan of claims
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
@@ -86,8 +86,9 @@ class Ledger:
         return first.connection if first else None
 
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
-        """Return the ``known`` versions and channels that claims on an application ask for. The
-        result also has an empty text if a claim asks for no version, or for an unknown one.
+        """Return the ``known`` versions and channels that claims on an application ask for.
+
+        An empty text stands for claims that ask for no version, or for an unknown one.
         """
         by_version = {word: self.index.get(("version", application, word)) for word in known}
         counts = {word: len(keys) for word, keys in by_version.items() if keys}
@@ -131,8 +132,8 @@ class Ledger:
         yield from sorted(usual - {excluded})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for each input in ``role`` that topic names show as ``part``.
-        ``version`` is that of the separate instance, else empty.
+        """Yield (input, version of a separate instance) for each input that topic names show as
+        ``part``.
         """
         for claim in self._claims("further", part):
             app = claim.application
@@ -182,16 +183,17 @@ class Ledger:
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:
-        """Return when the first lease and its slack end. An unstarted lease counts with
-        :data:`UNSTARTED`.
+        """Return when the first lease and its slack end, which is :data:`UNSTARTED` if none
+        started.
         """
         claims = (claim for key in self.first_to_end() or () if (claim := self.get(key)))
         return min((claim.lease.expires_at for claim in claims if claim.lease), default=None)
 
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
         """Return the keys of the claims whose leases, with their slack, end in the earliest minute.
-        Each call returns the same object until a claim enters the set, leaves the set or gets
-        another lease. So a caller that compares the objects sees each change.
+
+        Each call returns the same object until a claim enters the set, leaves it or gets another
+        lease.
         """
         return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
 
@@ -234,10 +236,7 @@ class Ledger:
         return tuple(sorted(ids))
 
     def indexed_names(self, entry: str) -> set[str]:
-        """Return the last text of each index entry whose first text is ``entry``.
-
-        This scans the whole index, so it is slow for a large ledger.
-        """
+        """Return the last text of each index entry that begins with ``entry``; scans the index."""
         return {key[-1] for key in self.index if key[0] == entry}
 
     def get(self, key: ClaimKey) -> Claim | None:
@@ -261,7 +260,8 @@ class Ledger:
             if not others and entry[0] == _ENDS:
                 minutes = minutes.remove(entry[1])
         added = after - before
-        if old and claim and old.lease != claim.lease:  # so ``first_to_end`` returns a new object
+        if old and claim and old.lease != claim.lease:
+            # so that first_to_end returns a new object, by which the expiry sees the change
             added |= {entry for entry in after if entry[0] == _ENDS}
         for entry in added:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
@@ -270,9 +270,7 @@ class Ledger:
         counts = self.applications_on
         if key.subject.kind is SubjectKind.APPLICATION:
             counts = _counted(counts, self.first_claim(key.subject), held[0] if held else None)
-        return Ledger(
-            claims, index, minutes, self.ended, self.shutdowns, counts, self.waiting, self.kept
-        )
+        return replace(self, claims=claims, index=index, minutes=minutes, applications_on=counts)
 
     def without(self, claims: Iterable[Claim]) -> Ledger:
         ledger = self
@@ -294,7 +292,6 @@ class Ledger:
         return ledger
 
     def __iter__(self) -> Iterator[Claim]:
-        """Yield every claim, in no order."""
         for claims in self.claims.values():
             yield from claims
 

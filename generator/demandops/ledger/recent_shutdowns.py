@@ -36,7 +36,7 @@ from demandops.settings import LEDGER_API_VERSION
 
 SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
 
-# How long after a shutdown the same shutdown counts as a repeat, not as a new one
+# how long after a shutdown the same shutdown counts as a repeat, not as a new one
 REMEMBERED = timedelta(minutes=15)
 
 # How old a record must be before forget removes it because of its age. This is longer than
@@ -115,8 +115,7 @@ class RecentShutdowns:
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
         """Return the records that are left, and the digests of those that are removed.
 
-        All records that name one of ``requesters`` are removed. Of the records that are older than
-        an hour, the ten oldest are removed.
+        Those are the ten oldest of more than an hour, and all that name one of ``requesters``.
         """
         ended = sorted(minute for minute in self.by_minute if minute < minute_of(now - _KEPT))
         old = (digest for minute in ended for digest in sorted(self.by_minute[minute]))

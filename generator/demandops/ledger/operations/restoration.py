@@ -1,7 +1,6 @@
 """A restoration books the claims of an earlier commit again.
 
-A restoration undoes newer claims only if the request says so. A restored lease runs for its full
-term from now on, because its old end may have passed. After a restoration, as after every change,
+A restoration undoes newer claims only if the request says so. Afterwards, as after every change,
 :mod:`demandops.plan.overrides.claim_overrides` updates the claims that overrides keep.
 """
 
@@ -47,10 +46,10 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
             ``drop_newer`` is not set. Claims that overrides keep, and renewals, do not count.
     """
     changes = _changes(ledger, request)
-    if not request.drop_newer:
-        newer = [c for c in changes if c.before is not None and c.before.keeping_override is None]
-        if newer:
-            raise Refused(_newer_faults(newer))
+    # claims that overrides keep do not count, because they are made again
+    newer = [c for c in changes if c.before is not None and c.before.keeping_override is None]
+    if newer and not request.drop_newer:
+        raise Refused(_newer_faults(newer))
     start = ledger
     for change in changes:
         claim = change.after

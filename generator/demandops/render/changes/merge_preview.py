@@ -89,30 +89,28 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
     Raises:
         Refused: if the definition of a claimed application is missing.
     """
-    faults: list[Fault] = []
-    files: dict[ReleaseKey, list[str]] = {}
+    errors: list[tuple[ReleaseKey, InvalidInput]] = []
     for key in all_keys(world):
         try:
             release = plan(world, key)
             if release is not None:
                 manifests.render(release, world.config, evaluate)
         except InvalidInput as error:
-            # made only now, because most worlds have no fault
-            files = files or _claim_files(world)
-            claims = files.get(key, [])
-            edited_claim = next((path for path in claims if path in edited), "")
-            for fault in error.faults:
-                faults.append(fault.within(edited_claim or fault.file or (claims or [""])[0]))
-    return list(dict.fromkeys(faults))
-
-
-def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
-    by_release: dict[ReleaseKey, list[str]] = {}
+            errors.append((key, error))
+    if not errors:
+        return []
+    files: dict[ReleaseKey, list[str]] = {}
     for subject in sorted(world.ledger.claims, key=str):
         paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
         for key in keys_of(world, subject):
-            by_release.setdefault(key, []).extend(paths)
-    return by_release
+            files.setdefault(key, []).extend(paths)
+    faults: list[Fault] = []
+    for key, failure in errors:
+        claims = files.get(key, [])
+        edited_claim = next((path for path in claims if path in edited), "")
+        for fault in failure.faults:
+            faults.append(fault.within(edited_claim or fault.file or (claims or [""])[0]))
+    return list(dict.fromkeys(faults))
 
 
 def preview(
