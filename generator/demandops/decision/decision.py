@@ -309,12 +309,7 @@ def _decided(
 def _booked(
     state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
 ) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
-    """Return the state with a request booked, the changes, and the releases that may change.
-
-    Raises:
-        Refused: if existing claims, an override, a quota or a clash of topics or names forbid the
-            booking.
-    """
+    """Return the state with a request booked, the changes, and the releases that may change."""
     checkpoint()
     subjects = request.subjects()
     # Claims of the request replace those that overrides kept. Else a kept claim, which nobody
@@ -358,11 +353,7 @@ def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.N
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    """Return the state after a step of a service's kept replicas has ended, and its changeset.
-
-    Raises:
-        Refused, InvalidInput: if the service cannot be planned or rendered.
-    """
+    """Return the state after a step of a service's kept replicas has ended, and its changeset."""
     after = replace(state, ledger=scale_downs.without_ended(state, instance, now))
     changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
     change = changeset.build_changeset(

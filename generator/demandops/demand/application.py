@@ -25,10 +25,7 @@ class InputTopic(NamedTuple):
     further: bool = False
 
     def part_in(self, version: str) -> str:
-        """Return the text that stands for this input in topic names.
-
-        ``version`` is the version of a separate instance, else empty.
-        """
+        """Return the text that stands for this input in topic names; ``version`` may be empty."""
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
     def distinguishing_text(self, further: bool, version: str) -> str:
@@ -137,10 +134,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the inputs of a role for which ``part`` stands in topic names.
-
-        Usual inputs are among them only for a separate instance.
-        """
+        """Return the inputs of a role that topic names show as ``part``."""
         if not self._further:  # computed only once, because the plans of many services need it
             for each, topic in self.all_inputs():
                 if topic.further or self.separate:

@@ -24,10 +24,6 @@ from demandops.subject import Subject
 Place = Callable[[str], str]
 
 
-def place_in(field: str) -> Place:
-    return lambda path: f"{field}.{path}"
-
-
 @dataclass(frozen=True, slots=True)
 class Demanded:
     """One application or connection that a request lists, and its requesters."""

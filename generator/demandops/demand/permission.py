@@ -81,9 +81,8 @@ def needed_access(
 
 
 def may_place(item: Demanded, appdef: str, node: str, config: Config) -> bool:
-    """Return whether the requesters may use a node for an application of the type ``appdef``.
-
-    If ``appdef`` is empty, return whether they may use the node as an end of a connection.
+    """Return whether the requesters may use a node for an ``appdef``, or as the end of a
+    connection.
     """
     domain = config.domain_of.get(node)
     access: Access = [("applications", appdef)] if appdef else []

@@ -52,11 +52,7 @@ def folder_of(subject: Subject) -> str:
 
 
 def parse_timestamp(text: str) -> datetime:
-    """Return the time that a text in a ledger file states, in UTC.
-
-    Raises:
-        ValueError: if the text is not a time with a time zone.
-    """
+    """Return the time that a text states, in UTC; raise ValueError without a time zone."""
     try:
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
         in_utc = moment.astimezone(timezone.utc)
@@ -339,11 +335,7 @@ def _partial(claim: Claim, topic: TopicKey) -> dict[str, list[str]]:
 
 
 def read(text: str, path: str) -> Claim:
-    """Return the claim in a file.
-
-    Raises:
-        InvalidInput: if the file is not valid, or if its path does not match the ids in the file.
-    """
+    """Return the claim in a file; raise InvalidInput if it is not valid or at another path."""
     data = strict_yaml.load(text, path)
     kind = data.get("kind") if isinstance(data, dict) else None
     version = _VERSION.match(str(data.get("apiVersion", ""))) if isinstance(data, dict) else None

@@ -284,13 +284,6 @@ class Ledger:
             waiting = waiting.discard(demand)
         return replace(self, waiting=waiting)
 
-    def with_claims_from(self, subject: Subject, other: Ledger) -> Ledger:
-        """Return the ledger with the claims on ``subject`` as they are in ``other``."""
-        ledger = self.without(self.claims_on(subject))
-        for claim in other.claims_on(subject):
-            ledger = ledger.replace(claim.key, claim)
-        return ledger
-
     def __iter__(self) -> Iterator[Claim]:
         for claims in self.claims.values():
             yield from claims

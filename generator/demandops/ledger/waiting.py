@@ -9,7 +9,7 @@ Each waiting demand is one file: ``ledger/waiting/<hh>/<demand>.yaml``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal, TypeAlias
@@ -126,8 +126,3 @@ def read_all(files: Mapping[str, str]) -> WaitingDemands:
     """Return the waiting demands in ``files`` (path to text); invalid files are skipped."""
     demands = (demand for path, text in files.items() if (demand := read(text, path)))
     return HashTrieMap({each.demand: each for each in demands})
-
-
-def of_requester(waiting: WaitingDemands, requester: str) -> Iterator[WaitingDemand]:
-    """Yield the waiting demands whose only requester is ``requester``."""
-    return (demand for demand in waiting.values() if demand.requesters == (requester,))

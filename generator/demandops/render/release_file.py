@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from itertools import dropwhile
 
 from demandops.config.config import Config
 from demandops.config.override import Override, format_time
@@ -18,18 +19,14 @@ from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.templating.values import Evaluate
 
 _START = "# override overrides/"
-# These effects change only a release's comments, which are updated even in a held file.
+# these effects change only a release's comments, which are updated even in a held file
 _OUTSIDE_BODY = frozenset({"hold", "keep"})
 _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
 def release_text(release: Release, config: Config, evaluate: Evaluate, current: str | None) -> str:
-    """Return the text of a release's file, whose text in the state repo is ``current``.
-
-    Raises:
-        Refused, InvalidInput: if the release cannot be rendered.
-    """
+    """Return the text of a release's file, whose text in the state repo is ``current``."""
     shaping = release.shaping
     if not shaping.held:
         comments = [override_comment(override, effects) for override, effects in shaping.by]
@@ -40,10 +37,12 @@ def release_text(release: Release, config: Config, evaluate: Evaluate, current: 
         comments.append(override_comment(override, effects))
     if current is None:
         return _join([*outside, *of_body], manifests.render(release, config, evaluate))
-    comments, body = split_comments(current)
+    lines = current.splitlines(keepends=True)
+    body = list(dropwhile(lambda line: line.startswith(_START), lines))
     # overrides that shaped the body when the hold started may have ended, so their comments stay
-    frozen = [comment for comment in comments if not _UPDATED_COMMENT.match(comment)]
-    return _join([*outside, *frozen], body)
+    above = (line.rstrip("\n") for line in lines[: len(lines) - len(body)])
+    frozen = [comment for comment in above if not _UPDATED_COMMENT.match(comment)]
+    return _join([*outside, *frozen], "".join(body))
 
 
 def _join(comments: list[str], body: str) -> str:
@@ -56,15 +55,6 @@ def override_comment(override: Override, effects: tuple[str, ...]) -> str:
         f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
         f"owner {override.owner}; reason: {override.reason}"
     )
-
-
-def split_comments(text: str) -> tuple[list[str], str]:
-    """Return the comments on overrides at the start of a file, and the file's body below them."""
-    lines = text.splitlines(keepends=True)
-    count = 0
-    while count < len(lines) and lines[count].startswith(_START):
-        count += 1
-    return [line.rstrip("\n") for line in lines[:count]], "".join(lines[count:])
 
 
 def kept_charts(

@@ -26,12 +26,9 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return a map from each appdef to the services' releases that a trial demand for it gives.
+    """Return the services' releases that a trial demand gives, for each appdef.
 
     Overrides do not apply. If no node is in an access domain, the map is empty.
-
-    Raises:
-        Refused: if a service cannot be planned.
     """
     if not config.domain_of:
         return {}

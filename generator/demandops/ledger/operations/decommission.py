@@ -16,16 +16,11 @@ from demandops.demand.demand_request import Decommission
 from demandops.errors import Refused, suggestion
 from demandops.ledger.claim_changes import Changes, claim_changes
 from demandops.ledger.ledger import Ledger
-from demandops.ledger.waiting import of_requester
 from demandops.subject import Subject, SubjectKind
 
 
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger after a node or requester is decommissioned, and the changes.
-
-    Raises:
-        Refused: if there is no claim to release or reduce, and no waiting demand to remove.
-    """
+    """Return the ledger after a node or requester is decommissioned, and the changes."""
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)
     if "node" in request.kinds:
@@ -35,7 +30,8 @@ def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[
         held = ledger.claims_of_requester(request.id)
         claims |= {f"{c.subject} {c.demand}": c for c in held}
         # a waiting demand that names others too stays, because they can still release it
-        waiting = tuple(demand.demand for demand in of_requester(ledger.waiting, request.id))
+        demands = ledger.waiting.values()
+        waiting = tuple(each.demand for each in demands if each.requesters == (request.id,))
     for claim in claims.values():
         left: Claim | None = claim
         if "requester" in request.kinds and request.id in claim.requesters:

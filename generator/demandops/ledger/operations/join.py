@@ -16,12 +16,7 @@ from demandops.subject import Subject
 
 
 def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger with the request's items added to what its demand holds, and the changes.
-
-    Raises:
-        Refused: with every conflict with an existing claim, or between items of the request, or if
-            the demand's id, which is a digest, is that of another demand.
-    """
+    """Return the ledger with the request's items added to what is held, and the changes."""
     faults: list[Fault] = []
     start = ledger
     keys: list[ClaimKey] = []

@@ -25,10 +25,7 @@ def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
 
 
 def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
-    """Return the claims of the request's demand.
-
-    Raises :class:`Refused` if the demand holds nothing or belongs to other requesters.
-    """
+    """Return the claims of the demand; raise Refused if it holds none or is of others."""
     held = ledger.claims_of_demand(request.demand)
     if not held:
         demands = sorted(

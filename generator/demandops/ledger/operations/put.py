@@ -15,12 +15,7 @@ from demandops.ledger.operations.ownership import is_waiting, refuse_other_owner
 
 
 def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger in which the demand holds only what ``request`` lists, and the changes.
-
-    Raises:
-        Refused: if the demand belongs to other requesters, conflicts with other demands, or lists
-            an application or a connection twice.
-    """
+    """Return the ledger in which the demand holds only what ``request`` lists, and the changes."""
     start, demand = ledger, request.demand
     held = ledger.claims_of_demand(demand)
     refuse_other_owners(held, request)

@@ -27,13 +27,7 @@ from demandops.subject import TopicKey
 
 
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger without the holds that a shutdown lists, and the changes.
-
-    If the ledger has a record of the same shutdown from the last 15 minutes, nothing changes.
-
-    Raises:
-        Refused: if the requesters have none of the listed holds.
-    """
+    """Return the ledger without the holds that a shutdown lists, and the changes."""
     record = RecentShutdown.of(request, now)
     repeats = ledger.shutdowns.earlier(record)
     if repeats is not None:
@@ -77,8 +71,7 @@ def _holds(
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
     """Yield (text, claim, keys) for each topic that a shutdown lists.
 
-    ``claim`` is the first claim in which the requester holds a matching topic, or ``None``.
-    ``keys`` are the keys of the matching topics that the requester holds there.
+    ``claim`` is the first in which the requester holds matching topics, whose keys are ``keys``.
     """
     subject = item.held.subject
     listed = [words for words, _ in item.held.listed_topics(item.held)]

@@ -120,11 +120,12 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
         new_path = path_of(new) if new else None
         current = read(new_path) if new_path else None
         try:
-            text = texts.of(new, current) if new else None
+            text = texts.text_of(new, current) if new else None
         except OverLimit:
             if keeps_late or old == new:  # what only renews a lease needs no template
                 continue
             raise
+        # the path has the node, so a release that moves to another node leaves a file behind
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
         blocked += _blocked(old, new) if current is not None else ()
@@ -199,14 +200,14 @@ def render_all(
     files = manifests.base_files(config)
     texts = _Texts(config, evaluate)
     keys = tuple(keys)
-    name_clash.refuse_shared_names(world, keys)
+    name_clash.refuse_shared_names(world, keys)  # one would overwrite the file of the other
     for key in keys:
         release = plan(world, key)
         if release is None:
             continue
         path = path_of(release)
         try:
-            files[path] = texts.of(release, current.get(path))
+            files[path] = texts.text_of(release, current.get(path))
         except OverLimit:
             if not keeps_late:
                 raise
@@ -222,7 +223,7 @@ class _Texts:
         self._config, self._evaluate = config, evaluate
         self._late: dict[str, OverLimit] = {}
 
-    def of(self, release: Release, current: str | None) -> str:
+    def text_of(self, release: Release, current: str | None) -> str:
         template = ""
         if isinstance(release, ServiceRelease):
             template = self._config.values_template(release.service)

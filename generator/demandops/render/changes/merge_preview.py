@@ -64,11 +64,7 @@ class MergePreview:
 
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
-    """Return all releases that can be planned, by key.
-
-    Raises:
-        Refused: if the definition of a claimed application is missing.
-    """
+    """Return all releases that can be planned, by key."""
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
         try:

@@ -29,11 +29,7 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
 
 
 def base_files(config: Config) -> dict[str, str]:
-    """Return the files that exist even without demands, by path.
-
-    Each cluster has a bootstrap file, which makes the cluster's controller follow the repo. For
-    Flux, each access domain of a cluster also has the sources of all charts.
-    """
+    """Return the files that exist even without demands, by path."""
     # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
     # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
     if config.repo_settings.gitops == "argocd":
