@@ -67,8 +67,8 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
                 yield replace(each, field=item.place(each.field))
 
 
-# The lists in these fields have no items of their own (items_of). A parameter is a value of its
-# author, so its size in bytes counts instead.
+# The lists in these fields have no items of their own (items_of). The size of parameters is limited
+# in bytes instead, and each target topic belongs to a source topic, which counts.
 _NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
 # About ten fields describe any item. Unknown fields are bounded too, because each would cost a
 # fault when the goal is parsed.

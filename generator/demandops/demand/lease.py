@@ -14,7 +14,7 @@ from datetime import datetime, timedelta, timezone
 LONGEST_S = 366 * 24 * 3600
 
 # The end of a lease that has not started. Its claim awaits approval, or a person approved it and
-# the generator has not started the lease yet. A time sorts and compares like any other end.
+# the generator has not started the lease yet.
 UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
 
 

@@ -64,8 +64,8 @@ def check_files(
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
     """Yield a file's valid documents, and append the faults of the others to ``faults``."""
     for part in text.split("\n---\n"):
-        # The spec of a document for Flux or Argo CD is not read, which takes most of the time. A
-        # template of the program writes it, and Helm values were checked when they were computed.
+        # The spec of a document for Flux or Argo CD is not parsed, which would cost time for nothing.
+        # A template of the program writes it, and Helm values were checked when they were computed.
         api = _API.search(part)
         of_controller = api is not None and api[1] not in _BUILT_IN
         try:
@@ -115,7 +115,7 @@ def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
 
 @lru_cache(maxsize=64)  # each kind needs the definitions, which are large
 def _with_local_references(file: Path) -> dict[str, Any]:
-    # the schemas refer to a path that exists only on the server that they were made for
+    # the definitions are put into each schema, because no file is at the path that it refers to
     text = file.read_text().replace("/api/_definitions.json#/$defs/", "#/$defs/")
     schema: dict[str, Any] = json.loads(text)
     return schema

@@ -66,7 +66,7 @@ def _connection_conflicts(
             ("target", demanded.target, booked.target),
             ("broker", demanded.broker, booked.broker),
         ):
-            # who names no broker takes the one that is used
+            # a broker that only one of the two names is no contradiction
             if new == current or (name == "broker" and not (new and current)):
                 continue
             message = (

@@ -29,7 +29,7 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
         faults += [*with_claims, *(each for each in above if each.field not in fields)]
         listed.add(item.held.subject)
         key = ClaimKey(item.held.subject, demand_id(request.id, item.requesters))
-        # two requests whose digests are the same can be searched, to change another's demand
+        # a put may have chosen this id for its demand, because demand ids are free text
         claims = start.claims_of_demand(key.demand)
         owners = {who for claim in claims for who in claim.requesters}
         if owners and owners.isdisjoint(item.requesters):
