@@ -64,8 +64,8 @@ def check_files(
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
     """Yield a file's valid documents, and append the faults of the others to ``faults``."""
     for part in text.split("\n---\n"):
-        # The spec of a document for Flux or Argo CD is not parsed, which would cost time for nothing.
-        # A template of the program writes it, and Helm values were checked when they were computed.
+        # The spec of a document for Flux or Argo CD is not parsed, because nothing reads it here. A
+        # template of the program writes it, and Helm values were checked when they were computed.
         api = _API.search(part)
         of_controller = api is not None and api[1] not in _BUILT_IN
         try:
