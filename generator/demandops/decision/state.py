@@ -18,7 +18,7 @@ from demandops.plan.checks.name_clash import Names
 from demandops.plan.nodes import capacity
 from demandops.plan.nodes.capacity import Usage
 from demandops.plan.release import Release
-from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys
+from demandops.plan.release_keys import ReleaseKey, affected_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
 from demandops.templating.values import Evaluate
@@ -89,14 +89,10 @@ def rendered_files(
 ) -> dict[str, str]:
     """Return every generated file that the state requires, as a map from path to text.
 
-    Args:
-        state: the world to render.
-        current: the current generated files, which ``hold`` overrides may preserve.
-        keeps_late: whether a release whose values take too long to compute keeps its file, instead
-            of OverLimit.
+    ``current`` are the current generated files, which ``hold`` overrides and ``keeps_late`` may
+    preserve (:func:`demandops.render.changes.changeset.render_all`).
     """
-    keys = all_keys(state)
-    return changeset.render_all(state, state.evaluate, keys, current, keeps_late=keeps_late)
+    return changeset.render_all(state, state.evaluate, current, keeps_late=keeps_late)
 
 
 def try_configuration(state: State) -> None:

@@ -21,7 +21,7 @@ from demandops.ledger.world import World
 from demandops.plan.checks import name_clash
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey
+from demandops.plan.release_keys import ReleaseKey, all_keys
 from demandops.quoting import one_line
 from demandops.render import release_file
 from demandops.render.gitops import manifests
@@ -183,23 +183,21 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
 def render_all(
     world: World,
     evaluate: Evaluate,
-    keys: Iterable[ReleaseKey],
     current: Mapping[str, str],
     *,
-    keeps_late: bool = False,
+    keeps_late: bool,
 ) -> dict[str, str]:
     """Return all generated files except those of the ledger, by path.
 
-    ``keys`` are those of all releases; ``current`` are the generated files in the state repo. With
-    ``keeps_late``, a release whose values take too long to compute keeps its file.
+    ``current`` are the generated files in the state repo. With ``keeps_late``, a release whose
+    values take too long to compute keeps its file.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered, or if two need one name.
     """
-    config = world.config
+    config, keys = world.config, all_keys(world)
     files = manifests.base_files(config)
     texts = _Texts(config, evaluate)
-    keys = tuple(keys)
     name_clash.refuse_shared_names(world, keys)  # one would overwrite the file of the other
     for key in keys:
         release = plan(world, key)
