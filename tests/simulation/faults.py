@@ -172,7 +172,7 @@ def deliver_under_the_source_topic(patch: Patch) -> None:
 
 
 def send_a_source_topic_to_two_targets(patch: Patch) -> None:
-    patch(conflicts, "_of_routes", lambda *_: ())
+    patch(conflicts, "_route_conflicts", lambda *_: ())
 
 
 def leave_the_clients_of_a_released_connection(patch: Patch) -> None:

@@ -25,13 +25,13 @@ from demandops.plan import implied_connections, output_topics
 from demandops.plan.nodes import placement
 from demandops.plan.nodes.choice import NO_ROOM
 
-_SUBJECT = re.compile(r"(apps|applications|connections)\[(\d+)\]")
+_ITEM = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
 
+# yields faults if a request comes too soon after others of its requesters
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
-"""A function that yields faults if a request comes too soon after others of its requesters."""
+# is called often during a decision, and raises OverBudget to end it
 Checkpoint = Callable[[], None]
-"""A function that is called often during a decision, and raises ``OverBudget`` to end it."""
 
 
 def admitted(
@@ -41,25 +41,23 @@ def admitted(
     throttle: Throttle,
     checkpoint: Checkpoint,
 ) -> DemandRequest:
-    """Return the request that a goal becomes.
-
-    If the demand lacks only room on a node and may wait, the result is a request to wait for room.
+    """Return the request that a goal becomes: to wait, if it lacks only room and may wait.
 
     Raises:
-        Refused: if the goal does not pass all checks of :func:`admit` and the demand cannot wait. A
-            demand that already holds claims never waits.
+        Refused: if the goal does not pass all checks of :func:`admit` and the demand cannot wait.
     """
     try:
         return admit(state, goal, throttle, None, checkpoint)
     except Refused as refused:
-        if any(found.code != NO_ROOM for found in refused.faults):
+        if any(each.code != NO_ROOM for each in refused.faults):
             raise
         # the reference's action names no demand that could wait
         if not isinstance(goal, dict) or not demand_goal.is_demand_goal(goal):
             raise
         parsed = separate_instance.with_separate_instances(demand_goal.parse(goal)[0], state.config)
-        known = state.ledger.waiting.get(parsed.demand)
-        mine = known is None or {*known.requesters} & {*parsed.requesters()}
+        before = state.ledger.waiting.get(parsed.demand)
+        mine = before is None or {*before.requesters} & {*parsed.requesters()}
+        # a demand that holds claims keeps them when it is refused, so it cannot wait as well
         holds = state.ledger.claims_of_demand(parsed.demand)
         if not isinstance(parsed, Put) or holds or not mine:
             raise
@@ -67,9 +65,11 @@ def admitted(
             raise
         if faults := list(throttle(parsed, state.config)):
             raise Refused(faults) from None
-        since, who = known.since if known else now, tuple(sorted({*parsed.requesters()}))
+        # a demand that is sent again keeps its place among those that wait
+        since = before.since if before else now
+        who = tuple(sorted({*parsed.requesters()}))
         waiting = WaitingDemand(parsed.demand, parsed.id, who, since, parsed.priority, goal)
-        reasons = tuple(found.message for found in refused.faults)
+        reasons = tuple(each.message for each in refused.faults)
         return Wait(parsed.id, (), parsed.demand, who, waiting, reasons)
 
 
@@ -82,8 +82,7 @@ def admit(
 ) -> DemandRequest:
     """Return the request that a goal becomes, if the goal passes all checks.
 
-    If ``trial`` is given, a node is chosen only if ``trial`` returns ``True`` for the request with
-    this node. ``checkpoint`` is that of :func:`demandops.decision.decision.decide`.
+    If ``trial`` is given, a node is chosen only if ``trial`` accepts the request with this node.
 
     Raises:
         Refused: with the limits that the goal exceeds, if it is too large. Otherwise with every
@@ -92,37 +91,38 @@ def admit(
     """
     config, ledger = state.config, state.ledger
     limits = config.repo_settings.limits
-    not_placed: list[Fault] = []
     if isinstance(goal, dict) and Decommission.is_goal(goal):
-        parsed_node = Decommission.parse(goal)
-        return replace(parsed_node, nodes=config.nodes_of(parsed_node.id))
+        decommission = Decommission.parse(goal)
+        return replace(decommission, nodes=config.nodes_of(decommission.id))
+    # before anything is parsed, because the parser's work grows with the goal
     _refuse(admission.length_faults(goal, limits))
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         parsed, faults = demand_goal.parse(goal)
         _refuse(admission.size_faults(parsed, limits))
         if parsed.adds_claims:
             checkpoint()
+        # the id of a separate instance comes first, because the placement looks for claims on it
         parsed = separate_instance.with_separate_instances(parsed, config)
         parsed, unclear = chosen_domain.with_chosen_domains(parsed, config, ledger.held)
         request = output_topics.with_further_topics(parsed, ledger, config)
-        request, not_placed = placement.with_chosen_nodes(
-            request, state, state.usage(), trial, checkpoint
-        )
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
         _refuse(admission.size_faults(wired, limits))
-        wired, unclear = chosen_domain.with_chosen_domains(wired, config, ledger.held)
-        request, not_placed = placement.with_chosen_nodes(
-            wired, state, state.usage(), trial, checkpoint
-        )
+        request, unclear = chosen_domain.with_chosen_domains(wired, config, ledger.held)
+    request, not_placed = placement.with_chosen_nodes(
+        request, state, state.usage(), trial, checkpoint
+    )
+    # what was booked must be released, however long that takes
     checkpoint = checkpoint if request.adds_claims else lambda: None
     checkpoint()
     request = completed(request, state)
     _refuse(admission.size_faults(request, limits))  # derived connections count as well
     checkpoint()
-    malformed = {found.field for found in faults}
+    # A field that is malformed was left out, so faults of its content would be wrong. The faults of
+    # form and of content that remain are reported together, to be mended in one go.
+    malformed = {each.field for each in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
     content = [
         *unclear,
@@ -133,27 +133,25 @@ def admit(
     # a list that could not be read must not be reported as empty
     unread = bool(malformed & {"apps", "applications", "connections"})
     faults += [
-        found
-        for found in content
-        if found.field not in around_malformed
-        and malformed.isdisjoint(_with_parents(found.field))
-        and not (unread and found.code == "empty")
+        each
+        for each in content
+        if each.field not in around_malformed
+        and malformed.isdisjoint(_with_parents(each.field))
+        and not (unread and each.code == "empty")
     ]
+    # last, because a goal with faults does not count against the limits of its requesters
     faults = faults or list(throttle(request, config))
     if faults:
-        raise Refused(sorted(dict.fromkeys(faults), key=lambda found: _subject_of(found.field)))
+        # the faults of one application or connection are reported together
+        raise Refused(sorted(dict.fromkeys(faults), key=lambda each: _item_of(each.field)))
     return request
 
 
 def completed(request: DemandRequest, state: State) -> DemandRequest:
-    """Return a request with its lease terms and connection types filled in.
-
-    The reference's requests also get their further topics, and other requests their implied
-    connections. The nodes of the request are chosen already.
-    """
+    """Return a request, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
     request = permission.with_lease_terms(request, config)
-    if request.is_reference:
+    if request.is_reference:  # its clients list their connections and shut down what they listed
         request = output_topics.with_further_topics(request, ledger, config)
     else:
         request = implied_connections.with_implied_connections(request, ledger, config)
@@ -173,7 +171,6 @@ _Item = TypeVar("_Item")
 
 
 def paced(items: Iterable[_Item], checkpoint: Checkpoint) -> Iterator[_Item]:
-    """Yield ``items``, and call ``checkpoint`` before each of them is used."""
     for item in items:
         checkpoint()
         yield item
@@ -182,20 +179,19 @@ def paced(items: Iterable[_Item], checkpoint: Checkpoint) -> Iterator[_Item]:
 def permission_faults(
     request: DemandRequest, config: Config, checkpoint: Checkpoint
 ) -> Iterator[Fault]:
-    """Yield what is not allowed; ``checkpoint`` is called for each item, as rules may be many."""
-    for one in paced(request.demanded, checkpoint):
-        yield from permission.faults(replace(request, demanded=(one,)), config)
+    for item in paced(request.demanded, checkpoint):  # an access domain may have many rules
+        yield from permission.faults(replace(request, demanded=(item,)), config)
 
 
 def _refuse(faults: Iterable[Fault]) -> None:
-    if found := list(faults):
-        raise Refused(found)
+    if listed := list(faults):
+        raise Refused(listed)
 
 
 def form_faults(goal: object) -> list[Fault]:
     """Return the faults in a goal's form that need no configuration, such as unknown fields."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
-        return demand_goal.form_faults(goal)
+        return demand_goal.parse(goal)[1]
     return deployment_request_goal.form_faults(goal)
 
 
@@ -205,11 +201,6 @@ def _with_parents(field: str) -> Iterator[str]:
         yield field[: match.start()]
 
 
-def _subject_of(field: str) -> tuple[str, int]:
-    """Return the list of the goal, and the index in this list, to which a field belongs.
-
-    Faults are sorted by this pair, so that the faults of one application or connection are reported
-    together.
-    """
-    match = _SUBJECT.match(field)
+def _item_of(field: str) -> tuple[str, int]:
+    match = _ITEM.match(field)
     return (match[1], int(match[2])) if match else ("", 0)

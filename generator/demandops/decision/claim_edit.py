@@ -8,10 +8,7 @@ from dataclasses import replace
 from itertools import chain
 
 from demandops.decision.state import State
-from demandops.demand import (
-    admission,
-    permission,
-)
+from demandops.demand import admission, permission
 from demandops.errors import Fault, Refused
 from demandops.ledger import claim_file
 from demandops.ledger.claim_changes import Changes, ClaimChange, changes_on
@@ -29,32 +26,20 @@ from demandops.subject import Subject
 def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return the changes to rendered files after a person edited claims on ``subjects``.
-
-    ``before`` is the ledger before the edit, and ``state`` has the ledger after it. A release whose
-    values take too long to compute keeps its file: that is no fault of the claim.
-    """
+    """Return the changes to rendered files after a person edited claims on ``subjects``."""
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
+    # a template that takes too long is no fault of the claim, so its release keeps its file
     return changeset.build_changeset(
         old, state, Changes(), keys, state.evaluate, read, keeps_late=True
     )
 
 
 def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
-    """Yield the faults of claims that a person wrote, each located in the claim's file.
-
-    A claim must be valid, permitted, within the quotas and capacities, and without a clash of
-    topics or names.
-    The permission and the quotas of a claim that is not valid are not checked. An edit that only
-    takes requesters away is always allowed, because it has the effect of a release.
-
-    Args:
-        before, after: the world before and after the edit.
-        changes: each claim as it was booked, and as the person wrote it.
-    """
+    """Yield the faults of claims that a person wrote, each located in the claim's file."""
     for change in changes:
         claim = change.after
+        # an edit that only takes requesters away has the effect of a release, which is allowed
         if claim is None or _only_reduces(change):
             continue
         wanted, config = restoration.request_for(claim), after.config
@@ -66,17 +51,15 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
             yield each.within(claim_file.path_of(claim.key))
         yield from topic_clash.faults_of_claim(claim, before, after)
         keys, changed = keys_of_claims(after, [claim]), Changes((change,))
-        clashes = name_clash.faults(wanted, before, after, keys, changed, after.names())
-        for each in (*clashes, *_above_capacity(change, after)):
+        faults = list(name_clash.faults(wanted, before, after, keys, changed, after.names()))
+        without = replace(after, ledger=after.ledger.replace(change.key, change.before))
+        with suppress(Refused):  # other checks report a claim that cannot be planned
+            grown = capacity.growth_by(without, after, [change])
+            # only growth is a fault: the nodes may be full because of other claims
+            usage = after.usage().plus({need: -amount for need, amount in grown.items()})
+            faults += capacity.faults(usage, grown, config)
+        for each in faults:
             yield each.within(claim_file.path_of(claim.key))
-
-
-def _above_capacity(change: ClaimChange, after: State) -> Iterator[Fault]:
-    without = replace(after, ledger=after.ledger.replace(change.key, change.before))
-    with suppress(Refused):  # other checks report a claim that cannot be planned
-        grown = capacity.growth_by(without, after, [change])
-        usage = after.usage().plus({need: -amount for need, amount in grown.items()})
-        yield from capacity.faults(usage, grown, after.config)
 
 
 def _only_reduces(change: ClaimChange) -> bool:

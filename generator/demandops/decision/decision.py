@@ -26,17 +26,12 @@ from demandops.decision.admitted_request import (
 )
 from demandops.decision.decision_notes import notes_on
 from demandops.decision.state import State
-from demandops.demand import (
-    admission,
-    demand_goal,
-    permission,
-)
+from demandops.demand import admission, demand_goal, permission
 from demandops.demand.demand_request import Decommission, DemandRequest
 from demandops.errors import Fault, OverBudget, Refused, fault
 from demandops.ledger.apply import apply
 from demandops.ledger.claim_changes import Changes
 from demandops.ledger.kept_replicas import Instance
-from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations import restoration
 from demandops.ledger.operations.drain import Drain
 from demandops.ledger.operations.restoration import Restoration
@@ -45,10 +40,7 @@ from demandops.plan import implied_connections
 from demandops.plan import scale_down as scale_downs
 from demandops.plan.checks import denial, name_clash, quota, topic_clash, version_difference
 from demandops.plan.nodes import capacity, relocation
-from demandops.plan.overrides.claim_overrides import (
-    with_kept_claims,
-    without_kept_claims,
-)
+from demandops.plan.overrides.claim_overrides import with_kept_claims, without_kept_claims
 from demandops.plan.release import ServiceKey
 from demandops.plan.release_keys import ReleaseKey, affected_keys
 from demandops.render.changes import changeset
@@ -57,6 +49,7 @@ from demandops.render.changes.changeset import FileReader, ReleaseChange
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "restored", "unchanged", "waiting"]
 
+# the outcome in the receipt, by operation; that of all others is ``released``
 _OUTCOMES: dict[str, Outcome] = {
     "join": "booked",
     "put": "booked",
@@ -65,19 +58,14 @@ _OUTCOMES: dict[str, Outcome] = {
     "rollback": "restored",
     "wait": "waiting",
 }
-"""The outcome in the receipt, by operation.
-
-The outcome of an operation that is not listed is ``released``.
-"""
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
     """The effect of a demand.
 
-    ``files`` maps each path to the new text, or to ``None`` if the file is to be removed. If the
-    demand changes nothing, ``files`` is empty. ``approval`` has the reasons why a person must
-    approve the demand before it is booked: access domains, rules, appdefs and changes of a version.
+    ``files`` maps each path to the new text, or to ``None`` if the file is to be removed.
+    ``approval`` has the reasons why a person must approve the demand before it is booked.
     """
 
     request: DemandRequest
@@ -88,30 +76,26 @@ class Decision:
     releases: tuple[ReleaseChange, ...]
     warnings: tuple[str, ...]
     approval: tuple[str, ...] = ()
+    # the paths of the overrides that change the content of the rendered files
     overrides: tuple[str, ...] = ()
-    """The paths of the overrides that change the content of the rendered files."""
+    # whether services now request less of a node, so that waiting demands are tried again
     frees: bool = False
-    """Whether room becomes free on a node, because services now request less of the node."""
 
     @property
     def placed(self) -> tuple[str, ...]:
-        """One text for each placed application or service: the chosen node and the reason."""
+        """A sentence for each placed application or service: the chosen node and the reason."""
         if isinstance(self.request, Drain):
             return self.request.moved
-        return tuple(text for one in self.request.demanded for text in one.placed)
+        return tuple(text for item in self.request.demanded for text in item.placed)
 
     @property
     def lease_s(self) -> int | None:
-        """The shortest lease of the demand in seconds, or ``None`` if the demand has no lease.
-
-        For a demand without an id, this is the shortest lease of the claims that the request added
-        or changed. For a waiting demand, this is the shortest lease that the demand may get later.
-        So the client renews the demand often enough.
-        """
+        """The shortest lease of the demand in seconds: the client must renew as often."""
         waiting = self.state.ledger.waiting.get(self.request.demand)
         if waiting is not None:
+            # which domain it will get is open, so any in which it may wait counts
             put, config = demand_goal.parse(dict(waiting.goal))[0], self.state.config
-            domains = (one for one in config.domains.values() if one.when_full == "wait")
+            domains = (domain for domain in config.domains.values() if domain.when_full == "wait")
             terms = (permission.term(put, domain) for domain in domains)
             return min((term.seconds for term in terms if term), default=None)
         claims = (
@@ -142,12 +126,11 @@ def decide(
         read: returns the current text of a file in the state repo, or ``None``.
         on_stage: called when the demand is admitted and when it is booked, each at most once.
             Later checks may still refuse an admitted demand.
-        throttle: called after all other checks of admission, and only if these find no fault. If
-            ``throttle`` yields faults, the request is refused. It may be called twice for one goal,
-            and is not called for a :class:`Decommission` and for the generator's own requests.
+        throttle: called if all other checks of admission find no fault, perhaps twice for one goal.
+            It is not called for a :class:`Decommission` and for the generator's own requests.
         checkpoint: called often while a demand that may add claims is decided, and raises
             :class:`OverBudget` to end the decision. It can only refuse a demand, never change what
-            is decided. What releases claims is decided without it, however long it takes.
+            is decided.
 
     Raises:
         Refused: with every fault, each with its field in the goal; with the code ``too-large``, if
@@ -157,7 +140,7 @@ def decide(
     if isinstance(goal, DemandRequest):
         return _decided(state, goal, now, read, on_stage)
     try:
-        return _searched(state, goal, now, read, on_stage, throttle, checkpoint)
+        return _decide_goal(state, goal, now, read, on_stage, throttle, checkpoint)
     except OverBudget as spent:
         raise Refused([_too_large(spent)]) from None
 
@@ -166,7 +149,7 @@ def _too_large(spent: OverBudget) -> Fault:
     return fault("", str(spent), code="too-large")
 
 
-def _searched(
+def _decide_goal(
     state: State,
     goal: object,
     now: datetime,
@@ -176,11 +159,12 @@ def _searched(
     checkpoint: Checkpoint,
 ) -> Decision:
     """Decide a goal; if it is refused on the nodes chosen first, look for others."""
-    limits, told = list[Fault](), set[Stage]()
+    throttled, told = list[Fault](), set[Stage]()
 
+    # who was throttled must not get another try on other nodes
     def noted(request: DemandRequest, config: Config) -> list[Fault]:
-        limits[:] = throttle(request, config)
-        return limits
+        throttled[:] = throttle(request, config)
+        return throttled
 
     def once(stage: Stage) -> None:
         if stage not in told:
@@ -191,8 +175,7 @@ def _searched(
         request = admitted(state, goal, now, noted, checkpoint)
         return _decided(state, request, now, read, once, checkpoint)
     except Refused as refused:
-        by_node = all(found.code in _BY_NODE for found in refused.faults) and not limits
-        if not by_node:
+        if throttled or any(each.code not in _BY_NODE for each in refused.faults):
             raise
         try:
             checkpoint()
@@ -210,18 +193,16 @@ def _searched(
         raise
 
 
+# The codes of faults that might not occur if other nodes were chosen for the demand
 _BY_NODE = frozenset(
     ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
 )
-"""The codes of faults that might not occur if other nodes were chosen for the demand."""
 
 
+# How many bookings one demand, or one drain of a node, may try while nodes are looked for. Each
+# trial books all that is placed so far. So the trials of one demand together may also book no more
+# items than the largest demand may list.
 MOST_TRIALS = 64
-"""How many bookings one demand, or one drain of a node, may try while nodes are looked for.
-
-Each trial books all that is placed so far. So the trials of one demand together may also book no
-more items than the largest demand may list.
-"""
 
 
 class _Trials:
@@ -232,11 +213,7 @@ class _Trials:
         self._tried = self._items = 0
 
     def succeeds(self, request: DemandRequest) -> bool:
-        """Return whether a request, which names a node for each application, can be booked.
-
-        Raises:
-            OverBudget: if too much was tried already.
-        """
+        """Return whether a request, which names a node for each application, can be booked."""
         self._tried += 1
         self._items += admission.items_of(request)
         most = self._state.config.repo_settings.limits.demand_items
@@ -266,8 +243,8 @@ def _decided(
     checkpoint: Checkpoint = lambda: None,
 ) -> Decision:
     config = state.config
-    if not request.adds_claims:  # what was booked must be released, however long that takes
-        checkpoint = _unlimited
+    # what was booked must be released, however long that takes
+    checkpoint = checkpoint if request.adds_claims else lambda: None
     if isinstance(request, Drain):
         request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
     if isinstance(request, Restoration):
@@ -277,7 +254,6 @@ def _decided(
             raise Refused(faults)
     on_stage("admitted")
     after, changes, keys = _booked(state, request, now, checkpoint)
-    ledger = after.ledger
     if taken := list(name_clash.faults_in_files(request, changes, read)):
         raise Refused(taken)
     rendered = changeset.build_changeset(
@@ -294,14 +270,15 @@ def _decided(
     differing = list(
         version_difference.differences(request, state, after, changes.claims, rendered.plans)
     )
-    refused = [found.fault for found in differing if found.is_refused]
+    refused = [difference.fault for difference in differing if difference.is_refused]
     grown = _growth(config, rendered)
+    # a drain was tried on its nodes already, and what releases claims makes room
     if request.adds_claims or isinstance(request, Restoration):
         refused = refused or list(capacity.faults(state.usage(), grown, config))
     if refused:
         raise Refused(refused)
     checkpoint()
-    after = state.followed_by(ledger, rendered, state.usage().plus(grown))
+    after = state.followed_by(after.ledger, rendered, state.usage().plus(grown))
     checkpoint()
     on_stage("booked")
     outcome: Outcome = "unchanged"
@@ -316,34 +293,41 @@ def _decided(
         releases=rendered.releases,
         warnings=(
             *notes_on(request, after, changes, rendered),
-            *filter(None, (found.warning() for found in differing)),
+            *filter(None, (difference.warning() for difference in differing)),
         ),
         approval=(
             *permission.approval_reasons(
                 request, ((c.before, c.after) for c in changes.claims), config
             ),
-            *filter(None, (found.approval_reason() for found in differing)),
+            *filter(None, (difference.approval_reason() for difference in differing)),
         ),
         overrides=rendered.overrides,
         frees=any(amount < 0 for amount in grown.values()),
     )
 
 
-def _unlimited() -> None:
-    """Be the checkpoint of a decision without a budget."""
-
-
 def _booked(
     state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
 ) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
-    """Return the state with a request booked, the changes, and the releases that may change.
-
-    Raises:
-        Refused: if existing claims, an override, a quota or a clash of topics or names forbid the
-            booking.
-    """
+    """Return the state with a request booked, the changes, and the releases that may change."""
     checkpoint()
-    ledger, changes = _book(state, request, now, checkpoint)
+    subjects = request.subjects()
+    # Claims of the request replace those that overrides kept. Else a kept claim, which nobody
+    # demands any longer, would contradict the request.
+    ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
+    if isinstance(request, Decommission):
+        ledger, changes = implied_connections.without_idle_deliveries(
+            state.ledger, replace(state, ledger=ledger), changes
+        )
+    after = replace(state, ledger=ledger)
+    checkpoint()
+    refusals = list(denial.faults(request, after, changes))
+    checkpoint()
+    refusals = refusals or list(quota.faults(state, after, changes))
+    if refusals:
+        raise Refused(refusals)
+    # overrides may keep what the request releases
+    ledger, changes = with_kept_claims(state.ledger, after, changes, subjects, now)
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
@@ -360,50 +344,16 @@ def _booked(
     return after, changes, keys
 
 
-def _book(
-    state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
-) -> tuple[Ledger, Changes]:
-    """Return the ledger with a request booked, and the changes.
-
-    Claims of the request replace claims that overrides kept. Overrides may keep claims that the
-    request releases.
-
-    Raises:
-        Refused: if existing claims, an override or a quota forbid the booking.
-    """
-    subjects = request.subjects()
-    ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
-    if isinstance(request, Decommission):
-        ledger, changes = implied_connections.without_idle_deliveries(
-            state.ledger, replace(state, ledger=ledger), changes
-        )
-    after = replace(state, ledger=ledger)
-    checkpoint()
-    refusals = list(denial.faults(request, after, changes))
-    checkpoint()
-    refusals = refusals or list(quota.faults(state, after, changes))
-    if refusals:
-        raise Refused(refusals)
-    return with_kept_claims(state.ledger, after, changes, subjects, now)
-
-
 def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    """Return the growth of the services' requests; empty if no node has a capacity."""
-    return (
-        capacity.growth(rendered.former, rendered.plans, config) if config.limits_capacity else {}
-    )
+    if not config.limits_capacity:
+        return {}
+    return capacity.growth(rendered.former, rendered.plans, config)
 
 
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    """Return the state after a service scales down because a step of its kept replicas has ended.
-
-    The second value is the changeset, which has the files to write.
-
-    Raises:
-        Refused, InvalidInput: if the service cannot be planned or rendered.
-    """
+    """Return the state after a step of a service's kept replicas has ended, and its changeset."""
     after = replace(state, ledger=scale_downs.without_ended(state, instance, now))
     changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
     change = changeset.build_changeset(

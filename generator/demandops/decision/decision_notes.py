@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 
 from demandops.config.override import format_time
 from demandops.demand import separate_instance
@@ -14,12 +14,9 @@ from demandops.ledger.waiting import Wait
 from demandops.ledger.world import World
 from demandops.plan.checks import denial
 from demandops.plan.flows import flows
-from demandops.plan.overrides.claim_overrides import (
-    without_suspended,
-)
+from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.planner import is_bridged
-from demandops.plan.release import Release, ServiceKey, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey
+from demandops.plan.release import ServiceKey, ServiceRelease
 from demandops.plan.views import misspelled_topics
 from demandops.render.changes.changeset import Changeset
 
@@ -32,23 +29,28 @@ def notes_on(
     yield from _connection_warnings(request, after)
     yield from misspelled_topics.notes(request, after)
     yield from rendered.blocked
-    yield from _repeat(changes)
+    if changes.repeats is not None:
+        at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
+        yield f"the same shutdown was carried out at {at}, so this one releases nothing more"
     if isinstance(request, Drain):
         yield from request.stays
     if isinstance(request, Wait):
         yield from request.reasons
     yield from denial.warnings(request, after)
-    yield from _kept_replicas(changes, rendered.plans)
+    for release in (rendered.plans.get(ServiceKey.of(instance)) for instance in changes.kept):
+        if isinstance(release, ServiceRelease) and release.keeps:
+            until = format_time(release.keeps.until)
+            yield (
+                f"{release.name} keeps {release.replicas} replicas until {until} (downAfter in its "
+                "definition), although its demands need fewer"
+            )
 
 
 def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each flow that no connection carries, and for each bridged topic.
-
-    If a connection differs from the requested one, the note about this difference is a warning too.
-    """
+    # a connection that an override denies carries nothing
     ledger = without_suspended(world).ledger
-    for one in request.demanded if request.adds_claims else ():
-        held = one.held
+    for item in request.demanded if request.adds_claims else ():
+        held = item.held
         if isinstance(held, Application):
             for flow in flows(world.config, held):
                 if not ledger.is_carried_to(flow.receiver, flow.target):
@@ -57,8 +59,8 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
                         f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
                     )
             continue
-        if one.note:
-            yield f"connection '{held.id}' {one.note}"
+        if item.note:
+            yield f"connection '{held.id}' {item.note}"
         for route in held.topics:
             if is_bridged(route, *held.nodes, world.config):
                 yield (
@@ -66,19 +68,3 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
                     f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
                     "the inventory), so no client of this connection carries it"
                 )
-
-
-def _repeat(changes: Changes) -> Iterator[str]:
-    if changes.repeats is not None:
-        at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
-        yield f"the same shutdown was carried out at {at}, so this one releases nothing more"
-
-
-def _kept_replicas(changes: Changes, plans: Mapping[ReleaseKey, Release | None]) -> Iterator[str]:
-    for release in (plans.get(ServiceKey.of(instance)) for instance in changes.kept):
-        if isinstance(release, ServiceRelease) and release.keeps:
-            until = format_time(release.keeps.until)
-            yield (
-                f"{release.name} keeps {release.replicas} replicas until {until} (downAfter in its "
-                "definition), although its demands need fewer"
-            )

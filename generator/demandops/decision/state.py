@@ -18,7 +18,7 @@ from demandops.plan.checks.name_clash import Names
 from demandops.plan.nodes import capacity
 from demandops.plan.nodes.capacity import Usage
 from demandops.plan.release import Release
-from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys
+from demandops.plan.release_keys import ReleaseKey, affected_keys
 from demandops.render import trial_render
 from demandops.render.changes import changeset
 from demandops.templating.values import Evaluate
@@ -26,13 +26,12 @@ from demandops.templating.values import Evaluate
 
 @dataclass(frozen=True, slots=True)
 class State(World):
-    """The world at one commit, and what computes the values of services in it.
-
-    ``plans`` are releases that earlier decisions on this configuration planned. A copy made with
-    ``replace`` has no plans; only :meth:`followed_by` carries over those that are still valid.
-    """
+    """The world at one commit, and what computes the values of services in it."""
 
     evaluate: Evaluate
+    # The releases that earlier decisions on this configuration planned, so that a decision need not
+    # plan them again to tell what it changes. A copy made with ``replace`` has none; followed_by
+    # carries over those that are still valid.
     plans: HashTrieMap[ReleaseKey, Release] = field(
         default_factory=HashTrieMap, init=False, compare=False, repr=False
     )
@@ -40,10 +39,7 @@ class State(World):
     _names: Names | None = field(default=None, init=False, compare=False, repr=False)
 
     def usage(self) -> Usage:
-        """Return, for each node and resource, how much the services request.
-
-        Only the first call counts all services; later calls return the same result.
-        """
+        """Return how much the services request; the first call counts all services."""
         if self._usage is None:
             object.__setattr__(self, "_usage", capacity.whole_usage(self))
         assert self._usage is not None  # noqa: S101 - set above
@@ -57,24 +53,18 @@ class State(World):
         return self._names
 
     def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
-        """Return the state after a decision, with the releases that the decision planned.
-
-        ``usage`` is the total that services request on each node after the decision.
-        """
-        known = self.plans
+        """Return the state after a decision, with the releases that the decision planned."""
+        plans = self.plans
         for key, release in rendered.plans.items():
-            known = known.insert(key, release) if release else known.discard(key)
+            plans = plans.insert(key, release) if release else plans.discard(key)
         state = replace(self, ledger=ledger)
-        object.__setattr__(state, "plans", known)
+        object.__setattr__(state, "plans", plans)
         object.__setattr__(state, "_usage", usage)
         state._follow_names(self, rendered.plans.keys())
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
-        """Return the state with another ledger, whose claims differ by ``changes``.
-
-        If the usage of nodes and the names are known, they are kept up to date with the changes.
-        """
+        """Return the state with another ledger, whose claims differ by ``changes``."""
         state, changes = replace(self, ledger=ledger), tuple(changes)
         with suppress(Refused):  # if a definition is gone; then ``names`` looks at all releases
             state._follow_names(self, affected_keys(self, state, changes))
@@ -99,21 +89,12 @@ def rendered_files(
 ) -> dict[str, str]:
     """Return every generated file that the state requires, as a map from path to text.
 
-    Args:
-        state: the world to render.
-        current: the current generated files. An override with ``hold`` keeps some of these files.
-        keeps_late: whether a release whose values take too long to compute keeps its file, instead
-            of OverLimit.
+    ``current`` are the current generated files, which ``hold`` overrides and ``keeps_late`` may
+    preserve (:func:`demandops.render.changes.changeset.render_all`).
     """
-    keys = all_keys(state)
-    return changeset.render_all(state, state.evaluate, keys, current, keeps_late=keeps_late)
+    return changeset.render_all(state, state.evaluate, current, keeps_late=keeps_late)
 
 
 def try_configuration(state: State) -> None:
-    """Render trial demands, so that every appdef and every override in effect is tried once.
-
-    Raises:
-        Refused, InvalidInput: if a template, its values or an override does not work. Each fault
-            names what does not work.
-    """
+    """Raise Refused or InvalidInput if an appdef or an override in effect does not work."""
     trial_render.render_trial_demands(state, state.evaluate)

@@ -27,46 +27,51 @@ from demandops.quoting import quoted
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
-    """Yield a fault for everything in ``request`` that cannot run, whatever the ledger contains.
-
-    A shutdown may name nodes that are no longer in the inventory, so that claims on these nodes can
-    be released.
-    """
+    """Yield a fault for everything in ``request`` that cannot run, whatever the ledger contains."""
     # if the goal gives no request id, the request has the demand's id, which is checked below
     if request.id and request.id != request.demand:
-        yield from _id("id" if request.is_reference else "request", request.id)
+        yield from _id_faults("id" if request.is_reference else "request", request.id)
     if not request.is_reference:
-        yield from _own_fields(request)
+        yield from _id_faults("demand", request.demand)
+        if request.demand.startswith(OVERRIDE_PREFIX):
+            message = (
+                f"starts with '{OVERRIDE_PREFIX}', which only overrides may use; choose another "
+                "demand id"
+            )
+            yield fault("demand", message)
+        if not request.demanded:  # otherwise the requesters of each item are checked
+            yield from _requester_faults(request.own_requesters)
+        lease_s = request.lease_s if isinstance(request, Put) else None
+        if lease_s is not None and not 0 < lease_s <= LONGEST_S:
+            yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
     for index, node in enumerate(request.positions if isinstance(request, Put) else ()):
-        yield from _id(f"positions[{index}].node", node)
-        yield from _node(f"positions[{index}].node", node, config)
+        yield from _id_faults(f"positions[{index}].node", node)
+        yield from _node_faults(f"positions[{index}].node", node, config)
     if not request.demanded and not isinstance(request, Release | Renew):
         yield fault(
             "id" if request.is_reference else "applications",
             "the request lists no application and no connection; list at least one",
             code="empty",
         )
-    for one in request.demanded:
-        found = chain(_id("id", one.held.id), _requesters(one.requesters))
-        if isinstance(one.held, Application):
-            found = chain(found, _application(one.held, config, request.adds_claims))
-        else:
-            found = chain(found, _connection(one.held, config, request.adds_claims))
-        for each in found:
-            # the placement itself reports that it found no node, so an empty node is no fault then
-            held = one.held
-            if (
-                each.field == "node"
-                and isinstance(held, Application)
-                and held.place
-                and not held.node
-            ):
-                continue
-            yield replace(each, field=one.place(each.field))
+    for item in request.demanded:
+        held = item.held
+        # the placement itself reports that it found no node, so an empty node is no fault then
+        unplaced = isinstance(held, Application) and held.place and not held.node
+        of_held = (
+            _application_faults(held, config, request.adds_claims)
+            if isinstance(held, Application)
+            else _connection_faults(held, config, request.adds_claims)
+        )
+        for each in chain(_id_faults("id", held.id), _requester_faults(item.requesters), of_held):
+            if not (unplaced and each.field == "node"):
+                yield replace(each, field=item.place(each.field))
 
 
+# The lists in these fields have no items of their own (items_of). The size of parameters is limited
+# in bytes instead, and each target topic belongs to a source topic, which counts.
 _NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
-"""Fields of goals whose lists have no items of their own (:func:`items_of`)."""
+# About ten fields describe any item. Unknown fields are bounded too, because each would cost a
+# fault when the goal is parsed.
 _FIELDS_OF_ITEM = 10
 _ITEMS = (
     "items (applications, connections, topics, requesters and so on, also of the connections that "
@@ -75,30 +80,29 @@ _ITEMS = (
 
 
 def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault if a goal, as plain data, is far too large to be parsed at all.
-
-    The check ends where the goal is too large, whatever it contains.
-    """
+    """Yield a fault if a goal, as plain data, is far too large to be parsed at all."""
     length = items = fields = 0
     most_fields = max(1_000, _FIELDS_OF_ITEM * limits.demand_items)
-    left: list[tuple[object, bool]] = [(goal, True)]
+    # The walk ends as soon as a limit is passed, so that a huge goal costs no more than the limit.
+    # It keeps a list instead of calling itself, because a goal may be nested to any depth.
+    unread: list[tuple[object, bool]] = [(goal, True)]
     while (
-        left
+        unread
         and length <= limits.demand_characters
         and items <= limits.demand_items
         and fields <= most_fields
     ):
-        value, counts = left.pop()
+        value, counts = unread.pop()
         if isinstance(value, str):
             length += len(value)
         elif isinstance(value, list):
             length += 2 * len(value)  # each part is at least a character and a comma
             items += len(value) if counts else 0
-            left += [(part, counts) for part in value]
+            unread += [(part, counts) for part in value]
         elif isinstance(value, dict):
             fields += len(value)
             length += sum(1 + len(key) if isinstance(key, str) else 1 for key in value)
-            left += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
+            unread += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
         elif isinstance(value, int):
             length += value.bit_length() // 4
     if length > limits.demand_characters:
@@ -115,34 +119,31 @@ def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
 
 
 def items_of(request: DemandRequest) -> int:
-    """Return how many things a request lists in total.
-
-    Each requester of an application or a connection holds each of its topics, so a topic counts
-    once for each of them.
-    """
+    """Return how many things a request lists in total."""
     items = len(request.own_requesters)
     items += len(request.positions) if isinstance(request, Put) else 0
-    for one in request.demanded:
-        held = one.held
+    for item in request.demanded:
+        held = item.held
         if isinstance(held, Application):
             topics = sum(map(len, held.inputs.values()))
             items += len(held.deliver) + len(held.named) + (held.place.size if held.place else 0)
         else:
             topics = len(held.topics)
-        items += len(one.requesters) if request.is_reference else 0
-        items += (1 + topics) * max(1, len(one.requesters))
+        items += len(item.requesters) if request.is_reference else 0
+        # each requester holds each topic of its item, so a topic counts once for each of them
+        items += (1 + topics) * max(1, len(item.requesters))
     return items
 
 
 def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
     """Yield a fault for each limit on items and parameters that the request exceeds."""
-    for one in request.demanded:
-        held = one.held
+    for item in request.demanded:
+        held = item.held
         if isinstance(held, Application) and held.parameters:
             size = len(json.dumps(dict(held.parameters), default=str))
             if size > limits.parameter_bytes:
                 message = _too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
-                yield one.fault("parameters", message, code="too-large")
+                yield item.fault("parameters", message, code="too-large")
     items = items_of(request)
     if items > limits.demand_items:
         listed = f"lists {items} {_ITEMS}"
@@ -157,68 +158,54 @@ def _too_large(size: str, limit: str, most: int) -> str:
     )
 
 
-def _own_fields(request: DemandRequest) -> Iterator[Fault]:
-    """Yield the faults of a Demand's id and lease, and of its requesters if it lists no items."""
-    yield from _id("demand", request.demand)
-    if request.demand.startswith(OVERRIDE_PREFIX):
-        message = (
-            f"starts with '{OVERRIDE_PREFIX}', which only overrides may use; choose another "
-            "demand id"
-        )
-        yield fault("demand", message)
-    if not request.demanded:  # otherwise the requesters of each item are checked
-        yield from _requesters(request.own_requesters)
-    lease_s = request.lease_s if isinstance(request, Put) else None
-    if lease_s is not None and not 0 < lease_s <= LONGEST_S:
-        yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
-
-
-def _application(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:
+def _application_faults(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:
     inputs = [
         (f"inputs.{role}[{position}]", topic)
         for role, topics in app.inputs.items()
         for position, topic in enumerate(topics)
     ]
+    # a shutdown may leave out nodes and sources, because it lists what is booked already
     if claiming or app.node:
-        yield from _id("node", app.node)
+        yield from _id_faults("node", app.node)
     for where, topic in inputs:
         problem = topic_problem(topic.topic)
         if problem:
             yield fault(f"{where}.topic", problem)
         if claiming or topic.source:
-            yield from _id(f"{where}.source", topic.source)
+            yield from _id_faults(f"{where}.source", topic.source)
         if topic.type:
-            yield from _id(f"{where}.type", topic.type)
+            yield from _id_faults(f"{where}.type", topic.type)
     appdef = config.appdefs.get(app.appdef)
     if appdef is None:
         yield _unknown_application(app.appdef, config)
     else:
-        yield from _of_appdef(app, appdef, config)
+        yield from _definition_faults(app, appdef, config)
+    # what is given up may name nodes that the inventory no longer has, or it could not be released
     if not claiming:
         return
-    yield from _node("node", app.node, config)
+    yield from _node_faults("node", app.node, config)
     sources = [(f"{where}.source", topic.source) for where, topic in inputs]
     services = sorted({**app.services, **app.moved}.items())
     for where, node in (*((f"services.{name}", node) for name, node in services), *sources):
-        yield from _node(where, node, config)
+        yield from _node_faults(where, node, config)
     for index, delivery in enumerate(app.deliver):
         where = f"deliver[{index}]"
-        yield from _id(f"{where}.node", delivery.node)
-        yield from _node(f"{where}.node", delivery.node, config)
+        yield from _id_faults(f"{where}.node", delivery.node)
+        yield from _node_faults(f"{where}.node", delivery.node, config)
         if appdef is not None:
-            yield from _delivery(where, delivery, config.services[appdef.name])
+            yield from _delivery_faults(where, delivery, config.services[appdef.name])
     if appdef is not None and not any(app.inputs.values()):
         roles = " or ".join(sorted(appdef.inputs))
         yield fault("inputs", f"is empty; list at least one topic of {roles}")
 
 
-def _delivery(where: str, delivery: Delivery, services: Services) -> Iterator[Fault]:
+def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iterator[Fault]:
     name, _, output = delivery.output.partition(".")
     service = services.get(name)
     if service is None or output not in service.outputs:
-        known = [f"{one.name}.{output}" for one in services.values() for output in one.outputs]
-        message = f"{quoted(delivery.output)} is not an output{suggestion(delivery.output, known)}"
-        yield fault(f"{where}.output", message)
+        outputs = [f"{each.name}.{output}" for each in services.values() for output in each.outputs]
+        close = suggestion(delivery.output, outputs)
+        yield fault(f"{where}.output", f"{quoted(delivery.output)} is not an output{close}")
     elif delivery.topic and service.roots:
         message = (
             f"{name} may make several topics, so a delivery cannot rename them; leave 'topic' out"
@@ -229,7 +216,10 @@ def _delivery(where: str, delivery: Delivery, services: Services) -> Iterator[Fa
         yield fault(f"{where}.topic", problem)
 
 
-def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) -> Iterator[Fault]:
+def _definition_faults(
+    app: Application, appdef: ApplicationDefinition, config: Config
+) -> Iterator[Fault]:
+    """Yield a fault for each field of an application that contradicts its definition."""
     for role, topics in app.inputs.items():
         if role not in appdef.inputs and topics:
             message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
@@ -237,9 +227,10 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
     parameters = config.parameters_of(appdef.name) if app.parameters else set()
     for name in app.parameters:
         if name not in parameters:
-            known = suggestion(name, parameters)
-            yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{known}")
-    for service in config.services[appdef.name].values():
+            close = suggestion(name, parameters)
+            yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{close}")
+    services = config.services[appdef.name]
+    for service in services.values():
         if service.nodes and app.node in config.nodes and app.node not in service.runs_at:
             cluster = config.nodes[app.node].cluster
             yield fault(
@@ -250,9 +241,20 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
                 f"field nodes of {service.file}",
                 code="no-node",
             )
-    yield from _named_services(app, appdef.name, config)
+    for name in app.named:
+        if name not in services:
+            close = suggestion(name, [each.name for each in services.values() if each.is_placeable])
+            yield fault(f"services.{name}", f"{appdef.name} has no such service{close}")
+        elif not services[name].is_placeable:
+            message = (
+                f"{name} runs at its sources, or serves applications of several types, so a "
+                f"demand cannot name the node of {name}; leave {name} out of 'services'"
+            )
+            yield fault(f"services.{name}", message)
+        elif not app.services.get(name):
+            yield from _id_faults(f"services.{name}", "")
     versions = config.versions_of(appdef.name)
-    yield from _instance(app, appdef, versions)
+    yield from _instance_faults(app, appdef, versions)
     if app.version and app.version not in versions:
         yield fault(
             "version",
@@ -261,35 +263,20 @@ def _of_appdef(app: Application, appdef: ApplicationDefinition, config: Config) 
         )
 
 
-def _named_services(app: Application, appdef: str, config: Config) -> Iterator[Fault]:
-    services = config.services[appdef]
-    for name in app.named:
-        service = services.get(name)
-        if service is None:
-            known = suggestion(name, [one.name for one in services.values() if one.is_placeable])
-            yield fault(f"services.{name}", f"{appdef} has no such service{known}")
-        elif not service.is_placeable:
-            message = (
-                f"{name} runs at its sources, or serves applications of several types, so a "
-                f"demand cannot name the node of {name}; leave {name} out of 'services'"
-            )
-            yield fault(f"services.{name}", message)
-        elif not app.services.get(name):
-            yield from _id(f"services.{name}", "")
-
-
-def _instance(
+def _instance_faults(
     app: Application, appdef: ApplicationDefinition, versions: Collection[str]
 ) -> Iterator[Fault]:
-    id, _, named = app.id.rpartition("@")
-    if app.separate and (not id or named != app.version):
+    # An id that ends in '@<version>' belongs to a separate instance, which the generator names. A
+    # claim that a person wrote, or an id that only looks like this, would share its names.
+    id, _, version = app.id.rpartition("@")
+    if app.separate and (not id or version != app.version):
         message = f"{quoted(app.id)} is a separate instance, but does not end in '@{app.version}'"
         yield fault("id", f"{message}; remove the claim, and demand the version instead")
-    elif not app.separate and appdef.versions == "separate" and id and named in versions:
+    elif not app.separate and appdef.versions == "separate" and id and version in versions:
         yield fault(
             "id",
-            f"{quoted(app.id)} is the instance of version {named}; demand {quoted(id)} with "
-            f"version '{named}' instead, or choose an id that does not end in '@{named}'",
+            f"{quoted(app.id)} is the instance of version {version}; demand {quoted(id)} with "
+            f"version '{version}' instead, or choose an id that does not end in '@{version}'",
         )
 
 
@@ -301,25 +288,25 @@ def _unknown_application(name: str, config: Config) -> Fault:
             if appdef.deployment_request
         ]
         none = "; no appdef.yaml has a deploymentRequest.type: add one, commit and push it"
-        known = f"; known: {', '.join(types)}" if types else none
+        remedy = f"; known: {', '.join(types)}" if types else none
     else:
         none = (
             "; appdefs/ on main has no application definition: add one (demandops new "
             "application), commit and push it"
         )
-        known = suggestion(name, config.appdefs) or none
+        remedy = suggestion(name, config.appdefs) or none
     shown = name.removeprefix("#") if name.startswith("#") else quoted(name)
-    message = f"{shown} is not a known application type{known}"
+    message = f"{shown} is not a known application type{remedy}"
     return fault("appdef", message, code="unknown-application")
 
 
-def _connection(connection: Connection, config: Config, claiming: bool) -> Iterator[Fault]:
+def _connection_faults(connection: Connection, config: Config, claiming: bool) -> Iterator[Fault]:
     ends = {"source": connection.source, "target": connection.target}
     for end, node in ends.items():
         if claiming or node:
-            yield from _id(end, node)
+            yield from _id_faults(end, node)
     if connection.broker:
-        yield from _id("broker", connection.broker)
+        yield from _id_faults("broker", connection.broker)
     if claiming and not connection.topics:
         yield fault("topics", "is empty; list at least one topic")
     yield from routes.faults("topics", connection.topics)
@@ -334,7 +321,7 @@ def _connection(connection: Connection, config: Config, claiming: bool) -> Itera
     if not claiming:
         return
     for end, node in ends.items():
-        yield from _node(end, node, config)
+        yield from _node_faults(end, node, config)
     if connection.type is not None:
         yield from connection_types.type_faults(connection.type, connection, config)
     elif {*connection.nodes} <= config.nodes.keys() and connection_types.choose_type(
@@ -343,17 +330,16 @@ def _connection(connection: Connection, config: Config, claiming: bool) -> Itera
         yield connection_types.no_type_fault(connection, config)
 
 
-def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
-    if not node:
-        return  # reported as an empty id
-    if node not in config.nodes:
+def _node_faults(where: str, node: str, config: Config) -> Iterator[Fault]:
+    # an empty node is reported as an empty id
+    if node and node not in config.nodes:
         yield fault(
             where,
             f"{quoted(node)} is not in {config.place_of(NODES_FILE)}"
             + suggestion(node, config.nodes),
             code="unknown-node",
         )
-    elif node not in config.domain_of:
+    elif node and node not in config.domain_of:
         yield fault(
             where,
             f"{quoted(node)} is not in any access domain; a platform engineer adds it to "
@@ -362,15 +348,15 @@ def _node(where: str, node: str, config: Config) -> Iterator[Fault]:
         )
 
 
-def _id(where: str, value: str) -> Iterator[Fault]:
+def _id_faults(where: str, value: str) -> Iterator[Fault]:
     problem = id_problem(value)
     if problem:
         yield fault(where, problem)
 
 
-def _requesters(requesters: tuple[str, ...]) -> Iterator[Fault]:
+def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
     for index, requester in enumerate(requesters):
-        yield from _id(f"requesters[{index}]", requester)
+        yield from _id_faults(f"requesters[{index}]", requester)
     if not requesters:
         yield fault("requesters", "is empty; list at least one requester")
 
@@ -378,32 +364,27 @@ def _requesters(requesters: tuple[str, ...]) -> Iterator[Fault]:
 def with_chosen_types(
     request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
 ) -> AnyRequest:
-    """Return ``request`` with the type that each connection gets.
+    """Return ``request`` with the type that each connection gets, if any type can carry it.
 
-    A type that the request names stays. If the request names none, a claimed connection keeps the
-    type of its claim, and a new connection gets the first type that can carry it
-    (:func:`connection_types.choose_type`). If no type can carry a connection, its type
-    stays ``None``. If the type carries a connection in another way than the request says, such as
-    over another broker than it names, the connection is changed and a note says so. A request that
-    adds no claims stays as it is.
-
-    Args:
-        request: the request.
-        config: the configuration, which has the nodes and brokers.
-        current: takes an id and returns the claimed connection that has it, or ``None``.
+    ``current`` takes an id and returns the claimed connection that has it, or ``None``.
     """
+    if not request.adds_claims:
+        return request
 
-    def chosen(one: Demanded) -> Demanded:
-        connection = one.held
-        if not isinstance(connection, Connection) or not request.adds_claims:
-            return one
+    def with_type(item: Demanded) -> Demanded:
+        connection = item.held
+        if not isinstance(connection, Connection):
+            return item
         if connection.type is None:
+            # A claimed connection keeps its type. Else a new broker or node property would change
+            # the type that is chosen, and the request would contradict the other claims.
             claimed = current(connection.id)
-            found = claimed.type if claimed else connection_types.choose_type(connection, config)
-            connection = replace(connection, type=found)
+            chosen = claimed.type if claimed else connection_types.choose_type(connection, config)
+            connection = replace(connection, type=chosen)
         if connection.type is None or id_problem(connection.broker or "none"):
-            return replace(one, held=connection)
-        held, note = connection.type.settled(connection, config)
-        return replace(one, held=held, note=note or one.note)
+            return replace(item, held=connection)
+        # the type may use another broker than the request names; the note says so
+        connection, note = connection.type.settled(connection, config)
+        return replace(item, held=connection, note=note or item.note)
 
-    return replace(request, demanded=tuple(map(chosen, request.demanded)))
+    return replace(request, demanded=tuple(map(with_type, request.demanded)))

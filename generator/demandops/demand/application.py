@@ -15,49 +15,28 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 
 
 class InputTopic(NamedTuple):
-    """An input topic of an application, and the node that publishes it.
-
-    ``further`` is true if this topic was not the node's usual topic when it was booked
-    (:mod:`demandops.plan.output_topics`).
-    """
+    """An input topic of an application, and the node that publishes it."""
 
     topic: str
     source: str
     type: str = ""
+    # It was not the usual topic of its source when it was booked. The claim says so, because a name
+    # that is made from it must not change while it is demanded (plan/output_topics.py).
     further: bool = False
 
-    @property
-    def part(self) -> str:
-        """The text that stands for this input in topic names.
-
-        The text is made from the source and, for a further topic, from the topic.
-        """
-        return self.part_in("")
-
     def part_in(self, version: str) -> str:
-        """Return the text that stands for this input in the topic names of a separate instance.
-
-        The text is made like :attr:`part`, but also from ``version``, the instance's version. If
-        ``version`` is empty, the text is :attr:`part`.
-        """
+        """Return the text that stands for this input in topic names; ``version`` may be empty."""
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
     def distinguishing_text(self, further: bool, version: str) -> str:
-        """Return the text that makes topic names differ although their source is the same.
-
-        The text contains the topic if ``further`` is set, and ``version`` unless ``version`` is
-        empty.
-        """
+        """Return the text that makes topic names differ although their source is the same."""
         if not further:
             return version
         return f"{self.topic} {version}" if version else self.topic
 
 
 class Delivery(NamedTuple):
-    """An output (``<service>.<output>``) that is brought to a node.
-
-    Without ``topic``, the output has the same topic name there.
-    """
+    """An output (``<service>.<output>``) that is brought to a node, as ``topic`` if that is set."""
 
     output: str
     node: str
@@ -66,11 +45,7 @@ class Delivery(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """Requirements on a node: its role, labels, capabilities and properties.
-
-    ``labels`` are pairs of key and value. ``properties`` are texts like ``memoryGiB>=8``
-    (:mod:`demandops.config.node_property`).
-    """
+    """Requirements on a node; ``properties`` are texts like ``memoryGiB>=8``."""
 
     role: str = ""
     labels: tuple[tuple[str, str], ...] = ()
@@ -79,14 +54,10 @@ class Requirement:
 
     @property
     def size(self) -> int:
-        """How many labels, capabilities and properties the requirement has."""
         return len(self.labels) + len(self.capabilities) + len(self.properties)
 
     def united(self, other: Requirement) -> Requirement:
-        """Return the requirement that a node meets if it meets both this one and ``other``.
-
-        If both name a role, they must name the same role. The lists of the result are sorted.
-        """
+        """Return the requirement that a node meets if it meets both; two roles must be the same."""
         return Requirement(
             self.role or other.role,
             tuple(sorted({*self.labels, *other.labels})),
@@ -97,51 +68,45 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
-    """One application: its appdef, its node, and its inputs by role.
-
-    ``appdef`` is ``#<number>`` if a goal gives the application's type as a number that no appdef
-    has. In a claim, the inputs of each role are sorted by topic (:meth:`booked`). ``place`` has the
-    requirements on the node; it is ``None`` if the demand names the node. ``separate`` says that
-    this version runs at the same time as other versions, and that the id ends in the version
-    (:mod:`demandops.demand.separate_instance`).
-
-    ``services`` maps service names to nodes, for services that have a node of their own. ``named``
-    lists the services for which the demand itself names the node; the generator chose the nodes of
-    the other services. ``moved`` maps service names to nodes, for services that an override moves.
-    """
+    """One application: its appdef, its node, and its inputs by role."""
 
     id: str
+    # ``#<number>`` if a goal gives the application's type as a number that no appdef has
     appdef: str
     node: str
     inputs: Mapping[str, tuple[InputTopic, ...]]
     parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     version: str = ""
     deliver: tuple[Delivery, ...] = ()
+    # the requirements on the node, kept to choose again; None if the demand names the node
     place: Requirement | None = None
+    # this version runs beside others, and the id ends in it (demand/separate_instance.py)
     separate: bool = False
+    # the nodes of services that have one of their own, by service
     services: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    # the nodes to which an override moves services, by service
     moved: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    # the services whose node the demand itself names; the generator chose the nodes of the others
     named: tuple[str, ...] = ()
     _further: dict[tuple[str, str], list[InputTopic]] = field(
         default_factory=dict, init=False, repr=False, compare=False
     )
 
     def __eq__(self, other: object) -> bool:
-        """Compare exactly, because Python treats 1, 1.0 and True as equal, but a chart does not."""
         if not isinstance(other, Application):
             return NotImplemented
-        compared = (one.name for one in fields(self) if one.compare)
+        compared = (field.name for field in fields(self) if field.compare)
         same = all(getattr(self, name) == getattr(other, name) for name in compared)
+        # Python treats 1, 1.0 and True as equal, but a chart does not
         return same and _exact(self.parameters) == _exact(other.parameters)
 
     @property
     def subject(self) -> Subject:
-        """The subject of a claim on this application."""
         return Subject(SubjectKind.APPLICATION, self.id)
 
     @property
     def own_version(self) -> str:
-        """The version in the names of services and topics; empty unless ``separate`` is set."""
+        """The version in the names of services and topics; empty unless ``separate``."""
         return self.version if self.separate else ""
 
     @property
@@ -151,7 +116,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     @property
     def nodes(self) -> tuple[str, ...]:
-        """The application's node. An override's selector may match it."""
         return (self.node,)
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:
@@ -159,32 +123,27 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
-        """Return the inputs of a role with this source and topic.
-
-        The inputs of the role must be sorted, as they are in a claim.
+        """Return the inputs of a role with this source and topic; they must be sorted as in a
+        claim.
         """
         inputs = self.inputs.get(role, ())
         start = bisect_left(inputs, InputTopic(topic, source))
         same = takewhile(
-            lambda one: (one.topic, one.source) == (topic, source), islice(inputs, start, None)
+            lambda each: (each.topic, each.source) == (topic, source), islice(inputs, start, None)
         )
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the further inputs of a role for which ``part`` stands in topic names.
-
-        For a separate instance, also return the usual inputs for which ``part`` stands.
-        """
+        """Return the inputs of a role that topic names show as ``part``."""
         if not self._further:  # computed only once, because the plans of many services need it
-            for known, topic in self.all_inputs():
+            for each, topic in self.all_inputs():
                 if topic.further or self.separate:
-                    called = topic.part_in(self.own_version)
-                    self._further.setdefault((known, called), []).append(topic)
+                    key = each, topic.part_in(self.own_version)
+                    self._further.setdefault(key, []).append(topic)
         return self._further.get((role, part), [])
 
     def needs(self, node: str) -> bool:
-        """Return whether the application depends on a node."""
-        delivered = any(one.node == node for one in self.deliver)
+        delivered = any(delivery.node == node for delivery in self.deliver)
         return delivered or node in self.needed_nodes()
 
     def needed_nodes(self) -> set[str]:
@@ -193,38 +152,28 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return {*self.chosen_nodes, *self.moved.values(), *sources}
 
     def chosen_node(self, service: str) -> str:
-        """Return the node that the demand or the generator chose for a service.
-
-        The service may run elsewhere if an override moves it, if it runs at its sources, or if it
-        runs once for each cluster.
-        """
+        """Return the node that was chosen for a service, which an override may have moved away."""
         return self.services.get(service, self.node)
 
     @property
     def chosen_nodes(self) -> set[str]:
-        """The nodes that the demand or the generator chose for the application and its services."""
         return {self.node, *self.services.values()}
 
     def has_same_definition_and_nodes(self, other: Application) -> bool:
-        """Return whether both applications have the same appdef and run on the same nodes."""
-        one, two = ((app.appdef, app.node, app.services, app.moved) for app in (self, other))
-        return one == two
+        mine, theirs = ((app.appdef, app.node, app.services, app.moved) for app in (self, other))
+        return mine == theirs
 
     def moved_to_nodes_of(self, first: Application) -> Application:
-        """Return the application with the nodes of ``first``: its own and those of its services.
-
-        ``first`` is the application in the first claim on the same subject.
-        """
+        """Return the application with the nodes of ``first``: its own and those of its services."""
         if (self.node, self.services, self.moved) == (first.node, first.services, first.moved):
             return self
         return replace(self, node=first.node, services=first.services, moved=first.moved)
 
     def booked(self) -> Application:
-        """Return the application in the form of a claim.
-
-        Its inputs, its deliveries and the requirements of ``place`` are sorted, without duplicates.
-        """
-        inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items()) if topics}
+        """Return the application in the form of a claim: sorted, without duplicates."""
+        # The order of a goal's lists must not reach the ledger, because the same demand in another
+        # order would make a commit.
+        inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items())}
         place = self.place and self.place.united(self.place)
         deliver = tuple(sorted({*self.deliver}))
         return replace(self, deliver=deliver, place=place).with_inputs(inputs)
@@ -235,10 +184,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, inputs=MappingProxyType(kept))
 
     def extended(self, more: Application) -> Application:
-        """Return ``more`` with this application's inputs, parameters and deliveries added.
-
-        A parameter of ``more`` has precedence over this application's parameter of the same name.
-        """
+        """Return ``more`` with this application's inputs, parameters and deliveries added."""
         roles = {*self.inputs, *more.inputs}
         inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
         parameters = MappingProxyType({**self.parameters, **more.parameters})
@@ -248,10 +194,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def matches_listed(self, listed: object) -> bool:
-        """Return whether a shutdown that lists ``listed`` means this application.
-
-        Both must have the same id. If ``listed`` names no node, the nodes are not compared.
-        """
+        """Return whether a shutdown that lists ``listed``, with the same id, means this."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -263,10 +206,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return (self.node, self.appdef)
 
     def topic_keys(self) -> Iterator[TopicKey]:
-        """Yield the key of each input: (role, topic, source).
-
-        If there are no inputs, yield one empty key.
-        """
+        """Yield the key of each input, (role, topic, source); without inputs one empty key."""
         for role, topic in self.all_inputs():
             yield role, topic.topic, topic.source
         if not any(self.inputs.values()):
@@ -275,8 +215,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
         """Yield (text, keys) for each input that a shutdown lists in ``listed``.
 
-        ``text`` describes the listed input. ``keys`` are the keys of this application's inputs that
-        match it. A listed input without a source matches that topic of any source.
+        ``keys`` are the keys of this application's inputs that match it.
         """
         assert isinstance(listed, Application)  # noqa: S101 - see matches_listed
         by_name: dict[TopicKey, list[TopicKey]] = {}
@@ -284,13 +223,14 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             by_name.setdefault(key[:2], []).append(key)
         for role, topic in listed.all_inputs():
             named = by_name.get((role, topic.topic), [])
+            # listed without a source, a topic is that of any source
             keys = [key for key in named if topic.source in ("", key[2])]
             yield f"{role} {topic.topic} of {topic.source}", keys
 
     def without_topics(self, gone: Container[TopicKey]) -> Application | None:
         """Return the application without the inputs in ``gone``; ``None`` if no input is left."""
         left = {
-            role: tuple(one for one in topics if (role, one.topic, one.source) not in gone)
+            role: tuple(each for each in topics if (role, each.topic, each.source) not in gone)
             for role, topics in self.inputs.items()
         }
         return self.with_inputs(left) if any(left.values()) else None
@@ -302,7 +242,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         """
         if node in self.chosen_nodes or node in self.moved.values():
             return None
-        deliver = tuple(one for one in self.deliver if one.node != node)
+        deliver = tuple(delivery for delivery in self.deliver if delivery.node != node)
         left = {
             role: tuple(topic for topic in topics if topic.source != node)
             for role, topics in self.inputs.items()
@@ -310,7 +250,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return replace(self, deliver=deliver).with_inputs(left) if any(left.values()) else None
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the application's entries in the ledger's index."""
         yield ("node", self.node)
         yield ("definition", self.appdef)
         for node in (*self.services.values(), *self.moved.values()):
@@ -323,12 +262,13 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             if topic.further or self.separate:
                 yield ("further", topic.part_in(self.own_version))
             if not topic.further:
+                # with and without the topic, so that the claims with another topic can be counted
                 yield ("usual", topic.source, role)
                 yield ("usual", topic.source, role, topic.topic)
         if self.version:
             yield ("version", self.id, self.version)
-        for one in self.deliver:
-            yield ("node", one.node)
+        for delivery in self.deliver:
+            yield ("node", delivery.node)
         yield ("topics", naming.topic_part(self.id))
 
 
@@ -337,14 +277,11 @@ def _exact(values: Mapping[str, object]) -> str:
 
 
 def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
-    """Return the topics sorted, with one topic for each topic name and source.
-
-    Of several with the same name and source, the first one with a type is kept. If none has a type,
-    the first one is kept.
-    """
+    """Return the topics sorted, with one topic for each topic name and source."""
     merged: dict[tuple[str, str], InputTopic] = {}
     for topic in topics:
-        known = merged.setdefault((topic.topic, topic.source), topic)
-        if topic.type and not known.type:
+        first = merged.setdefault((topic.topic, topic.source), topic)
+        # only some goals give the type of a topic, and the others must not take it away
+        if topic.type and not first.type:
             merged[topic.topic, topic.source] = topic
     return tuple(topic for _, topic in sorted(merged.items()))

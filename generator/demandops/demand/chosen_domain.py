@@ -26,42 +26,39 @@ from demandops.errors import Fault
 from demandops.subject import Subject
 
 Held = Application | Connection
+# returns the application or connection that a subject's first claim holds
 Booked = Callable[[Subject], "Held | None"]
-"""Returns the application or connection that a subject's first claim holds, or ``None``."""
 
 
 def with_chosen_domains(
     request: AnyRequest, config: Config, booked: Booked
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with a chosen access domain for each node, and the faults.
+    """Return the request with a chosen access domain for each node.
 
-    There is a fault for each node for which several access domains are possible. A request that
-    adds no claims has no faults; such a node then stays as it is named.
+    There is a fault for each node for which several access domains are possible. In a request that
+    adds no claims, such a node stays as it is named.
     """
     if not config.hosts:
         return request, []
     faults: list[Fault] = []
     demanded = []
-    for one in request.demanded:
-        held = _with_short_names(one.held, config)
-        known = booked(held.subject)
-        ends = dict(_chosen(one, known, config, request.adds_claims, faults))
-        demanded.append(replace(one, held=_with_ends(held, ends)))
+    for item in request.demanded:
+        held = _with_short_names(item.held, config)
+        booked_nodes = dict(_named(at)) if (at := booked(held.subject)) else {}
+        chosen = dict(_chosen(item, booked_nodes, config, request.adds_claims, faults))
+        if isinstance(held, Application):
+            services = {name: chosen.get(_field(name), n) for name, n in held.services.items()}
+            node = chosen.get("node", held.node)
+            held = replace(held, node=node, services=MappingProxyType(services))
+        else:
+            source, target = chosen.get("source", held.source), chosen.get("target", held.target)
+            held = replace(held, source=source, target=target)
+        demanded.append(replace(item, held=held))
     return replace(request, demanded=tuple(demanded)), faults
 
 
-def _with_ends(held: Held, ends: Mapping[str, str]) -> Held:
-    if isinstance(held, Application):
-        services = {name: ends.get(_field(name), node) for name, node in held.services.items()}
-        node = ends.get("node", held.node)
-        return replace(held, node=node, services=MappingProxyType(services))
-    source, target = ends.get("source", held.source), ends.get("target", held.target)
-    return replace(held, source=source, target=target)
-
-
 def _with_short_names(held: Held, config: Config) -> Held:
-    """Return ``held`` with each name ``<node>@<first domain>`` shortened to ``<node>``."""
-
+    # <node>@<first domain> is the same node as <node>, which is the name in the configuration
     def short(name: str) -> str:
         node, _, domain = name.rpartition("@")
         own = config.domain_of.get(node)
@@ -71,10 +68,10 @@ def _with_short_names(held: Held, config: Config) -> Held:
         source, target, broker = map(short, (held.source, held.target, held.broker))
         return replace(held, source=source, target=target, broker=broker)
     inputs = {
-        role: tuple(one._replace(source=short(one.source)) for one in topics)
+        role: tuple(topic._replace(source=short(topic.source)) for topic in topics)
         for role, topics in held.inputs.items()
     }
-    deliver = tuple(one._replace(node=short(one.node)) for one in held.deliver)
+    deliver = tuple(each._replace(node=short(each.node)) for each in held.deliver)
     services = MappingProxyType({name: short(node) for name, node in held.services.items()})
     held = replace(held, node=short(held.node), services=services, deliver=deliver)
     return held.with_inputs(inputs)
@@ -94,31 +91,31 @@ def _field(service: str) -> str:
 
 
 def _chosen(
-    one: Demanded, booked: Held | None, config: Config, adds: bool, faults: list[Fault]
+    item: Demanded,
+    booked_nodes: Mapping[str, str],
+    config: Config,
+    adds: bool,
+    faults: list[Fault],
 ) -> Iterator[tuple[str, str]]:
-    """Yield (field, name) for each node for which an access domain is chosen.
-
-    ``name`` is the node's name in the chosen domain. Nodes in only one domain are left out. If the
-    rules allow several domains and the request adds claims, add a fault for the field.
-    """
-    held, known = one.held, dict(_named(booked)) if booked else {}
+    """Yield (field, the node's name in the chosen domain) for each node in several domains."""
+    held = item.held
     for field, node in _named(held):
-        current = known.get(field, "")
         choices = config.nodes_of(node)
         if len(choices) < 2:
             continue
-        if current in choices:
-            yield field, current
+        # A demand that is sent again must mean what is booked, even if the rules changed since
+        if booked_nodes.get(field) in choices:
+            yield field, booked_nodes[field]
             continue
         appdef = held.appdef if isinstance(held, Application) else ""
-        allowed = [choice for choice in choices if may_place(one, appdef, choice, config)]
+        allowed = [choice for choice in choices if may_place(item, appdef, choice, config)]
         if len(allowed) == 1:
             yield field, allowed[0]
-        elif allowed and adds and one.requesters:
+        elif allowed and adds and item.requesters:
             domains = [config.domain_of[choice].name for choice in allowed]
             named = " or ".join(id_in_domain(node, domain) for domain in domains)
             message = (
                 f"'{node}' is in the access domains {' and '.join(domains)}, and their rules let "
                 f"the requesters use the node in each; name it as {named}"
             )
-            faults.append(one.fault(field, message, code="several-access-domains"))
+            faults.append(item.fault(field, message, code="several-access-domains"))

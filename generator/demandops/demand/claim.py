@@ -13,8 +13,8 @@ from demandops.demand.application import Application
 from demandops.demand.lease import Lease
 from demandops.subject import Subject, SubjectKind, TopicKey
 
+# The prefix of the demand ids of claims that overrides make; no other demand may use it
 OVERRIDE_PREFIX = "override:"
-"""The prefix of the demand ids of claims that overrides make; no other demand may use it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,9 +29,8 @@ class ClaimKey:
 class Claim:
     """One demand's hold on an application or a connection.
 
-    ``joined`` is true if a goal of the reference's action booked the claim. A shutdown takes holds
-    only from such claims. If only some of the ``requesters`` hold a topic, ``partial``
-    maps this topic to the requesters that hold it.
+    ``joined``: a goal of the reference's action booked the claim; a shutdown takes holds only from
+    such claims. ``partial`` maps each topic that only some ``requesters`` hold to these.
     """
 
     held: Application | Connection
@@ -45,34 +44,29 @@ class Claim:
 
     @property
     def application(self) -> Application:
-        """The held application; the claim must be on an application."""
         assert isinstance(self.held, Application), self.subject  # noqa: S101
         return self.held
 
     @property
     def connection(self) -> Connection:
-        """The held connection; the claim must be on a connection."""
         assert isinstance(self.held, Connection), self.subject  # noqa: S101
         return self.held
 
     @property
     def subject(self) -> Subject:
-        """The subject that the claim holds."""
         return self.held.subject
 
     @property
     def is_on_application(self) -> bool:
-        """Whether the claim holds an application."""
         return self.subject.kind is SubjectKind.APPLICATION
 
     @property
     def key(self) -> ClaimKey:
-        """The identity of the claim, by which the ledger finds it."""
         return ClaimKey(self.subject, self.demand)
 
     @property
     def keeping_override(self) -> str | None:
-        """The name of the override that made the claim by its effect ``keep``, or ``None``."""
+        """The name of the override that made the claim by its effect ``keep``."""
         name = self.demand.removeprefix(OVERRIDE_PREFIX)
         return None if name == self.demand else name
 
@@ -88,28 +82,20 @@ class Claim:
         yield from self.held.index_entries()
 
     def holders(self, topic: TopicKey) -> tuple[str, ...]:
-        """Return the requesters that hold a topic of the claim."""
         return self.partial.get(topic, self.requesters)
 
     def with_holders(
         self, held: Application | Connection, holders: Mapping[TopicKey, tuple[str, ...]]
     ) -> Claim:
-        """Return the claim with ``held`` as its content, and with new holders of its topics.
-
-        Args:
-            held: the application or the connection that the returned claim holds.
-            holders: maps each topic of ``held`` to the sorted requesters that hold it.
-        """
+        """Return the claim with other content; ``holders`` maps each topic to sorted requesters."""
         requesters = tuple(sorted({who for names in holders.values() for who in names}))
         partial = {topic: names for topic, names in holders.items() if names != requesters}
         return replace(self, held=held, requesters=requesters, partial=partial)
 
     def extending(self, current: Claim) -> Claim:
-        """Return the claim with everything added that ``current`` holds.
-
-        ``current`` is the earlier claim of the same demand on the same subject.
-        """
+        """Return the claim with everything added that ``current``, the claim so far, holds."""
         held = current.held.extended(self.held).booked()  # type: ignore[arg-type]  # of one kind
+        # a shutdown may have taken holds: only what is listed again is held by all requesters
         holders = dict.fromkeys(held.topic_keys(), self.requesters)
         listed = {*self.held.topic_keys()}
         kept = {topic: current.holders(topic) for topic in holders if topic not in listed}
@@ -118,11 +104,7 @@ class Claim:
     def without_holds(
         self, requester: str, topics: Container[TopicKey] | None = None
     ) -> Claim | None:
-        """Return the claim without a requester's holds on ``topics``, or on all topics.
-
-        A topic that no requester holds any longer leaves the claim. Return ``None`` if no topic is
-        left.
-        """
+        """Return the claim without a requester's holds on ``topics``, or on all topics."""
         holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
         for topic in self.held.topic_keys():
             names = self.holders(topic)
@@ -130,46 +112,33 @@ class Claim:
                 names = tuple(who for who in names if who != requester)
             if names:
                 holders[topic] = names
-            else:
+            else:  # nobody holds the topic any longer, so the claim loses it
                 gone.add(topic)
         held = self.held.without_topics(gone) if gone else self.held
         return None if held is None else self.with_holders(held, holders)
 
     def without_node(self, node: str) -> Claim | None:
-        """Return what is left of the claim without a node; ``None`` if nothing is left.
-
-        The claim must need the node. An application loses its inputs from the node and its
-        deliveries to it. A connection loses its broker, which runs on the node. Nothing is left of
-        an application that runs on the node, has a service there or has no other inputs, or of a
-        connection from or to the node.
-        """
+        """Return what is left of the claim, which must need the node, without it."""
         held = self.held.without_node(node)
         if held is None:
             return None
         return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
 
     def after_booking(self, current: Claim | None) -> Claim:
-        """Return the claim as a booking writes it to the ledger.
-
-        If the demand's earlier claim, ``current``, differs in nothing but the lease, the returned
-        claim keeps the earlier time of booking.
-        """
         if current is None:
             return self
+        # The time of booking stays if at most the lease changes. Else each renewal, and each demand
+        # that is sent again, would change the claim's file.
         kept = replace(self, booked=current.booked)
         return kept if replace(kept, lease=current.lease) == current else self
 
 
 def requesters_of(claims: Iterable[Claim]) -> tuple[str, ...]:
-    """Return the requesters of claims, sorted."""
     return tuple(sorted({who for claim in claims for who in claim.requesters}))
 
 
 def demand_id(request: str, requesters: Iterable[str]) -> str:
-    """Return the demand id for a request of the reference's action, which names no demand.
-
-    The id is a digest of the request id and the set of requesters. So a repeated request gets the
-    same demand id.
-    """
+    """Return the demand id for a request of the reference's action, which names no demand."""
+    # a digest, so that every generator gives a repeated request the same demand id
     exact = json.dumps([request, sorted(set(requesters))], ensure_ascii=True)
     return naming.hash_of(exact, 20)

@@ -116,6 +116,7 @@ class GoalConnection(FrozenModel):
 
 
 def _lease_form(value: object) -> object:
+    # without this validator, pydantic reports one fault for each type in the union
     if value is None or (isinstance(value, str | int) and not isinstance(value, bool)):
         return value
     raise ValueError(
@@ -124,11 +125,6 @@ def _lease_form(value: object) -> object:
 
 
 Lease = Annotated[str | int | None, PlainValidator(_lease_form)]
-"""A duration or a number of seconds.
-
-The validator :func:`_lease_form` checks this, because for a wrong value of a union, pydantic
-reports one fault for each type in the union.
-"""
 
 
 class DemandGoal(FrozenModel):
@@ -148,25 +144,18 @@ class DemandGoal(FrozenModel):
     answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
 
 
+# How many levels a parameter's value may have. It is a part of a claim's file, which may have 100.
 _DEEPEST = 50
-"""How many levels a parameter's value may have.
-
-The value is a part of a claim's file, and the whole file may have 100 levels.
-"""
 _TOO_DEEP = f"is nested deeper than {_DEEPEST} levels; make it flatter"
+# How many characters a key in a parameter's value may have. YAML reads keys of at most 1024
+# characters, in which an escape counts as several.
 _LONGEST_KEY = 128
-"""How many characters a key in a parameter's value may have.
-
-YAML reads keys of at most 1024 characters, in which an escape counts as several.
-"""
 _LISTS_OF_TEXT = ("requesters", "labels", "capabilities", "properties")
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
-    """Return whether plain data is to be read as a goal of our own action.
-
-    The reference's goals have neither of the fields ``kind`` and ``apiVersion``.
-    """
+    """Return whether plain data is to be read as a goal of our own action."""
+    # the reference's goals have neither of these fields
     return "kind" in data or "apiVersion" in data
 
 
@@ -179,15 +168,19 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     """
     goal, faults = parse_valid_part(data, DemandGoal, _LISTS_OF_TEXT)
     requesters = tuple(goal.requesters)
-    head: dict[str, Any] = {
-        "id": goal.request or goal.demand,
-        "demand": goal.demand,
-        "own_requesters": requesters,
-    }
-    lease_s = _lease(goal.lease, faults)
+    id = goal.request or goal.demand
+    lease_s: int | None = None
+    if isinstance(goal.lease, str):
+        try:
+            lease_s = seconds_of(goal.lease)
+        except ValueError as error:
+            faults.append(fault("lease", str(error)))
+    else:
+        lease_s = goal.lease
     if goal.operation != "put":
-        faults += _not_of_a_put(goal, lease_s)
-        return (Release if goal.operation == "release" else Renew)(**head), faults
+        faults += _fields_of_a_put(goal, lease_s)
+        operation = Release if goal.operation == "release" else Renew
+        return operation(id, demand=goal.demand, own_requesters=requesters), faults
     applications = (
         Demanded(
             _application(f"applications[{index}]", app, faults),
@@ -201,24 +194,32 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         Demanded(_connection(connection), requesters, partial(_field, f"connections[{index}]"))
         for index, connection in enumerate(goal.connections)
     )
-    positions = _positions(goal.positions, faults)
-    demanded = (*applications, *connections)
-    more: dict[str, Any] = {"positions": positions, "priority": goal.priority}
-    return Put(**head, demanded=demanded, lease_s=lease_s, **more), faults
+    positions: dict[str, Position] = {}
+    for index, position in enumerate(goal.positions):
+        if position.node in positions:
+            message = f"{quoted(position.node)} has another position above; give only one"
+            faults.append(fault(f"positions[{index}].node", message))
+        positions[position.node] = Position(x=position.x, y=position.y)
+    put = Put(
+        id,
+        demand=goal.demand,
+        own_requesters=requesters,
+        demanded=(*applications, *connections),
+        lease_s=lease_s,
+        positions=positions,
+        priority=goal.priority,
+    )
+    return put, faults
 
 
 def _field(item: str, path: str) -> str:
-    """Return the path in the goal for a field of an item; faults name this path.
-
-    For example, the field ``appdef`` of the item ``applications[0]`` has the path
-    ``applications[0].type``. The requesters are a field of the goal itself.
-    """
+    # the requesters are a field of the goal, and the appdef is its field ``type``
     if path.startswith("requesters"):
         return path
     return f"{item}.{'type' if path == 'appdef' else path}"
 
 
-def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
+def _fields_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
     """Yield a fault for each field of a release or a renewal that only a put may have."""
     if lease_s is not None:
         yield fault("lease", "is set by a put; leave it out, or put the demand again")
@@ -239,13 +240,10 @@ def _not_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
 
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
-    """Return the requirement that the field ``place`` states, or ``None`` if the field is empty.
-
-    Add a fault for each invalid text in the field to ``faults``.
-    """
     if place == GoalPlace():
         return None
-    told = {found.field for found in faults}
+    # a text of the wrong type was reported and is empty now, which would be a second fault
+    told = {each.field for each in faults}
     labels = [tuple(label.split("=", 1)) for label in place.labels]
     for index, label in enumerate(labels):
         field = f"{where}.labels[{index}]"
@@ -265,31 +263,6 @@ def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requireme
     return Requirement(place.role, pairs, tuple(place.capabilities), tuple(place.properties))
 
 
-def _positions(listed: list[GoalPosition], faults: list[Fault]) -> dict[str, Position]:
-    found: dict[str, Position] = {}
-    for index, one in enumerate(listed):
-        if one.node in found:
-            message = f"{quoted(one.node)} has another position above; give only one"
-            faults.append(fault(f"positions[{index}].node", message))
-        found[one.node] = Position(x=one.x, y=one.y)
-    return found
-
-
-def form_faults(data: dict[str, Any]) -> list[Fault]:
-    """Return the faults in the form of a goal, such as unknown fields and wrong types."""
-    return parse(data)[1]
-
-
-def _lease(lease: str | int | None, faults: list[Fault]) -> int | None:
-    if not isinstance(lease, str):
-        return lease
-    try:
-        return seconds_of(lease)
-    except ValueError as error:
-        faults.append(fault("lease", str(error)))
-        return None
-
-
 def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Application:
     parameters: dict[str, Any] = {}
     for name, value in app.parameters.items():
@@ -306,7 +279,7 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
             faults.append(fault(place, message))
         except RecursionError:
             faults.append(fault(place, _TOO_DEEP))
-        except ValueError:  # Python refuses to convert it
+        except ValueError:  # Python refuses to convert integers of more than 4300 digits
             faults.append(fault(place, "has an integer of too many digits; write a shorter one"))
     return Application(
         id=app.id,
@@ -322,8 +295,8 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
         parameters=MappingProxyType(parameters),
         version=app.version,
         deliver=tuple(
-            Delivery(one.output, one.node, absolute_topic(one.topic) if one.topic else "")
-            for one in app.deliver
+            Delivery(each.output, each.node, absolute_topic(each.topic) if each.topic else "")
+            for each in app.deliver
         ),
         place=_requirement(f"{where}.place", app.place, faults),
         services=MappingProxyType(dict(app.services)),
@@ -332,7 +305,7 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
 
 
 def _storable(where: str, value: object, faults: list[Fault]) -> object:
-    """Return a parameter's value; add a fault and return ``None`` if the ledger cannot store it."""
+    # None stands for a value that the ledger cannot store; the fault keeps it from being booked
     problem = _value_problem(value, 0)
     if problem:
         faults.append(fault(where, problem))

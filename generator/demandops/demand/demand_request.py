@@ -19,16 +19,9 @@ from demandops.errors import Fault, Refused, fault
 from demandops.identifiers import id_problem
 from demandops.subject import Subject
 
+# Takes a field's path in an application or connection, and returns the field's path in the goal.
+# For example, ``inputs.ego_data[2].source`` becomes ``applications[0].inputs.ego_data[2].source``.
 Place = Callable[[str], str]
-"""Takes a field's path in an application or connection, and returns the field's path in the goal.
-
-For example, ``inputs.ego_data[2].source`` becomes ``applications[0].inputs.ego_data[2].source``.
-"""
-
-
-def place_in(field: str) -> Place:
-    """Return a function that maps ``path`` to ``<field>.<path>``, for an item at ``field``."""
-    return lambda path: f"{field}.{path}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,18 +32,15 @@ class Demanded:
     requesters: tuple[str, ...]
     place: Place
     term: Term | None = None
+    # the type of an application's derived connections; ``auto``: any type, ``none``: none
     connect: str = "none"
-    """The type of derived connections of an application; ``auto``: any type, ``none``: none."""
+    # how a connection differs from the requested one, for a warning in the receipt
     note: str = ""
-    """How a connection differs from the requested one; the receipt has this text as a warning."""
+    # a sentence for each placed application or service: which node was chosen, and why
     placed: tuple[str, ...] = ()
-    """A sentence for each placed application or service: which node was chosen, and why."""
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
-        """Return a fault for the field at ``path`` in this item.
-
-        The fault names the field by its path in the goal.
-        """
+        """Return a fault for the field at ``path`` in this item, named by its path in the goal."""
         return fault(self.place(path), message, code=code)
 
 
@@ -58,11 +48,9 @@ class Demanded:
 class DemandRequest:
     """A request; it is booked or refused as a whole.
 
-    ``demand`` is the demand's id. The reference's requests have no demand id; for each item of such
-    a request, :func:`demandops.demand.claim.demand_id` makes one from the request id and the item's
-    requesters. ``own_requesters`` are the
-    requesters of the request as a whole. For example, a request to release a demand lists no
-    applications and no connections, but has requesters.
+    The reference's requests have no demand id; :func:`demandops.demand.claim.demand_id` makes one
+    for each item. ``own_requesters`` are those of the request as a whole: a release lists nothing,
+    but has requesters.
     """
 
     id: str
@@ -70,21 +58,18 @@ class DemandRequest:
     demand: str = ""
     own_requesters: tuple[str, ...] = ()
 
-    operation: ClassVar[str]
-    """The operation's name in commits and files."""
+    operation: ClassVar[str]  # as in commits and files
     adds_claims: ClassVar[bool] = False
-    """Whether the request can add claims."""
+    # the request is a goal of the reference's action, which names no demand
     is_reference: ClassVar[bool] = False
-    """Whether the request is a goal of the reference's action, which names no demand."""
 
     def requesters(self) -> tuple[str, ...]:
         """Return all requesters, each once, in the order of the request."""
-        listed = (who for one in self.demanded for who in one.requesters)
+        listed = (who for item in self.demanded for who in item.requesters)
         return tuple(dict.fromkeys((*self.own_requesters, *listed)))
 
     def subjects(self) -> tuple[Subject, ...]:
-        """Return the subjects of the listed applications and connections, each once."""
-        return tuple(dict.fromkeys(one.held.subject for one in self.demanded))
+        return tuple(dict.fromkeys(item.held.subject for item in self.demanded))
 
 
 AnyRequest = TypeVar("AnyRequest", bound=DemandRequest)
@@ -111,8 +96,8 @@ class Shutdown(DemandRequest):
 class Put(DemandRequest):
     """A goal of our own action, after which the demand holds exactly what the goal lists.
 
-    ``lease_s`` is the wanted lease in seconds. ``positions`` has the positions of nodes that
-    have none in the inventory. ``priority`` ranks the demand among those that wait for room.
+    ``lease_s`` is the wanted lease in seconds. ``positions`` has the positions of nodes that have
+    none in the inventory. ``priority`` ranks the demand among those that wait for room.
     """
 
     lease_s: int | None = None
@@ -149,9 +134,8 @@ class Decommission(DemandRequest):
     """An operator's request to release what needs a node or names a requester.
 
     ``id`` is the name of the node or requester. ``kinds`` are ``node``, ``requester`` or both.
-    ``nodes`` lists the names that the node has in its access domains; the admission of the request
-    fills it in. ``by`` is the operator as ``name <email>``; ``reason`` may be empty. The journal
-    stores the request; no action and no demand file can express it.
+    ``nodes`` lists the names that the node has in its access domains; the admission fills it in.
+    ``by`` is the operator as ``name <email>``.
     """
 
     kinds: frozenset[str] = frozenset()
@@ -161,9 +145,9 @@ class Decommission(DemandRequest):
 
     operation = "decommission"
 
+    # The journal stores the request as a goal. No action and no demand file can express it.
     @staticmethod
     def is_goal(data: object) -> bool:
-        """Return whether plain data is the goal of a request to decommission."""
         return isinstance(data, dict) and data.get("kind") == "Decommission"
 
     def goal(self) -> dict[str, Any]:
@@ -173,11 +157,6 @@ class Decommission(DemandRequest):
 
     @classmethod
     def parse(cls, data: dict[str, Any]) -> Decommission:
-        """Return the request that plain data describes.
-
-        Raises:
-            Refused: if the name is invalid.
-        """
         name = data.get("name")
         problem = id_problem(name) if isinstance(name, str) else "must be text"
         if problem:

@@ -7,7 +7,7 @@ Faults name the fields of the message (``apps[0].header.node_id``).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from types import MappingProxyType
 from typing import Annotated
@@ -88,12 +88,8 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return the path in the goal for a field of an application; faults name this path.
-
-    For example, the field ``node`` of the item ``apps[0]`` has the path ``apps[0].header.node_id``.
-    ``lists`` maps roles to the goal's lists of topics.
-    """
-    name, _, rest = path.partition(".")
+    """Return the path of an application's field in the goal; ``lists`` maps roles to its lists."""
+    name, _, within = path.partition(".")
     if name in ("id", "node"):
         return f"{item}.header.{'id' if name == 'id' else 'node_id'}"
     if name.startswith("requesters"):
@@ -102,18 +98,13 @@ def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
         return f"{item}.type"
     if name != "inputs":
         return f"{item}.{path}"
-    role, bracket, place = rest.partition("[")
+    role, bracket, place = within.partition("[")
     place = place.replace("].topic", "].topic_name").replace("].source", "].source_node_id")
     field = f".{lists.get(role, role)}" if role else ""
     return f"{item}.{_BODY}{field}{bracket}{place}"
 
 
 def _connection_field(item: str, path: str) -> str:
-    """Return the path in the goal for a field of a connection; faults name this path.
-
-    For example, the field ``topics[2].target`` of the item ``connections[0]`` has the path
-    ``connections[0].target_topics[2]``.
-    """
     if path.startswith("requesters"):
         return f"{item}.requester_ids{path.removeprefix('requesters')}"
     if path in ("source", "target", "broker"):
@@ -125,22 +116,16 @@ def _connection_field(item: str, path: str) -> str:
 
 
 def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | None, list[Fault]]:
-    """Parse a goal given as plain data.
-
-    Args:
-        data: the goal as a mapping, as ``ros2 action send_goal`` takes it.
-        appdef_by_type: takes an application's type, which is a number in the message, and returns
-            the appdef of this type, or ``None``.
+    """Parse a goal given as plain data, as ``ros2 action send_goal`` takes it.
 
     Returns:
         The request and the faults of its form. Fields of the wrong form are left out of the
         request, so that the caller can check the others. A request with faults must not be booked.
-        The request is ``None`` if ``data`` is not a mapping.
     """
     if not isinstance(data, dict):
         return None, [_not_a_mapping()]
     goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
-    faulty = {found.field for found in faults}
+    faulty = {each.field for each in faults}
     demanded = [
         _application(f"apps[{index}]", app, appdef_by_type(app.type))
         for index, app in enumerate(goal.apps)
@@ -151,8 +136,8 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         kind = type_numbered(connection.type) if f"{where}.type" not in faulty else None
         demanded.append(_connection(where, connection, kind))
         if kind is None and f"{where}.type" not in faulty:
-            known = ", ".join(f"{known.number} ({known.name})" for known in by_number())
-            message = f"{connection.type} is not a connection type; known: {known}"
+            types = ", ".join(f"{each.number} ({each.name})" for each in by_number())
+            message = f"{connection.type} is not a connection type; known: {types}"
             faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
         sources, targets = len(connection.source_topics), len(connection.target_topics)
         if sources != targets:
@@ -167,7 +152,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
 
 
 def form_faults(data: object) -> list[Fault]:
-    """Return the faults in a goal's form that need no configuration, such as unknown fields."""
+    """Return the faults in a goal's form that need no configuration."""
     if not isinstance(data, dict):
         return [_not_a_mapping()]
     return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
@@ -192,7 +177,11 @@ def _application(
         topics: list[WireTopic] = getattr(body, name)
         role = roles.get(name) or name
         if topics:
-            inputs[role] = (*inputs.get(role, ()), *_topics(topics))
+            # the appdef may give both lists to one role
+            inputs[role] = inputs.get(role, ()) + tuple(
+                InputTopic(absolute_topic(topic.topic_name), topic.source_node_id, topic.type)
+                for topic in topics
+            )
     return Demanded(
         Application(
             id=app.header.id,
@@ -205,16 +194,10 @@ def _application(
     )
 
 
-def _topics(topics: Iterable[WireTopic]) -> tuple[InputTopic, ...]:
-    return tuple(
-        InputTopic(absolute_topic(topic.topic_name), topic.source_node_id, topic.type)
-        for topic in topics
-    )
-
-
 def _connection(where: str, connection: WireConnection, kind: ConnectionType | None) -> Demanded:
     sources, targets = connection.source_topics, connection.target_topics
-    # the caller reports lists of unequal length; here the longer list fills up the shorter
+    # The caller reports lists of unequal length. Here the longer list fills up the shorter one, so
+    # that faults of all topics are found too.
     pairs = zip(
         [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
     )
@@ -223,7 +206,7 @@ def _connection(where: str, connection: WireConnection, kind: ConnectionType | N
         type=kind,
         source=connection.source_node_id,
         target=connection.target_node_id,
-        topics=tuple(Route(absolute_topic(one), absolute_topic(other)) for one, other in pairs),
+        topics=tuple(Route(absolute_topic(here), absolute_topic(there)) for here, there in pairs),
         broker=connection.broker_node_id,
     )
     return Demanded(

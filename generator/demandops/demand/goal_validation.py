@@ -15,8 +15,8 @@ from demandops import strict_yaml
 from demandops.config.base_model import faults_of
 from demandops.errors import MOST_FAULTS, Fault, Refused, fault, field_path
 
+# how deeply a goal may be nested: as deeply as a YAML file of the state repo
 _DEEPEST = 100
-"""How deeply a goal may be nested: as deeply as a YAML file of the state repo."""
 
 Goal = TypeVar("Goal", bound=BaseModel)
 
@@ -26,10 +26,7 @@ def parse_valid_part(
 ) -> tuple[Goal, list[Fault]]:
     """Return the part of ``data`` that has the form of ``model``, and a fault for each wrong part.
 
-    Args:
-        data: the goal.
-        model: a model with a default for every field.
-        lists_of_text: the fields of the model that are lists of text.
+    The model has a default for every field; ``lists_of_text`` are those that are lists of text.
 
     Raises:
         Refused: with the first faults, if there are too many to look for others.
@@ -52,10 +49,7 @@ def _with_keys_of_text(
     location: tuple[int | str, ...],
     faults: list[Fault],
 ) -> Any:  # noqa: ANN401
-    """Return ``data`` without the entries whose key is not Unicode text; add a fault for each.
-
-    Lists and mappings that are nested too deeply become ``None``, with a fault too.
-    """
+    """Return ``data`` without keys that are not Unicode text and without what is too deep."""
     if len(location) > _DEEPEST and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST} levels; make it flatter"
         faults.append(fault(field_path(location[:2]), message))
@@ -76,18 +70,14 @@ def _with_keys_of_text(
 
 
 def is_unicode(text: str) -> bool:
-    """Return whether a text is valid Unicode, which has no surrogate characters."""
+    # JSON can escape half of a surrogate pair, and no file in UTF-8 can contain the result
     return not any("\ud800" <= char <= "\udfff" for char in text)
 
 
 def _blank(
     data: dict[str, Any], location: Sequence[int | str], lists_of_text: Container[str]
 ) -> dict[str, Any]:
-    """Remove the value at ``location`` from ``data`` in place, and return ``data``.
-
-    A field is removed, so that its default applies. An item of a list is replaced by an empty one,
-    so that later items keep their positions.
-    """
+    """Remove the value at ``location`` from ``data`` in place, and return ``data``."""
     *parents, last = location
     node: Any = data
     within = ""
@@ -98,7 +88,8 @@ def _blank(
             return data
         node = node[head]
     if isinstance(node, list) and isinstance(last, int):
+        # an empty item, because later faults name the positions of later items
         node[last] = "" if within in lists_of_text else {}
     elif isinstance(node, dict):
-        node.pop(last, None)
+        node.pop(last, None)  # so that the field's default applies
     return data

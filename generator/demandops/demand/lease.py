@@ -13,27 +13,21 @@ from datetime import datetime, timedelta, timezone
 
 LONGEST_S = 366 * 24 * 3600
 
+# The end of a lease that has not started. Its claim awaits approval, or a person approved it and
+# the generator has not started the lease yet.
 UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
-"""The end of a lease that has not started.
-
-Its claim awaits approval, or a person approved it and the generator has not started the lease yet.
-"""
 
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """The requested lease and its slack, both in seconds.
-
-    The lease starts when the request is received; with ``on_approval``, when a person approves the
-    request.
-    """
+    """The requested lease and its slack, both in seconds."""
 
     seconds: int
     slack: int = 0
+    # the lease starts when a person approves the request, not when the request is received
     on_approval: bool = False
 
     def lease_from(self, now: datetime) -> Lease:
-        """Return the lease of a claim that is requested at ``now``."""
         if self.on_approval:
             return Lease(self.seconds, self.slack, UNSTARTED)
         return Lease(self.seconds, self.slack, now + timedelta(seconds=self.seconds))
@@ -41,55 +35,39 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    """The lease of a claim: its term and its recorded end, in UTC."""
-
     seconds: int
     slack: int
     until: datetime
 
     @property
     def has_started(self) -> bool:
-        """Whether the lease has started. See :data:`UNSTARTED`."""
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        """Return the lease of a claim that a person approves at ``now``.
-
-        If the claim had the lease ``before``, the approval renews ``before``. So the new lease
-        never ends earlier than ``before``.
-        """
+        """Return the lease of a claim that a person approves at ``now``."""
         term = Term(self.seconds, self.slack)
+        # the approval of a changed demand renews its lease, which never ends earlier than before
         return before.renewed(term, now) if before else term.lease_from(now)
 
     @property
     def expires_at(self) -> datetime:
-        """The time after which the claim may be released: the recorded end plus the slack."""
+        """The time after which the claim may be released."""
         return self.until + timedelta(seconds=self.slack)
 
     def has_ended(self, now: datetime) -> bool:
-        """Return whether the claim may be released: the recorded end plus the slack has passed."""
         return self.expires_at < now
 
     def renewed(self, term: Term, now: datetime) -> Lease:
-        """Return the lease after a renewal.
-
-        If the term is the same and the slack covers the renewal, the lease stays the same. The
-        recorded end never moves to an earlier time, because the clock may have been set back.
-        """
         wanted = term.lease_from(now)
-        if (self.seconds, self.slack) == (
-            term.seconds,
-            term.slack,
-        ) and wanted.until <= self.expires_at:
+        same_term = (self.seconds, self.slack) == (term.seconds, term.slack)
+        # a thousand vehicles renew every few minutes, and not each renewal may make a commit
+        if same_term and wanted.until <= self.expires_at:
             return self
+        # the end never moves to an earlier time, because the clock may have been set back
         return replace(wanted, until=max(wanted.until, self.until))
 
 
 def renewed(current: Lease | None, term: Term | None, now: datetime) -> Lease | None:
-    """Return a claim's lease after a request with ``term``; ``None`` without a term.
-
-    Without ``current``, the lease is new. With ``current``, :meth:`Lease.renewed` gives the lease.
-    """
     if term is None:
         return None
     return current.renewed(term, now) if current else term.lease_from(now)

@@ -21,29 +21,32 @@ from demandops.demand.demand_request import AnyRequest, Demanded, DemandRequest,
 from demandops.demand.lease import Term
 from demandops.errors import Fault, fault
 
+# pairs of a rule's field, such as ``nodes``, and a value that this field must allow
 Access = list[tuple[str, str]]
-"""Pairs of a rule's field, such as ``nodes``, and a value that this field must allow."""
 
+# the field of a rule that lists the access domains to which connections may lead
 PEERS = "peers"
-"""The field of a rule that lists the access domains to which connections may lead."""
+# without rules in a domain's policy, everybody may demand everything inside of the domain
 _NO_RULES = (Rule(name="everything"),)
-"""For a domain whose policy has no rules: everybody may demand everything inside of the domain."""
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
-    """Yield a fault for everything that the access domains do not allow the requesters.
-
-    A request that adds no claims needs no permission. :mod:`demandops.demand.admission` reports
-    nodes without a domain.
-    """
-    if not request.adds_claims:
+    """Yield a fault for everything that the access domains do not allow the requesters."""
+    if not request.adds_claims:  # everybody may release what is theirs
         return
-    for one in request.demanded:
-        for domain, access in needed_access(one.held, config):
-            yield from _not_allowed(one, domain, access)
-        home = config.domain_of.get(one.held.home)
-        if home is not None:
-            yield from _too_long(request, home)
+    lease_s = _wanted_lease(request)
+    for item in request.demanded:
+        for domain, access in needed_access(item.held, config):
+            yield from _not_allowed(item, domain, access)
+        home = config.domain_of.get(item.held.home)  # the admission reports nodes without a domain
+        longest = home.leases.longest if home else None
+        if home and longest and lease_s is not None and lease_s > seconds_of(longest):
+            yield fault(
+                "lease",
+                f"is {duration_text(lease_s)}, but leases.longest of access domain '{home.name}' "
+                f"is {longest}; request a shorter lease, and renew it",
+                code="not-allowed",
+            )
 
 
 def needed_access(
@@ -51,12 +54,20 @@ def needed_access(
 ) -> Iterator[tuple[AccessDomain, Access]]:
     """Yield (access domain, access) for each node where services run or a connection has an end.
 
-    The access domain is the node's; a node without one is left out. The access is what a rule of
-    this domain must grant.
+    The access is what a rule of this domain must grant. A node without a domain is left out.
     """
     more: Access = []
     if isinstance(held, Application):
-        nodes, first = _service_nodes(held, config), [("applications", held.appdef)]
+        first = [("applications", held.appdef)]
+        services = config.services.get(held.appdef, {}).values()
+        roles = {role for service in services if service.at_source for role in service.roots}
+        # A node to which an override moves a service is left out: the override's owner decides
+        nodes: Iterable[str] = (
+            held.node,
+            *held.services.values(),
+            *(service.runs_at[held.node] for service in services if held.node in service.runs_at),
+            *(topic.source for role in sorted(roles) for topic in held.inputs.get(role, ())),
+        )
     else:
         nodes, first = held.nodes, []
         more = held.type.access(held, config) if held.type else []
@@ -69,48 +80,30 @@ def needed_access(
         yield domain, access
 
 
-def _service_nodes(app: Application, config: Config) -> Iterable[str]:
-    """Return the nodes on which services of an application run.
-
-    These are the application's node, the sources at which services run, and the nodes of services
-    that run once for a cluster or have a node of their own. A node to which an override moves a
-    service is left out, because the override's owner decides about that node.
-    """
-    services = config.services.get(app.appdef, {}).values()
-    roles = {role for one in services if one.at_source for role in one.roots}
-    others = (one.runs_at[app.node] for one in services if app.node in one.runs_at)
-    return (
-        app.node,
-        *app.services.values(),
-        *others,
-        *(one.source for role in sorted(roles) for one in app.inputs.get(role, ())),
-    )
-
-
-def may_place(one: Demanded, appdef: str, node: str, config: Config) -> bool:
-    """Return whether the requesters may use a node for an application of the type ``appdef``.
-
-    If ``appdef`` is empty, return whether they may use the node as an end of a connection.
+def may_place(item: Demanded, appdef: str, node: str, config: Config) -> bool:
+    """Return whether the requesters may use a node for an ``appdef``, or as the end of a
+    connection.
     """
     domain = config.domain_of.get(node)
     access: Access = [("applications", appdef)] if appdef else []
     access.append(("nodes", config.host_of(node)))
-    return domain is not None and not any(_not_allowed(one, domain, access))
+    return domain is not None and not any(_not_allowed(item, domain, access))
 
 
-def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
+def _not_allowed(item: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
     """Yield a fault for each requester to whom no rule of the domain grants the access."""
     rules = domain.rules or _NO_RULES
-    for index, requester in enumerate(one.requesters):
+    for index, requester in enumerate(item.requesters):
         own = [rule for rule in rules if matches(requester, rule.requesters)]
+        # one rule must grant the whole access: two rules that grant half of it each do not add up
         misses = [first_uncovered(rule, access) for rule in own]
         if own and None in misses:
             continue
         if not own:
-            known = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
+            named = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
             message = (
                 f"no rule of access domain '{domain.name}' is for '{requester}'; its rules are "
-                f"{known}; ask for a change of policy/"
+                f"{named}; ask for a change of policy/"
             )
         else:
             reasons = "; ".join(
@@ -118,7 +111,7 @@ def _not_allowed(one: Demanded, domain: AccessDomain, access: Access) -> Iterato
                 for rule, miss in zip(own, filter(None, misses), strict=True)
             )
             message = f"{reasons}; request what is allowed, or ask for a change of policy/"
-        yield one.fault(f"requesters[{index}]", message, code="not-allowed")
+        yield item.fault(f"requesters[{index}]", message, code="not-allowed")
 
 
 def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: str) -> str:
@@ -142,35 +135,19 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
     )
 
 
-def _too_long(request: DemandRequest, domain: AccessDomain) -> Iterator[Fault]:
-    longest, lease_s = domain.leases.longest, _wanted_lease(request)
-    if longest is None or lease_s is None or lease_s <= seconds_of(longest):
-        return
-    yield fault(
-        "lease",
-        f"is {duration_text(lease_s)}, but leases.longest of access domain '{domain.name}' is "
-        f"{longest}; request a shorter lease, and renew it",
-        code="not-allowed",
-    )
-
-
 def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with the lease term of each item.
+    """Return the request with the lease term that its access domain sets for each item."""
 
-    The lease policy of the item's access domain sets the term. An item without a lease gets
-    ``None``.
-    """
-
-    def with_term(one: Demanded) -> Demanded:
-        domain = config.domain_of.get(one.held.home)
-        return replace(one, term=term(request, domain) if domain else None)
+    def with_term(item: Demanded) -> Demanded:
+        domain = config.domain_of.get(item.held.home)
+        return replace(item, term=term(request, domain) if domain else None)
 
     return replace(request, demanded=tuple(map(with_term, request.demanded)))
 
 
 def term(request: DemandRequest, domain: AccessDomain) -> Term | None:
-    """Return the lease term that a request gets in an access domain; ``None`` for no lease."""
     policy = domain.leases
+    # the reference's clients need not repeat their demands, unless the policy says so
     if request.is_reference and not policy.deployment_requests:
         return None
     given = policy.default or policy.longest
@@ -187,46 +164,35 @@ def approval_reasons(
 ) -> tuple[str, ...]:
     """Return the reasons why a request needs approval, such as ``access domain 'edge'``, each once.
 
-    The result is empty if the request needs none. Renewals, releases and the claims of overrides
-    need no approval.
-
-    Args:
-        request: an admitted request.
-        changes: each changed claim as (before the request, after the request).
-        config: the access domains and application definitions.
+    ``changes`` has each changed claim as (before the request, after the request).
     """
     if not request.adds_claims:
         return ()
-    listed = set(request.subjects())
-    changed = (
-        after
-        for before, after in changes
-        if after and after.subject in listed and _is_more_than_renewed(before, after)
-    )
-    return tuple(dict.fromkeys(reason for claim in changed for reason in _reasons(claim, config)))
-
-
-def _is_more_than_renewed(before: Claim | None, after: Claim) -> bool:
-    return before is None or replace(after, lease=before.lease) != before
-
-
-def _reasons(claim: Claim, config: Config) -> Iterator[str]:
-    if isinstance(claim.held, Application):
-        appdef = config.appdefs.get(claim.held.appdef)
-        if appdef is not None and appdef.approval == "required":
-            yield f"application definition '{appdef.name}'"
-    for domain, access in needed_access(claim.held, config):
-        for requester in claim.requesters:
-            yield from _domain_reasons(domain, requester, access)
+    listed = set(request.subjects())  # without the claims of overrides, which need no approval
+    reasons: dict[str, None] = {}
+    for before, after in changes:
+        if after is None or after.subject not in listed:
+            continue
+        # a renewal needs no approval, because the person approved what it renews
+        if before is not None and replace(after, lease=before.lease) == before:
+            continue
+        if isinstance(after.held, Application):
+            appdef = config.appdefs.get(after.held.appdef)
+            if appdef is not None and appdef.approval == "required":
+                reasons[f"application definition '{appdef.name}'"] = None
+        for domain, access in needed_access(after.held, config):
+            for requester in after.requesters:
+                reasons |= dict.fromkeys(_domain_reasons(domain, requester, access))
+    return tuple(reasons)
 
 
 def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:
-    """Yield why an access to a domain needs approval, if no rule grants it without approval."""
     rules = [
         rule
         for rule in domain.rules
         if matches(requester, rule.requesters) and first_uncovered(rule, access) is None
     ]
+    # one rule that grants the access without approval is enough
     if any((rule.approval or domain.approval) == "none" for rule in rules):
         return
     own = [rule for rule in rules if rule.approval == "required"]
@@ -238,8 +204,8 @@ def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Ite
 
 def with_leases_from_approval(request: AnyRequest) -> AnyRequest:
     """Return the request with leases that start when a person approves the request."""
-
-    def from_approval(one: Demanded) -> Demanded:
-        return replace(one, term=replace(one.term, on_approval=True)) if one.term else one
-
-    return replace(request, demanded=tuple(map(from_approval, request.demanded)))
+    demanded = (
+        replace(item, term=replace(item.term, on_approval=True)) if item.term else item
+        for item in request.demanded
+    )
+    return replace(request, demanded=tuple(demanded))

@@ -21,28 +21,24 @@ from demandops.demand.demand_request import AnyRequest, DemandRequest
 
 
 def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with separate instances for versions other than the default.
-
-    This concerns only applications whose appdef has ``versions: separate``. If such an application
-    names a channel, the channel is replaced by the version that it stands for, even if that is the
-    default version.
-    """
+    """Return the request with separate instances for versions other than the default."""
     demanded = (
-        replace(one, held=_separated(one.held, config))
-        if isinstance(one.held, Application) and one.held.version
-        else one
-        for one in request.demanded
+        replace(item, held=_separated(item.held, config))
+        if isinstance(item.held, Application) and item.held.version
+        else item
+        for item in request.demanded
     )
     return replace(request, demanded=tuple(demanded))
 
 
 def _separated(app: Application, config: Config) -> Application:
     appdef = config.appdefs.get(app.appdef)
-    known = config.application_versions.get(app.appdef, {})
-    version = known.get(app.version)
+    versions = config.application_versions.get(app.appdef, {})
+    version = versions.get(app.version)
     if appdef is None or appdef.versions != "separate" or version is None:
         return app
-    if version.rank == known[""].rank:
+    # two names of one version have the same rank
+    if version.rank == versions[""].rank:
         return replace(app, version=version.name)
     suffix = f"@{version.name}"
     id = app.id if app.id.endswith(suffix) else f"{app.id}{suffix}"
@@ -51,7 +47,7 @@ def _separated(app: Application, config: Config) -> Application:
 
 def notes(request: DemandRequest) -> Iterator[str]:
     """Yield a note for each separate instance that a request lists."""
-    for one in request.demanded:
-        if isinstance(one.held, Application) and one.held.separate:
-            id, _, version = one.held.id.rpartition("@")
-            yield f"application '{id}' in version {version} runs separately, as '{one.held.id}'"
+    for item in request.demanded:
+        if isinstance(item.held, Application) and item.held.separate:
+            id, _, version = item.held.id.rpartition("@")
+            yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"

@@ -33,23 +33,14 @@ from demandops.ledger.waiting import Wait
 
 
 def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger after a request is carried out, and the changes.
+    """Return the ledger after an admitted request is carried out, and the changes.
 
-    Args:
-        ledger: the claims before the request.
-        request: an admitted request (:mod:`demandops.demand.admission`).
-        now: when the request was received, with time zone. Claims that a join or a put books or
-            changes record this time.
-
-    Returns:
-        The new ledger and what changed. If the same request is booked already, at most the leases
-        of its claims change.
+    If the same request is booked already, at most the leases of its claims change. ``now`` is when
+    the request was received, with time zone.
 
     Raises:
-        Refused: with every contradiction between the request and existing claims, or if the request
-            contradicts itself, changes a demand of other requesters, releases or renews what is not
-            held, or is a :class:`Restoration` that may not undo newer claims and would do so. A
-            refused request books nothing.
+        Refused: if the request contradicts existing claims or itself, changes a demand of other
+            requesters, releases or renews what is not held, or undoes newer claims unasked.
     """
     match request:
         case Join():

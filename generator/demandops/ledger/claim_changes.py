@@ -14,9 +14,8 @@ from demandops.subject import Subject
 
 @dataclass(frozen=True, slots=True)
 class ClaimChange:
-    """One claim before and after a change.
-
-    ``before`` is ``None`` if the claim is new, ``after`` is ``None`` if it is released.
+    """One claim before and after a change: it is new without ``before``, released without
+    ``after``.
     """
 
     before: Claim | None
@@ -24,7 +23,6 @@ class ClaimChange:
 
     @property
     def key(self) -> ClaimKey:
-        """The key of the changed claim."""
         claim = self.after or self.before
         assert claim is not None  # noqa: S101 - a change has at least one side
         return claim.key
@@ -38,38 +36,34 @@ class ClaimChange:
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What a request changed in the ledger.
-
-    ``not_held``: in words, what a shutdown lists, but its requesters do not hold. ``shutdowns``:
-    the digests of shutdowns that the ledger now records or forgets. ``repeats``: the earlier
-    shutdown that the request repeats, or ``None``. ``kept``: the service instances whose kept
-    replicas changed. ``waiting``: the ids of the demands that begin or cease to wait, or that now
-    wait with another goal.
-    """
+    """What a request changed in the ledger."""
 
     claims: tuple[ClaimChange, ...] = ()
+    # in words, what a shutdown lists, but its requesters do not hold
     not_held: tuple[str, ...] = ()
+    # the digests of shutdowns that the ledger now records or forgets
     shutdowns: tuple[str, ...] = ()
+    # the earlier shutdown that the request repeats
     repeats: RecentShutdown | None = None
+    # the service instances whose kept replicas changed
     kept: tuple[Instance, ...] = ()
+    # the ids of the demands that begin or cease to wait, or that now wait with another goal
     waiting: tuple[str, ...] = ()
 
     def subjects(self) -> tuple[Subject, ...]:
-        """Return the subjects whose claims changed, each once."""
         return tuple(dict.fromkeys(change.key.subject for change in self.claims))
 
 
 def changes_on(
     before: Ledger, after: Ledger, subjects: Iterable[Subject]
 ) -> tuple[ClaimChange, ...]:
-    """Return the claims on ``subjects`` that differ between two ledgers."""
-    claims = (
-        claim
+    keys = (
+        claim.key
         for subject in subjects
         for ledger in (before, after)
         for claim in ledger.claims_on(subject)
     )
-    return claim_changes(before, after, (claim.key for claim in claims))
+    return claim_changes(before, after, keys)
 
 
 def claim_changes(

@@ -1,10 +1,8 @@
 """Claim files: one YAML file for each claim, with a schema version.
 
-The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. The subjects are
-spread over many folders ``hh``, because a Git tree with 100,000 entries adds 100 ms to each commit.
-``subject`` and ``demand`` are slugs with a hash of the exact id. The file contains the exact ids,
-so a file that was moved to another path is noticed. A demand is refused if the path of its claim is
-that of another claim's file (:mod:`demandops.plan.checks.name_clash`).
+The path is ``ledger/<applications|connections>/<hh>/<subject>/<demand>.yaml``. ``subject`` and
+``demand`` are slugs with a hash of the exact id, which the file contains. A demand is refused if
+the path of its claim is that of another claim's file (:mod:`demandops.plan.checks.name_clash`).
 """
 
 from __future__ import annotations
@@ -21,7 +19,7 @@ from demandops import naming, strict_yaml
 from demandops.config.base_model import FrozenModel, parse
 from demandops.connections.connection import Connection
 from demandops.connections.connection_types import type_named, type_word
-from demandops.connections.route import Route, RouteOptions
+from demandops.connections.route import RouteOptions
 from demandops.demand.application import Application, Delivery, InputTopic, Requirement
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import LONGEST_S, UNSTARTED, Lease
@@ -33,6 +31,7 @@ from demandops.subject import Subject, SubjectKind, TopicKey
 LEDGER_ROOT = "ledger"
 
 _JOINED = re.compile(r"[0-9a-f]{20}")  # the form of what demandops.demand.claim.demand_id returns
+# nine digits, because Python refuses to convert thousands of them
 _VERSION = re.compile(r"^demandops\.ledger/v([0-9]{1,9})$")
 
 
@@ -42,27 +41,18 @@ def segment(exact: str) -> str:
 
 
 def path_of(key: ClaimKey) -> str:
-    """Return the path of a claim's file in the state repo."""
     return f"{folder_of(key.subject)}/{segment(key.demand)}.yaml"
 
 
 def folder_of(subject: Subject) -> str:
     """Return the folder of all claims on an application or a connection."""
+    # many folders, because a Git tree with 100,000 entries adds 100 ms to each commit
     fan = naming.hash_of(subject.id, 2)
     return f"{LEDGER_ROOT}/{subject.kind.value}/{fan}/{segment(subject.id)}"
 
 
-def _timestamp(text: str) -> str:
-    parse_timestamp(text)
-    return text
-
-
 def parse_timestamp(text: str) -> datetime:
-    """Return the time that a text in a ledger file states, in UTC.
-
-    Raises:
-        ValueError: if the text is not a time with a time zone.
-    """
+    """Return the time that a text states, in UTC; raise ValueError without a time zone."""
     try:
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
         in_utc = moment.astimezone(timezone.utc)
@@ -74,7 +64,12 @@ def parse_timestamp(text: str) -> datetime:
     return in_utc
 
 
-Timestamp = Annotated[str, AfterValidator(_timestamp)]
+def minute_of(moment: datetime) -> str:
+    """Return the minute of a time, in UTC, as a text that sorts like the time."""
+    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
+
+
+Timestamp = Annotated[str, AfterValidator(lambda text: parse_timestamp(text) and text)]
 
 
 def _end_of_lease(text: str) -> str:
@@ -84,8 +79,7 @@ def _end_of_lease(text: str) -> str:
 
 
 _EndOfLease = Annotated[str, AfterValidator(_end_of_lease)]
-
-
+# a person may list one twice or in another order
 _Requesters = Annotated[tuple[str, ...], AfterValidator(lambda names: tuple(sorted(set(names))))]
 
 
@@ -105,8 +99,10 @@ class _Place(FrozenModel):
 
     def requirement(self) -> Requirement:
         labels = tuple(sorted(self.labels.items()))
-        words = (tuple(sorted({*of})) for of in (self.capabilities, self.properties))
-        return Requirement(self.role, labels, *words)
+        capabilities, properties = {*self.capabilities}, {*self.properties}
+        return Requirement(
+            self.role, labels, tuple(sorted(capabilities)), tuple(sorted(properties))
+        )
 
 
 class _Delivery(FrozenModel):
@@ -120,9 +116,10 @@ class _Route(RouteOptions):
     requesters: _Requesters = Field(default=(), strict=False)
 
 
-def _plain_route(value: object) -> object:
-    """Return a route's data as a mapping; if it is a text (``/a: /b``), the text is the target."""
-    return {"target": value} if isinstance(value, str) else value
+# most routes are written as /a: /b, because they have no options
+_RouteEntry = Annotated[
+    _Route, BeforeValidator(lambda value: {"target": value} if isinstance(value, str) else value)
+]
 
 
 class _Lease(FrozenModel):
@@ -170,17 +167,15 @@ class _Claim(FrozenModel):
             requesters=self.requesters,
             booked=parse_timestamp(self.booked),
             lease=self.lease.lease() if self.lease else None,
-            joined=self.action is not None or self._is_old_join(),
+            # the first version of claim files had no field ``action``
+            joined=self.action is not None
+            or (self.apiVersion == "demandops.ledger/v1" and bool(_JOINED.fullmatch(self.demand))),
         )
         partial = {key: names for _, key, names in self.partial()}
         if not partial:
             return claim
         holders = {key: partial.get(key, self.requesters) for key in held.topic_keys()}
         return claim.with_holders(held, holders)
-
-    def _is_old_join(self) -> bool:
-        """Return whether a join booked the claim before claim files had the field ``action``."""
-        return self.apiVersion == "demandops.ledger/v1" and bool(_JOINED.fullmatch(self.demand))
 
 
 class _ApplicationFile(_Claim):
@@ -200,10 +195,10 @@ class _ApplicationFile(_Claim):
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
         for role, topics in self.inputs.items():
-            for number, one in enumerate(topics):
-                if one.requesters:
-                    place = f"inputs.{role}[{number}]"
-                    yield place, (role, one.topic, one.source), one.requesters
+            for index, topic in enumerate(topics):
+                if topic.requesters:
+                    place = f"inputs.{role}[{index}]"
+                    yield place, (role, topic.topic, topic.source), topic.requesters
 
     def held(self) -> Application:
         inputs = {
@@ -218,7 +213,7 @@ class _ApplicationFile(_Claim):
             MappingProxyType(inputs),
             MappingProxyType(self.parameters),
             self.version,
-            tuple(sorted(Delivery(one.output, one.node, one.topic) for one in self.deliver)),
+            tuple(sorted(Delivery(each.output, each.node, each.topic) for each in self.deliver)),
             self.place.requirement() if self.place else None,
             self.separate,
             MappingProxyType(self.services),
@@ -234,7 +229,7 @@ class _ConnectionFile(_Claim):
     source: str
     target: str
     broker: str = ""
-    topics: dict[str, Annotated[_Route, BeforeValidator(_plain_route)]] = Field(min_length=1)
+    topics: dict[str, _RouteEntry] = Field(min_length=1)
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
         for source, route in self.topics.items():
@@ -250,9 +245,11 @@ class _ConnectionFile(_Claim):
 
 
 def text_of(claim: Claim) -> str:
-    """Return the text of a claim's file. The same claim gives the same bytes."""
     held = claim.held
-    kind = "Application" if isinstance(held, Application) else "Connection"
+    if isinstance(held, Application):
+        kind, data = "Application", _application_data(claim, held)
+    else:
+        kind, data = "Connection", _connection_data(claim, held)
     lease: dict[str, object] = {}
     if claim.lease is not None:
         lease = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
@@ -268,32 +265,32 @@ def text_of(claim: Claim) -> str:
             "requesters": list(claim.requesters),
             "booked": format_timestamp(claim.booked),
             **({"action": "DeploymentRequest"} if claim.joined else {}),
-            **_data(claim),
+            **data,
             **({"lease": lease} if lease else {}),
         }
     )
 
 
-def _data(claim: Claim) -> dict[str, Any]:
-    if claim.is_on_application:
-        return _application_data(claim, claim.application)
-    return _connection_data(claim, claim.connection)
-
-
 def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
+    def topic_data(role: str, topic: InputTopic) -> dict[str, Any]:
+        entry: dict[str, Any] = {"topic": topic.topic, "source": topic.source}
+        entry |= {"type": topic.type} if topic.type else {}
+        entry |= {"further": True} if topic.further else {}
+        return entry | _partial(claim, (role, topic.topic, topic.source))
+
     data: dict[str, Any] = {
         "definition": app.appdef,
         "node": app.node,
         "inputs": {
-            role: [_topic(claim, role, topic) for topic in topics]
+            role: [topic_data(role, topic) for topic in topics]
             for role, topics in app.inputs.items()
         },
     }
-    if app.parameters:
-        data["parameters"] = dict(sorted(app.parameters.items()))
+    # Empty fields are left out, so that a new field leaves the files of other claims as they are
+    data |= {"parameters": dict(sorted(app.parameters.items()))} if app.parameters else {}
     data |= {"version": app.version} if app.version else {}
     data |= {"separate": True} if app.separate else {}
-    deliver = [{k: v for k, v in one._asdict().items() if v} for one in app.deliver]
+    deliver = [{k: v for k, v in each._asdict().items() if v} for each in app.deliver]
     data |= {"deliver": deliver} if deliver else {}
     data |= {"services": dict(sorted(app.services.items()))} if app.services else {}
     data |= {"named": list(app.named)} if app.named else {}
@@ -302,7 +299,7 @@ def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
 
 
 def place_data(place: Requirement) -> dict[str, Any]:
-    """Return the requirement on a node as plain data, in the form of a claim's file."""
+    """Return the requirement on a node in the form of a claim's file."""
     listed = {
         "role": place.role,
         "labels": dict(place.labels),
@@ -313,14 +310,17 @@ def place_data(place: Requirement) -> dict[str, Any]:
 
 
 def _connection_data(claim: Claim, connection: Connection) -> dict[str, Any]:
-    data: dict[str, Any] = {
+    topics: dict[str, str | dict[str, Any]] = {}
+    for route in connection.topics:
+        options = route.options() | _partial(claim, (route.source,))
+        topics[route.source] = {"target": route.target, **options} if options else route.target
+    return {
         "type": connection.known_type.word,
         "source": connection.source,
         "target": connection.target,
+        **({"broker": connection.broker} if connection.broker else {}),
+        "topics": topics,
     }
-    if connection.broker:
-        data["broker"] = connection.broker
-    return data | {"topics": {route.source: _route(claim, route) for route in connection.topics}}
 
 
 def format_timestamp(moment: datetime) -> str:
@@ -329,76 +329,46 @@ def format_timestamp(moment: datetime) -> str:
     return f"{in_utc.removesuffix('+00:00')}Z"
 
 
-def _topic(claim: Claim, role: str, topic: InputTopic) -> dict[str, Any]:
-    entry: dict[str, Any] = {"topic": topic.topic, "source": topic.source}
-    entry |= {"type": topic.type} if topic.type else {}
-    entry |= {"further": True} if topic.further else {}
-    return entry | _partial(claim, (role, topic.topic, topic.source))
-
-
-def _route(claim: Claim, route: Route) -> str | dict[str, Any]:
-    options = route.options() | _partial(claim, (route.source,))
-    return {"target": route.target, **options} if options else route.target
-
-
 def _partial(claim: Claim, topic: TopicKey) -> dict[str, list[str]]:
     names = claim.partial.get(topic)
     return {"requesters": list(names)} if names else {}
 
 
 def read(text: str, path: str) -> Claim:
-    """Return the claim in a file.
-
-    Raises:
-        InvalidInput: if the file is not valid, or if its path does not match the ids in the file.
-    """
+    """Return the claim in a file; raise InvalidInput if it is not valid or at another path."""
     data = strict_yaml.load(text, path)
     kind = data.get("kind") if isinstance(data, dict) else None
     version = _VERSION.match(str(data.get("apiVersion", ""))) if isinstance(data, dict) else None
+    # said before the fields are read, because a newer schema has fields that are unknown here
     if version and int(version[1]) > 2:
-        raise InvalidInput(
-            [
-                fault(
-                    "apiVersion",
-                    f"is {data['apiVersion']}, newer than this generator's "
-                    f"{LEDGER_API_VERSION}; update the generator",
-                ).within(path)
-            ]
+        message = (
+            f"is {data['apiVersion']}, newer than this generator's {LEDGER_API_VERSION}; update "
+            "the generator"
         )
+        raise InvalidInput.at("apiVersion", message, file=path)
     file: _Claim
     if kind == "ApplicationClaim":
         file = parse(_ApplicationFile, data, path)
     elif kind == "ConnectionClaim":
         file = parse(_ConnectionFile, data, path)
     else:
-        raise InvalidInput(
-            [
-                fault(
-                    "kind", f"is {kind!r}, but must be ApplicationClaim or ConnectionClaim"
-                ).within(path)
-            ]
-        )
-    if faults := [found.within(path) for found in file.faults()]:
+        message = f"is {kind!r}, but must be ApplicationClaim or ConnectionClaim"
+        raise InvalidInput.at("kind", message, file=path)
+    if faults := [each.within(path) for each in file.faults()]:
         raise InvalidInput(faults)
     claim = file.claim()
+    # a file that was moved would be a second claim with the same key
     if path_of(claim.key) != path:
-        raise InvalidInput(
-            [
-                fault(
-                    "",
-                    f"the ids in this file belong to {path_of(claim.key)}; move the file to that "
-                    "path, or restore the ids",
-                ).within(path)
-            ]
+        message = (
+            f"the ids in this file belong to {path_of(claim.key)}; move the file to that path, or "
+            "restore the ids"
         )
+        raise InvalidInput.at("", message, file=path)
     return claim
 
 
 def kind_of(path: str) -> SubjectKind | None:
-    """Return the kind of subject to which the claim file at ``path`` belongs.
-
-    Return ``None`` if the path does not have the form of a claim file's path.
-    """
+    """Return the kind of subject of the claim file at ``path``; ``None`` if it is no such path."""
     parts = path.split("/")
     if len(parts) != 5 or parts[0] != LEDGER_ROOT or not path.endswith(".yaml"):
         return None

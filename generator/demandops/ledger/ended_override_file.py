@@ -29,12 +29,10 @@ class _Marker(FrozenModel):
 
 
 def path_of(name: str) -> str:
-    """Return the path of an override's marker."""
     return f"{MARKERS_ROOT}/{name}.yaml"
 
 
 def text_of(override: Override) -> str:
-    """Return the text of the marker that records the end of an override."""
     assert override.end is not None  # noqa: S101 - only an override with an end ends
     return strict_yaml.dump(
         {
@@ -47,10 +45,8 @@ def text_of(override: Override) -> str:
 
 
 def read(files: Mapping[str, str]) -> dict[str, str]:
-    """Return a map from the name of each ended override to the end that its marker records.
-
-    ``files`` maps paths to texts. Files that are not valid markers are skipped;
-    :func:`stale_markers` lists them for removal.
+    """Return a map from the name of each ended override to the end that its marker records. Files
+    that are not valid markers are skipped; :func:`stale_markers` lists them for removal.
     """
     ended = {}
     for path, text in files.items():
@@ -65,11 +61,8 @@ def read(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def stale_markers(files: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
-    """Return the paths of those markers in ``files`` that no longer apply, sorted.
-
-    These are the markers that are not valid, whose override is gone, or whose override now has
-    another end or no end.
-    """
+    """Return the paths of those markers in ``files`` that no longer apply, sorted."""
+    # A marker is stale if it is not valid, its override is gone, or the override's end was changed
     ended = read(files)
     current = {
         path_of(name)

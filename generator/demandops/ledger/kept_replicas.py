@@ -1,12 +1,10 @@
 """Kept replicas: those that a service keeps for a while although its demands need fewer.
 
 A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service has
-the highest number of replicas that its demands needed within this time. A service instance with
-kept replicas has one record, the file ``ledger/replicas/<hh>/<name>.yaml``. The record lists each
-number of replicas above the present need, with the time until which the service keeps this number.
-When that time passes, the generator publishes a commit that removes the number from the record.
-The replicas depend on the record, never on the clock, so ``demandops verify`` computes the same
-bytes again.
+the highest number of replicas that its demands needed within this time. Its record, the file
+``ledger/replicas/<hh>/<name>.yaml``, lists each number above the present need, with the time until
+which it is kept. When that time passes, the generator removes the number by a commit. The replicas
+depend on the record, never on the clock, so ``demandops verify`` computes the same bytes again.
 """
 
 from __future__ import annotations
@@ -14,7 +12,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from datetime import datetime, timezone
+from datetime import datetime
 from itertools import pairwise
 from typing import Literal, NamedTuple, TypeAlias
 
@@ -28,6 +26,7 @@ from demandops.ledger.claim_file import (
     LEDGER_ROOT,
     Timestamp,
     format_timestamp,
+    minute_of,
     parse_timestamp,
     segment,
 )
@@ -35,81 +34,60 @@ from demandops.settings import LEDGER_API_VERSION
 
 REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
 
+# the key of a service instance: the text ``replicas``, then the values of _FIELDS
 Instance: TypeAlias = "tuple[str, ...]"
-"""The key of a service instance: the text ``replicas``, then the values of ``_FIELDS``.
-
-The text tells the key apart from the entries of the ledger's index.
-"""
 
 _FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
 
 
 class Kept(NamedTuple):
-    """One step of scaling down: a service keeps ``replicas`` replicas until the time ``until``."""
+    """One step of scaling down: a service keeps ``replicas`` replicas until ``until``."""
 
     replicas: int
     until: datetime
 
 
+# each step has fewer replicas and a later end than the previous one
 Steps: TypeAlias = "tuple[Kept, ...]"
-"""The steps in which one service scales down.
-
-Each step has fewer replicas and a later end than the previous step.
-"""
 
 
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
     """Return the steps of a service whose demands now need more or fewer replicas.
 
-    If the demands need fewer, a new step with ``was_needed`` replicas replaces each step with as
-    many or fewer. A step with ``needed`` replicas or fewer is left out, and so is a step that has
-    ended.
-
-    Args:
-        steps: the steps so far.
-        needed: how many replicas the demands need now.
-        was_needed: how many replicas the demands needed before.
-        now: the time.
-        until: the end of the new step.
+    ``until`` is the end of a new step.
     """
     if was_needed > needed:
-        steps = (*(one for one in steps if one.replicas > was_needed), Kept(was_needed, until))
+        # the new step ends last, so it covers each step with as many replicas or fewer
+        steps = (*(step for step in steps if step.replicas > was_needed), Kept(was_needed, until))
     left: list[Kept] = []
-    for one in steps:
+    for step in steps:
         # the clock may have been set back, so a later step may end first
-        if one.replicas > needed and one.until > (left[-1].until if left else now):
-            left.append(one)
+        if step.replicas > needed and step.until > (left[-1].until if left else now):
+            left.append(step)
     return tuple(left)
-
-
-def _minute(moment: datetime) -> str:
-    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
 
 
 @dataclass(frozen=True, slots=True)
 class KeptReplicas:
-    """The records of all services that keep replicas.
-
-    ``steps`` maps each such service instance to its steps: how many replicas it keeps until when.
-    ``by_minute`` maps a minute to the instances whose first step ends in this minute.
-    """
+    """The records of all services that keep replicas."""
 
     steps: HashTrieMap[Instance, Steps] = field(default_factory=HashTrieMap)
+    # by the minute in which the first step ends, so that the next end is found without a scan
     by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
 
     def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
         """Return the records with ``steps`` for ``instance``; empty steps remove its record."""
-        known = self.steps.get(instance) or ()
-        if known == steps:
+        old = self.steps.get(instance) or ()
+        if old == steps:
             return self
         all_steps, by_minute = self.steps, self.by_minute
-        if known:
-            minute = _minute(known[0].until)
+        if old:
+            minute = minute_of(old[0].until)
             left = by_minute[minute].remove(instance)
             by_minute = by_minute.insert(minute, left) if left else by_minute.remove(minute)
             all_steps = all_steps.remove(instance)
         if steps:
-            minute = _minute(steps[0].until)
+            minute = minute_of(steps[0].until)
             others = by_minute.get(minute) or HashTrieSet()
             by_minute = by_minute.insert(minute, others.insert(instance))
             all_steps = all_steps.insert(instance, steps)
@@ -117,25 +95,27 @@ class KeptReplicas:
 
     def due(self, now: datetime) -> list[Instance]:
         """Return the instances whose first step of scaling down has ended, sorted."""
-        minutes = [minute for minute in self.by_minute if minute <= _minute(now)]
-        instances = (one for minute in minutes for one in self.by_minute[minute])
-        return sorted(one for one in instances if self.steps[one][0].until <= now)
+        return sorted(
+            instance
+            for minute in self.by_minute
+            if minute <= minute_of(now)
+            for instance in self.by_minute[minute]
+            if self.steps[instance][0].until <= now
+        )
 
     def next_end(self) -> datetime | None:
-        """Return when the next instance is to scale down, or ``None`` if none keeps replicas."""
         if not self.by_minute:
             return None
-        return min(self.steps[one][0].until for one in self.by_minute[min(self.by_minute)])
+        first = self.by_minute[min(self.by_minute)]
+        return min(self.steps[instance][0].until for instance in first)
 
 
 def path_of(instance: Instance) -> str:
-    """Return the path of a service instance's record."""
     exact = json.dumps(instance[1:], ensure_ascii=True)
     return f"{REPLICAS_ROOT}/{naming.hash_of(exact, 2)}/{segment(exact)}.yaml"
 
 
 def text_of(instance: Instance, steps: Steps) -> str:
-    """Return the text of a service instance's record."""
     named = zip(_FIELDS, instance[1:], strict=True)
     return strict_yaml.dump(
         {
@@ -143,7 +123,7 @@ def text_of(instance: Instance, steps: Steps) -> str:
             "kind": "KeptReplicas",
             **{name: value for name, value in named if value},
             "keeps": [
-                {"replicas": one.replicas, "until": format_timestamp(one.until)} for one in steps
+                {"replicas": step.replicas, "until": format_timestamp(step.until)} for step in steps
             ],
         }
     )
@@ -169,12 +149,13 @@ class _KeptReplicasFile(FrozenModel):
 
 def read(text: str, path: str) -> tuple[Instance, Steps] | None:
     """Return the record in a file; ``None`` if the file is not valid or belongs at another path."""
+    # a person may have written the file; a mistake in it must not stop demands
     try:
         file = parse_file(_KeptReplicasFile, text, path)
     except InvalidInput:
         return None
     instance = ("replicas", *(getattr(file, name) for name in _FIELDS))
-    steps = tuple(Kept(one.replicas, parse_timestamp(one.until)) for one in file.keeps)
+    steps = tuple(Kept(step.replicas, parse_timestamp(step.until)) for step in file.keeps)
     falls = all(a.replicas > b.replicas and a.until < b.until for a, b in pairwise(steps))
     return (instance, steps) if falls and path == path_of(instance) else None
 

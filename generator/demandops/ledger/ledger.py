@@ -1,8 +1,6 @@
 """The ledger: which demand holds which subject, as a set of persistent maps.
 
-A :class:`Ledger` never changes, because each request makes a new one. How long that takes depends
-on the size of the request and on the number of claims on its subjects, not on the number of all
-claims.
+A :class:`Ledger` never changes, because each request makes a new one.
 """
 
 from __future__ import annotations
@@ -10,7 +8,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timezone
+from datetime import datetime
 from operator import attrgetter
 from typing import TypeAlias
 
@@ -22,6 +20,7 @@ from demandops.connections.connection_type import ConnectionType
 from demandops.demand.application import Application, InputTopic
 from demandops.demand.claim import Claim, ClaimKey
 from demandops.demand.lease import UNSTARTED
+from demandops.ledger.claim_file import minute_of
 from demandops.ledger.kept_replicas import KeptReplicas
 from demandops.ledger.recent_shutdowns import RecentShutdowns
 from demandops.ledger.waiting import WaitingDemands
@@ -36,33 +35,28 @@ Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
 
 @dataclass(frozen=True, slots=True)
 class Ledger:
-    """All claims, and an index of them.
+    """All claims, an index of them, and the ledger's other records."""
 
-    ``claims`` maps each subject to the claims on it, sorted by demand id. The generator books only
-    claims that agree with the other claims on the subject about its type and nodes. If a person
-    writes a claim that disagrees, the first claim on the subject decides.
-    ``index`` maps each entry of :func:`index_entries` to the keys of the claims that have it.
-    ``minutes`` has each minute in which a lease and its slack end, so that the next end is found
-    without a scan of all claims.
-    ``ended`` maps the name of each ended override to the end that the override then had.
-    ``shutdowns`` are the recent shutdowns.
-    ``applications_on`` maps each node to the number of applications for which the node was chosen.
-    An application counts even if the node was chosen only for one of its services.
-    ``kept`` are the replicas that services keep for a while.
-    ``waiting`` are the demands that wait for room.
-    """
-
+    # The claims on each subject, sorted by demand id. The generator books only claims that agree
+    # about the subject's type and nodes. If a person writes one that disagrees, the first decides.
+    # They are a tuple, because the planner asks for all of them at each join, and a persistent map
+    # would make and sort them anew each time.
     claims: HashTrieMap[Subject, tuple[Claim, ...]] = field(default_factory=HashTrieMap)
+    # The keys of the claims that have an entry. What a request costs then depends on its claims and
+    # not on all claims.
     index: Index = field(default_factory=HashTrieMap)
+    # each minute in which a lease and its slack end: the next end is found without a scan of claims
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
+    # the end that each ended override had when it ended, by name
     ended: Mapping[str, str] = field(default_factory=dict)
     shutdowns: RecentShutdowns = field(default_factory=RecentShutdowns)
+    # For how many applications each node was chosen, also if only for one of their services. The
+    # choice of nodes takes the emptiest, and must not count all claims for each demand.
     applications_on: HashTrieMap[str, int] = field(default_factory=HashTrieMap)
     waiting: WaitingDemands = field(default_factory=HashTrieMap)
     kept: KeptReplicas = field(default_factory=KeptReplicas)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
-        """Return the claims on ``subject``, sorted by demand id."""
         return self.claims.get(subject) or ()
 
     def first_claim(self, subject: Subject) -> Claim | None:
@@ -71,71 +65,59 @@ class Ledger:
         return held[0] if held else None
 
     def held(self, subject: Subject) -> Application | Connection | None:
-        """Return the application or connection in the first claim on ``subject``, or ``None``."""
+        """Return the application or connection in the first claim on ``subject``."""
         first = self.first_claim(subject)
         return first.held if first else None
 
     def application_claims(self, application: str) -> tuple[Claim, ...]:
-        """Return the claims on an application."""
         return self.claims_on(Subject(SubjectKind.APPLICATION, application))
 
     def connection_claims(self, connection: str) -> tuple[Claim, ...]:
-        """Return the claims on a connection."""
         return self.claims_on(Subject(SubjectKind.CONNECTION, connection))
 
     def application(self, id: str) -> Application | None:
-        """Return an application as its first claim has it, or ``None`` if no claim holds it."""
+        """Return an application as its first claim has it."""
         first = self.first_claim(Subject(SubjectKind.APPLICATION, id))
         return first.application if first else None
 
     def connection(self, id: str) -> Connection | None:
-        """Return a connection as its first claim has it, or ``None`` if no claim holds it."""
+        """Return a connection as its first claim has it."""
         first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
         return first.connection if first else None
 
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
         """Return the ``known`` versions and channels that claims on an application ask for.
 
-        The result also has an empty text if a claim asks for no version, or for an unknown one.
+        An empty text stands for claims that ask for no version, or for an unknown one.
         """
         by_version = {word: self.index.get(("version", application, word)) for word in known}
-        found = {word: len(keys) for word, keys in by_version.items() if keys}
-        claims = self.claims.get(Subject(SubjectKind.APPLICATION, application)) or ()
-        return {*found, ""} if len(claims) > sum(found.values()) else {*found}
+        counts = {word: len(keys) for word, keys in by_version.items() if keys}
+        others = len(self.application_claims(application)) > sum(counts.values())
+        return {*counts, ""} if others else {*counts}
 
     def subjects(self, kind: SubjectKind) -> list[str]:
-        """Return the ids of all subjects of a kind that have claims, sorted."""
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
     def claims_reading(self, source: str, topic: str) -> tuple[Claim, ...]:
-        """Return the claims with ``topic`` of the node ``source`` as an input.
-
-        They are sorted by application, then by demand.
-        """
+        """Return the claims with ``topic`` of ``source`` as an input, by application and demand."""
         return self._claims("takes", source, topic)
 
     def each_reading(self, source: str, topic: str) -> Iterator[Claim]:
-        """Yield the claims with ``topic`` of the node ``source`` as an input, in no order."""
+        """Yield the claims of :meth:`claims_reading` in no order, without the cost of sorting."""
         for key in self.index.get(("takes", source, topic)) or ():
             claim = self.get(key)
             if claim is not None:
                 yield claim
 
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
-        """Return the booked input with this topic and source in ``role``.
-
-        Return ``None`` if no claim has such an input.
-        """
+        """Return the booked input with this topic and source in ``role``."""
         for claim in self.each_reading(source, topic):
-            if found := claim.application.inputs_from(role, source, topic):
-                return found[0]
+            if inputs := claim.application.inputs_from(role, source, topic):
+                return inputs[0]
         return None
 
     def has_usual_topic(self, role: str, source: str, *, except_demand: str | None = None) -> bool:
-        """Return whether a claim has the usual topic of ``source`` as an input in ``role``.
-
-        Claims of the demand ``except_demand`` do not count.
-        """
+        """Return whether a claim has the usual topic of ``source`` as an input in ``role``."""
         keys = self.index.get(("usual", source, role)) or ()
         return any(key.demand != except_demand for key in keys)
 
@@ -144,32 +126,26 @@ class Ledger:
         keys = self.index.get(("usual", source, role)) or ()
         if len(keys) == len(self.index.get(("usual", source, role, excluded)) or ()):
             return  # all these claims have the topic ``excluded``
-        found = (claim for key in keys if (claim := self.get(key)))
-        topics = (topic for claim in found for topic in claim.application.inputs.get(role, ()))
-        usual = {one.topic for one in topics if one.source == source and not one.further}
+        claims = (claim for key in keys if (claim := self.get(key)))
+        inputs = (each for claim in claims for each in claim.application.inputs.get(role, ()))
+        usual = {each.topic for each in inputs if each.source == source and not each.further}
         yield from sorted(usual - {excluded})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version) for each input in ``role`` that topic names show as ``part``.
-
-        An input with the usual topic of its source is yielded only if its application is a separate
-        instance. ``version`` is the version of the separate instance; it is empty for an input of
-        any other application.
+        """Yield (input, version of a separate instance) for each input that topic names show as
+        ``part``.
         """
         for claim in self._claims("further", part):
             app = claim.application
             yield from ((topic, app.own_version) for topic in app.further_inputs(role, part))
 
     def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
-        """Return the ids of the connections that bring ``topic`` to the node ``target``, sorted."""
         return self._ids("brings", target, topic)
 
     def is_carried_to(self, target: str, topic: str) -> bool:
-        """Return whether a connection brings ``topic`` to the node ``target``."""
         return ("brings", target, topic) in self.index
 
     def claims_of_demand(self, demand: str) -> tuple[Claim, ...]:
-        """Return the claims of one demand, sorted by subject."""
         return self._claims("demand", demand)
 
     def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
@@ -177,70 +153,59 @@ class Ledger:
         return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
 
     def moved_applications(self) -> tuple[str, ...]:
-        """Return the ids of the applications with a service that an override moves, sorted."""
         return self._ids("moved")
 
     def is_only_kept(self, subject: Subject) -> bool:
-        """Return whether ``subject`` has no claims except those that overrides keep."""
-        return len(self.claims.get(subject) or ()) == len(self.kept_claims(subject))
+        return len(self.claims_on(subject)) == len(self.kept_claims(subject))
 
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
-        """Return the claims of a requester, sorted by subject and demand."""
         return self._claims("requester", requester)
 
     def claims_held_by(self, requester: str, subject: Subject) -> tuple[Claim, ...]:
-        """Return the claims of a requester on one subject, sorted by demand."""
         return self._claims("holder", requester, subject.kind.value, subject.id)
 
     def count_of_requester(self, requester: str) -> int:
-        """Return how many claims a requester has."""
         return len(self.index.get(("requester", requester)) or ())
 
     def claims_of_definition(self, appdef: str) -> tuple[Claim, ...]:
-        """Return the claims on the applications of an appdef, sorted by subject and demand."""
         return self._claims("definition", appdef)
 
     def claims_at(self, node: str) -> tuple[Claim, ...]:
-        """Return the claims on applications that run on, read from or deliver to a node, sorted."""
+        """Return the claims on applications that run on, read from or deliver to a node."""
         return self._claims("node", node)
 
     def applications_at(self, node: str) -> tuple[str, ...]:
-        """Return the ids of applications that run on, read from or deliver to a node, sorted."""
+        """Return the ids of applications that run on, read from or deliver to a node."""
         return self._ids("node", node)
 
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        """Return the ids of the applications that are called ``part`` in topic names, sorted.
-
-        ``part`` is the text that replaces ``{instance}`` in output patterns.
-        """
+        """Return the ids of the applications for which ``part`` replaces ``{instance}``."""
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:
-        """Return when the first lease and its slack end, or ``None`` if there is no lease.
-
-        A lease that has not started counts with the end :data:`UNSTARTED`.
+        """Return when the first lease and its slack end, which is :data:`UNSTARTED` if none
+        started.
         """
-        found = (claim for key in self.first_to_end() or () if (claim := self.get(key)))
-        return min((claim.lease.expires_at for claim in found if claim.lease), default=None)
+        claims = (claim for key in self.first_to_end() or () if (claim := self.get(key)))
+        return min((claim.lease.expires_at for claim in claims if claim.lease), default=None)
 
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
         """Return the keys of the claims whose leases, with their slack, end in the earliest minute.
 
-        Return ``None`` if there is no lease. Each call returns the same object until a claim enters
-        the set, leaves the set or gets another lease. So a caller that compares the objects sees
-        each change.
+        Each call returns the same object until a claim enters the set, leaves it or gets another
+        lease.
         """
         return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
 
     def unstarted_claims(self) -> tuple[Claim, ...]:
         """Return the approved claims whose lease the generator has not started yet."""
-        later = (minute for minute in self.minutes if minute >= _minute(UNSTARTED))
-        found = (claim for minute in sorted(later) for claim in self._claims(_ENDS, minute))
-        return tuple(claim for claim in found if claim.lease and not claim.lease.has_started)
+        later = (minute for minute in self.minutes if minute >= minute_of(UNSTARTED))
+        claims = (claim for minute in sorted(later) for claim in self._claims(_ENDS, minute))
+        return tuple(claim for claim in claims if claim.lease and not claim.lease.has_started)
 
     def ended_claims(self, now: datetime) -> tuple[Claim, ...]:
         """Return the claims whose lease and slack ended before ``now``, the earliest end first."""
-        over = (minute for minute in self.minutes if minute <= _minute(now))
+        over = (minute for minute in self.minutes if minute <= minute_of(now))
         ended = [
             (claim.lease.expires_at, claim)
             for minute in over
@@ -253,40 +218,35 @@ class Ledger:
         return tuple(sorted({key.subject.id for key in self.index.get(entry) or ()}))
 
     def _claims(self, *entry: str) -> tuple[Claim, ...]:
-        keys = sorted(self.index.get(entry) or (), key=_order)
-        found = (self.get(key) for key in keys)
-        return tuple(claim for claim in found if claim is not None)
+        keys = sorted(
+            self.index.get(entry) or (),
+            key=lambda key: (key.subject.kind.value, key.subject.id, key.demand),
+        )
+        return tuple(claim for key in keys if (claim := self.get(key)))
 
     def connections_at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
-        """Return the ids of the connections of a type from or to ``node``, sorted."""
+        """Return the ids of the connections of a type from or to ``node``."""
         return self._ids("link", kind.name, node)
 
     def connections_needing(self, node: str) -> tuple[str, ...]:
-        """Return the ids of the connections from or to a node, or that name its broker, sorted."""
-        found = {
-            id
-            for kind in connection_types.CONNECTION_TYPES
-            for id in self.connections_at(kind, node)
-        }
-        return tuple(sorted(found | set(self._ids("broker", node))))
+        """Return the ids of the connections from or to a node, or that name its broker."""
+        ids = set(self._ids("broker", node))
+        for kind in connection_types.CONNECTION_TYPES:
+            ids |= {*self.connections_at(kind, node)}
+        return tuple(sorted(ids))
 
     def indexed_names(self, entry: str) -> set[str]:
-        """Return the last text of each index entry whose first text is ``entry``.
-
-        This scans the whole index, so it is slow for a large ledger.
-        """
-        return {known[-1] for known in self.index if known[0] == entry}
+        """Return the last text of each index entry that begins with ``entry``; scans the index."""
+        return {key[-1] for key in self.index if key[0] == entry}
 
     def get(self, key: ClaimKey) -> Claim | None:
-        """Return the claim at ``key``, or ``None``."""
-        held = self.claims.get(key.subject) or ()
+        held = self.claims_on(key.subject)
         place = bisect_left(held, key.demand, key=_DEMAND)
-        found = held[place : place + 1]
-        return found[0] if found and found[0].demand == key.demand else None
+        return held[place] if place < len(held) and held[place].demand == key.demand else None
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
         """Return the ledger with ``claim`` at ``key``; ``None`` removes the claim at ``key``."""
-        held, old = self.claims.get(key.subject) or (), self.get(key)
+        held, old = self.claims_on(key.subject), self.get(key)
         if old == claim:
             return self
         place = bisect_left(held, key.demand, key=_DEMAND)
@@ -300,7 +260,8 @@ class Ledger:
             if not others and entry[0] == _ENDS:
                 minutes = minutes.remove(entry[1])
         added = after - before
-        if old and claim and old.lease != claim.lease:  # so ``first_to_end`` returns a new object
+        if old and claim and old.lease != claim.lease:
+            # so that first_to_end returns a new object, by which the expiry sees the change
             added |= {entry for entry in after if entry[0] == _ENDS}
         for entry in added:
             index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
@@ -309,33 +270,21 @@ class Ledger:
         counts = self.applications_on
         if key.subject.kind is SubjectKind.APPLICATION:
             counts = _counted(counts, self.first_claim(key.subject), held[0] if held else None)
-        return Ledger(
-            claims, index, minutes, self.ended, self.shutdowns, counts, self.waiting, self.kept
-        )
+        return replace(self, claims=claims, index=index, minutes=minutes, applications_on=counts)
 
     def without(self, claims: Iterable[Claim]) -> Ledger:
-        """Return the ledger without these claims."""
         ledger = self
         for claim in claims:
             ledger = ledger.replace(claim.key, None)
         return ledger
 
     def without_waiting(self, demands: Iterable[str]) -> Ledger:
-        """Return the ledger without these waiting demands."""
         waiting = self.waiting
         for demand in demands:
             waiting = waiting.discard(demand)
         return replace(self, waiting=waiting)
 
-    def with_claims_from(self, subject: Subject, other: Ledger) -> Ledger:
-        """Return the ledger with the claims on ``subject`` as they are in ``other``."""
-        ledger = self.without(self.claims_on(subject))
-        for claim in other.claims_on(subject):
-            ledger = ledger.replace(claim.key, claim)
-        return ledger
-
     def __iter__(self) -> Iterator[Claim]:
-        """Yield every claim, in no order."""
         for claims in self.claims.values():
             yield from claims
 
@@ -346,11 +295,8 @@ class Ledger:
 def _counted(
     counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
 ) -> HashTrieMap[str, int]:
-    """Return ``counts`` (:attr:`Ledger.applications_on`) with one application counted anew.
-
-    Of all claims on the application, the first decides where it runs. ``before`` and ``after`` are
-    that claim before and after a change.
-    """
+    # Of all claims on the application, the first decides where it runs. These are the first before
+    # and after a change.
     old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
     for nodes, change in ((old - new, -1), (new - old, 1)):
         for node in nodes:
@@ -360,17 +306,7 @@ def _counted(
 
 
 def index_entries(claim: Claim | None) -> set[Entry]:
-    """Return the index entries of a claim; ``None`` has no entries."""
-    found = set(claim.index_entries()) if claim else set()
+    entries = set(claim.index_entries()) if claim else set()
     if claim and claim.lease:
-        found.add((_ENDS, _minute(claim.lease.expires_at)))
-    return found
-
-
-def _order(key: ClaimKey) -> tuple[str, str, str]:
-    return key.subject.kind.value, key.subject.id, key.demand
-
-
-def _minute(moment: datetime) -> str:
-    """Return the minute of a time, in UTC, as a text that sorts like the time."""
-    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
+        entries.add((_ENDS, minute_of(claim.lease.expires_at)))
+    return entries

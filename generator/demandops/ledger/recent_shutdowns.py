@@ -14,7 +14,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta, timezone
+from datetime import datetime, timedelta
 from itertools import islice
 from typing import Literal, TypeAlias
 
@@ -25,34 +25,34 @@ from demandops import strict_yaml
 from demandops.config.base_model import FrozenModel, parse_file
 from demandops.demand.demand_request import Shutdown
 from demandops.errors import InvalidInput
-from demandops.ledger.claim_file import LEDGER_ROOT, Timestamp, format_timestamp, parse_timestamp
+from demandops.ledger.claim_file import (
+    LEDGER_ROOT,
+    Timestamp,
+    format_timestamp,
+    minute_of,
+    parse_timestamp,
+)
 from demandops.settings import LEDGER_API_VERSION
 
 SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
 
+# how long after a shutdown the same shutdown counts as a repeat, not as a new one
 REMEMBERED = timedelta(minutes=15)
-"""How long after a shutdown the same shutdown counts as a repeat, not as a new one."""
 
+# How old a record must be before forget removes it because of its age. This is longer than
+# REMEMBERED, because a repeat that was received in time may wait in a journal before it is decided.
 _KEPT = timedelta(hours=1)
-"""How old a record must be before :meth:`RecentShutdowns.forget` removes it because of its age.
 
-This is longer than :data:`REMEMBERED`, because a repeat that was received in time may wait in a
-journal before it is decided.
-"""
-
+# How many old records one request removes at most, so that its commit stays small. It adds one
+# record, so old records do not pile up.
 _FORGOTTEN = 10
-"""The highest number of old records that one request removes."""
 
 _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 
 
 @dataclass(frozen=True, slots=True)
 class RecentShutdown:
-    """The record of a shutdown that released something.
-
-    ``digest`` is a hash of the request id and of everything that the shutdown lists. ``at`` is the
-    time at which the shutdown was received.
-    """
+    """The record of a shutdown that released something; ``at`` is when it was received."""
 
     digest: str
     request: str
@@ -61,16 +61,16 @@ class RecentShutdown:
 
     @classmethod
     def of(cls, request: Shutdown, at: datetime) -> RecentShutdown:
-        """Return the record of a shutdown that was received at the time ``at``."""
+        # what is listed twice or in another order is the same shutdown
         listed = {
             (
-                one.held.subject.kind.value,
-                one.held.subject.id,
-                tuple(sorted(set(one.requesters))),
-                one.held.distinguishing_values(),
-                tuple(sorted({words for words, _ in one.held.listed_topics(one.held)})),
+                item.held.subject.kind.value,
+                item.held.subject.id,
+                tuple(sorted(set(item.requesters))),
+                item.held.distinguishing_values(),
+                tuple(sorted({words for words, _ in item.held.listed_topics(item.held)})),
             )
-            for one in request.demanded
+            for item in request.demanded
         }
         exact = json.dumps([request.id, sorted(listed)], ensure_ascii=True)
         digest = hashlib.sha256(exact.encode()).hexdigest()[:20]
@@ -86,29 +86,26 @@ class RecentShutdowns:
     by_minute: _Index = field(default_factory=HashTrieMap)
 
     def earlier(self, shutdown: RecentShutdown) -> RecentShutdown | None:
-        """Return the record of the shutdown that ``shutdown`` repeats, or ``None``.
-
-        A shutdown repeats another one if both have the same digest, request id and requesters, and
-        are at most 15 minutes apart.
-        """
-        known = self.by_digest.get(shutdown.digest)
-        same = known is not None and replace(known, at=shutdown.at) == shutdown
-        return known if known and same and abs(shutdown.at - known.at) <= REMEMBERED else None
+        """Return the record of the shutdown that ``shutdown`` repeats, or ``None``."""
+        record = self.by_digest.get(shutdown.digest)
+        # a person may have written a record that has this digest and other requesters
+        same = record is not None and replace(record, at=shutdown.at) == shutdown
+        return record if record and same and abs(shutdown.at - record.at) <= REMEMBERED else None
 
     def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
         """Return all records, with the one at ``digest`` replaced; ``None`` removes the record."""
-        known = self.by_digest.get(digest)
-        if known == shutdown:
+        old = self.by_digest.get(digest)
+        if old == shutdown:
             return self
         by_digest, by_requester, by_minute = self.by_digest, self.by_requester, self.by_minute
-        if known is not None:
+        if old is not None:
             by_digest = by_digest.remove(digest)
-            by_minute = _removed(by_minute, _minute(known.at), digest)
-            for who in known.requesters:
+            by_minute = _removed(by_minute, minute_of(old.at), digest)
+            for who in old.requesters:
                 by_requester = _removed(by_requester, who, digest)
         if shutdown is not None:
             by_digest = by_digest.insert(digest, shutdown)
-            by_minute = _added(by_minute, _minute(shutdown.at), digest)
+            by_minute = _added(by_minute, minute_of(shutdown.at), digest)
             for who in shutdown.requesters:
                 by_requester = _added(by_requester, who, digest)
         return RecentShutdowns(by_digest, by_requester, by_minute)
@@ -118,11 +115,9 @@ class RecentShutdowns:
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
         """Return the records that are left, and the digests of those that are removed.
 
-        All records that name one of ``requesters`` are removed. Of the records that are older than
-        an hour, the ten oldest are removed.
+        Those are the ten oldest of more than an hour, and all that name one of ``requesters``.
         """
-        first = _minute(now - _KEPT)
-        ended = sorted(one for one in self.by_minute if one < first)
+        ended = sorted(minute for minute in self.by_minute if minute < minute_of(now - _KEPT))
         old = (digest for minute in ended for digest in sorted(self.by_minute[minute]))
         forgotten = {*islice(old, _FORGOTTEN)}
         forgotten |= {digest for who in requesters for digest in self.by_requester.get(who, ())}
@@ -130,10 +125,6 @@ class RecentShutdowns:
         for digest in forgotten:
             left = left.replace(digest, None)
         return left, tuple(sorted(forgotten))
-
-
-def _minute(moment: datetime) -> str:
-    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
 
 
 def _added(index: _Index, key: str, digest: str) -> _Index:
@@ -146,17 +137,14 @@ def _removed(index: _Index, key: str, digest: str) -> _Index:
 
 
 def path_of(digest: str) -> str:
-    """Return the path of the file that records a shutdown."""
     return f"{SHUTDOWNS_ROOT}/{digest[:2]}/{digest}.yaml"
 
 
 def digest_in(path: str) -> str:
-    """Return the digest in the path of a file that records a shutdown."""
     return path.rsplit("/", 1)[-1].removesuffix(".yaml")
 
 
 def text_of(shutdown: RecentShutdown) -> str:
-    """Return the text of the file that records a shutdown."""
     return strict_yaml.dump(
         {
             "apiVersion": LEDGER_API_VERSION,
@@ -185,14 +173,14 @@ def read(text: str, path: str) -> RecentShutdown | None:
     except InvalidInput:
         return None
     requesters = tuple(sorted(set(file.requesters)))  # a person may have listed one twice
-    found = RecentShutdown(file.digest, file.request, requesters, parse_timestamp(file.at))
-    return found if path == path_of(file.digest) else None
+    record = RecentShutdown(file.digest, file.request, requesters, parse_timestamp(file.at))
+    return record if path == path_of(file.digest) else None
 
 
 def read_all(files: Mapping[str, str]) -> RecentShutdowns:
     """Return the records in ``files``, a map from path to text; invalid files are skipped."""
-    found = [one for path, text in files.items() if (one := read(text, path))]
     shutdowns = RecentShutdowns()
-    for one in sorted(found, key=lambda one: one.at):
-        shutdowns = shutdowns.replace(one.digest, one)
+    for path, text in files.items():
+        if record := read(text, path):
+            shutdowns = shutdowns.replace(record.digest, record)
     return shutdowns

@@ -9,7 +9,7 @@ Each waiting demand is one file: ``ledger/waiting/<hh>/<demand>.yaml``.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from typing import Any, Literal, TypeAlias
@@ -36,11 +36,7 @@ WAITING_ROOT = f"{LEDGER_ROOT}/waiting"
 
 @dataclass(frozen=True, slots=True)
 class WaitingDemand:
-    """A demand that waits for room.
-
-    ``goal`` is the demand's goal as plain data. ``since`` is the time when the demand was first
-    received.
-    """
+    """A demand that waits for room; ``since`` is when it was first received."""
 
     demand: str
     request: str
@@ -55,13 +51,13 @@ class WaitingDemand:
         return -self.priority, self.since, self.demand
 
 
+# by demand id
 WaitingDemands: TypeAlias = "HashTrieMap[str, WaitingDemand]"
-"""A map from demand id to waiting demand."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wait(DemandRequest):
-    """The request of a demand that must wait; ``reasons`` say why it must."""
+    """The request of a demand that must wait; ``reasons`` say why."""
 
     waiting: WaitingDemand | None = None
     reasons: tuple[str, ...] = ()
@@ -71,16 +67,14 @@ class Wait(DemandRequest):
 
 def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
     """Return the waiting demands in the order in which the generator tries to book them."""
-    return sorted(waiting.values(), key=lambda one: one.turn)
+    return sorted(waiting.values(), key=lambda demand: demand.turn)
 
 
 def path_of(demand: str) -> str:
-    """Return the path of a waiting demand's file."""
     return f"{WAITING_ROOT}/{naming.hash_of(demand, 2)}/{segment(demand)}.yaml"
 
 
 def text_of(waiting: WaitingDemand) -> str:
-    """Return the text of a waiting demand's file."""
     return strict_yaml.dump(
         {
             "apiVersion": LEDGER_API_VERSION,
@@ -109,8 +103,7 @@ class _WaitingFile(FrozenModel):
 def read(text: str, path: str) -> WaitingDemand | None:
     """Return the waiting demand in a file, or ``None`` if the file is not valid.
 
-    A valid file contains a put of the action ``Demand`` for the demand that the file names, and is
-    at the path of this demand. The put itself may have faults.
+    The put in a valid file may have faults.
     """
     try:
         file = parse_file(_WaitingFile, text, path)
@@ -121,22 +114,15 @@ def read(text: str, path: str) -> WaitingDemand | None:
         return None
     if not isinstance(put, Put) or put.demand != file.demand:
         return None
+    if path != path_of(file.demand):
+        return None
     since = parse_timestamp(file.since)
-    found = WaitingDemand(
+    return WaitingDemand(
         file.demand, file.request, file.requesters, since, file.priority, file.goal
     )
-    return found if path == path_of(file.demand) else None
 
 
 def read_all(files: Mapping[str, str]) -> WaitingDemands:
-    """Return the waiting demands in ``files``, a map from path to text.
-
-    Files that are not valid are skipped.
-    """
-    found = (one for path, text in files.items() if (one := read(text, path)))
-    return HashTrieMap({one.demand: one for one in found})
-
-
-def of_requester(waiting: WaitingDemands, requester: str) -> Iterator[WaitingDemand]:
-    """Yield the waiting demands whose only requester is ``requester``."""
-    return (one for one in waiting.values() if one.requesters == (requester,))
+    """Return the waiting demands in ``files`` (path to text); invalid files are skipped."""
+    demands = (demand for path, text in files.items() if (demand := read(text, path)))
+    return HashTrieMap({each.demand: each for each in demands})

@@ -11,14 +11,11 @@ from demandops.ledger.ledger import Ledger
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """The configuration and the ledger.
-
-    ``overrides`` are the overrides of the configuration that have not ended, in the order in which
-    they apply.
-    """
+    """The configuration and the ledger."""
 
     config: Config
     ledger: Ledger
+    # the overrides that have not ended, in the order in which they apply
     overrides: tuple[Override, ...] = field(init=False, compare=False, repr=False)
 
     def __post_init__(self) -> None:

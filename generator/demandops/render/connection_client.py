@@ -39,6 +39,8 @@ def render(client: Client, config: Config) -> str:
         raise Refused.at("images", message, code=UNSUPPORTED)
     configuration, settings = client.configuration(), client.settings(config)
     check_configuration(kind.word, configuration, client.name)
+    # A client reads these fields only at its start. Their checksum is an annotation of the pod, so
+    # that a change of them restarts the pod, and a change of other fields does not.
     at_start = client.written(client.read_at_start(configuration))
     return engine.text(
         f"connections/{kind.word}/client.yaml.j2",
@@ -62,12 +64,7 @@ def render(client: Client, config: Config) -> str:
 
 
 def check_configuration(kind: str, configuration: dict[str, Any], client: str) -> None:
-    """Check the configuration of a client against the schema of its connection type.
-
-    Raises:
-        InvalidInput: if fields do not match the schema. The error names each of these fields. The
-            cause is a mistake in DemandOps, not in a demand.
-    """
+    """Raise InvalidInput if fields do not match the schema: a mistake in DemandOps itself."""
     schema = data_folder("templates") / "connections" / kind / "schema.json"
     faults = [
         fault(field_path(tuple(error.instance_path)), error.message).within(f"{kind} of {client}")

@@ -20,8 +20,8 @@ import jsonschema_rs
 from demandops import strict_yaml
 from demandops.errors import Fault, InvalidInput, fault, field_path
 
+# whose schemas check the objects of built-in kinds
 KUBERNETES_VERSION = "1.36.0"
-"""The version of Kubernetes whose schemas are used to check objects of built-in kinds."""
 
 OWN_ROOTS = ("bootstrap/", "clusters/", "ledger/")
 
@@ -42,12 +42,9 @@ def check_files(
 ) -> None:
     """Check files that are about to be committed. A file with the text ``None`` is removed.
 
-    ``checkpoint`` is called for each file; it may raise an exception to end the check.
-
     Raises:
-        InvalidInput: if a file is not valid, or if an object of a cluster appears twice. The error
-            lists all faults. Their cause is a mistake in DemandOps or in a template, not in a
-            demand.
+        InvalidInput: if a file is not valid, or if an object of a cluster appears twice. The cause
+            is a mistake in DemandOps or in a template, not in a demand.
     """
     faults: list[Fault] = []
     seen: dict[tuple[str, str, str, str], str] = {}
@@ -65,13 +62,10 @@ def check_files(
 
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
-    """Yield a file's valid documents, and append the faults of its other documents to ``faults``.
-
-    Documents for Flux and Argo CD are yielded without their ``spec``. The ``spec`` needs no check
-    here, because a template of the program writes it, and Helm values were checked when they
-    were computed.
-    """
+    """Yield a file's valid documents, and append the faults of the others to ``faults``."""
     for part in text.split("\n---\n"):
+        # The spec of a document for Flux or Argo CD is not parsed, because nothing reads it here. A
+        # template of the program writes it, and Helm values were checked when they were computed.
         api = _API.search(part)
         of_controller = api is not None and api[1] not in _BUILT_IN
         try:
@@ -101,15 +95,8 @@ def _check_object(
         yield fault("metadata.name", f"{kind} {name} is {where}").within(path)
     seen[identity] = path
     if api in _BUILT_IN:
-        for where, message in _problems(_kind_validator(api, kind), document):
-            yield fault(where, message).within(path)
-
-
-def _problems(validator: Any, instance: object) -> list[tuple[str, str]]:  # noqa: ANN401
-    return [
-        (field_path(tuple(error.instance_path)), error.message)
-        for error in validator.iter_errors(instance)
-    ]
+        for error in _kind_validator(api, kind).iter_errors(document):
+            yield fault(field_path(tuple(error.instance_path)), error.message).within(path)
 
 
 @lru_cache(maxsize=64)
@@ -121,15 +108,14 @@ def _kind_validator(api: str, kind: str) -> Any:  # noqa: ANN401
     folder = Path(package.origin).parent / "kubernetes-json-schema"
     folder = folder / f"v{KUBERNETES_VERSION}-local-strict"
     name = f"{kind.lower()}-{prefix}{version}.json"
-    schema = json.loads((folder / name).read_text())
-    definitions = _definitions(folder)
-    text = json.dumps(schema).replace("/api/_definitions.json#/$defs/", "#/$defs/")
-    return jsonschema_rs.Draft7Validator({**json.loads(text), "$defs": definitions})
+    schema = _with_local_references(folder / name)
+    definitions = _with_local_references(folder / "_definitions.json")["$defs"]
+    return jsonschema_rs.Draft7Validator({**schema, "$defs": definitions})
 
 
-@lru_cache(maxsize=1)
-def _definitions(folder: Path) -> dict[str, Any]:
-    text = (folder / "_definitions.json").read_text()
-    data = json.loads(text.replace("/api/_definitions.json#/$defs/", "#/$defs/"))
-    definitions: dict[str, Any] = data["$defs"]
-    return definitions
+@lru_cache(maxsize=64)  # each kind needs the definitions, which are large
+def _with_local_references(file: Path) -> dict[str, Any]:
+    # the definitions are put into each schema, because no file is at the path that it refers to
+    text = file.read_text().replace("/api/_definitions.json#/$defs/", "#/$defs/")
+    schema: dict[str, Any] = json.loads(text)
+    return schema

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from itertools import dropwhile
 
 from demandops.config.config import Config
 from demandops.config.override import Override, format_time
@@ -18,27 +19,14 @@ from demandops.render.gitops.paths import CLUSTERS_ROOT
 from demandops.templating.values import Evaluate
 
 _START = "# override overrides/"
+# these effects change only a release's comments, which are updated even in a held file
 _OUTSIDE_BODY = frozenset({"hold", "keep"})
-"""The effects of overrides that change only a release's comments, and not the body.
-
-The comments on these effects are updated even in a held file.
-"""
 _UPDATED_COMMENT = re.compile(rf"{_START}[^:]+: (\w+, )*(hold|keep)(, \w+)*; ")
 _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
 def release_text(release: Release, config: Config, evaluate: Evaluate, current: str | None) -> str:
-    """Return the text of a release's file. A held release keeps the body of ``current``.
-
-    Args:
-        release: the release.
-        config: the configuration with which the release was planned.
-        evaluate: computes the values of services.
-        current: the file's text in the state repo; ``None`` if there is no file.
-
-    Raises:
-        Refused, InvalidInput: if the release cannot be rendered.
-    """
+    """Return the text of a release's file, whose text in the state repo is ``current``."""
     shaping = release.shaping
     if not shaping.held:
         comments = [override_comment(override, effects) for override, effects in shaping.by]
@@ -49,9 +37,12 @@ def release_text(release: Release, config: Config, evaluate: Evaluate, current: 
         comments.append(override_comment(override, effects))
     if current is None:
         return _join([*outside, *of_body], manifests.render(release, config, evaluate))
-    comments, body = split_comments(current)
-    frozen = [comment for comment in comments if not _UPDATED_COMMENT.match(comment)]
-    return _join([*outside, *frozen], body)
+    lines = current.splitlines(keepends=True)
+    body = list(dropwhile(lambda line: line.startswith(_START), lines))
+    # overrides that shaped the body when the hold started may have ended, so their comments stay
+    above = (line.rstrip("\n") for line in lines[: len(lines) - len(body)])
+    frozen = [comment for comment in above if not _UPDATED_COMMENT.match(comment)]
+    return _join([*outside, *frozen], "".join(body))
 
 
 def _join(comments: list[str], body: str) -> str:
@@ -59,7 +50,6 @@ def _join(comments: list[str], body: str) -> str:
 
 
 def override_comment(override: Override, effects: tuple[str, ...]) -> str:
-    """Return the comment that names an override and its effects."""
     until = f"until {format_time(override.end)}; " if override.end else ""
     return (
         f"# override {override.path}: {', '.join(effects)}; priority {override.priority}; {until}"
@@ -67,30 +57,16 @@ def override_comment(override: Override, effects: tuple[str, ...]) -> str:
     )
 
 
-def split_comments(text: str) -> tuple[list[str], str]:
-    """Return the comments on overrides at the start of a file, and the file's body below them."""
-    lines = text.splitlines(keepends=True)
-    count = 0
-    while count < len(lines) and lines[count].startswith(_START):
-        count += 1
-    return [line.rstrip("\n") for line in lines[:count]], "".join(lines[count:])
-
-
 def kept_charts(
     files: Mapping[str, str], current: Mapping[str, str], world: World
 ) -> dict[str, str]:
     """Return, by path, the chart sources that stay because a held release may still use them.
 
-    The source of a chart in a folder of the state repo is not kept, because it would fetch the
-    newest version of the folder.
-
-    Args:
-        files: the new generated files.
-        current: the generated files in the state repo.
-        world: the world, whose overrides say whether a release is held.
+    ``files`` are the new generated files, and ``current`` are those in the state repo.
     """
     if not any(override.hold for override in world.overrides):
         return {}
+    # not that of a chart in a folder of the state repo: it would fetch the folder's newest version
     return {
         path: text
         for path, text in current.items()

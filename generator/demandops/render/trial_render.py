@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from datetime import datetime, timezone
 
@@ -26,13 +26,9 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return a map from each appdef to the services' releases that a trial demand for it gives.
+    """Return the services' releases that a trial demand gives, for each appdef.
 
-    Overrides do not apply. Each trial demand names the first suitable node (:func:`_trial_node`).
-    If no node is in an access domain, there are no trial demands, and the map is empty.
-
-    Raises:
-        Refused: if a service cannot be planned.
+    Overrides do not apply. If no node is in an access domain, the map is empty.
     """
     if not config.domain_of:
         return {}
@@ -44,26 +40,12 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
 
 
 def _trial_node(appdef: str, config: Config) -> str:
-    """Return the id of the first node that can run all services of an appdef.
-
-    Without such a node, return the id of the first node.
-    """
+    """Return the first node that can run all services of an appdef, else the first of all."""
     services = config.services.get(appdef, {}).values()
     nodes = sorted(config.domain_of)
-    fitting = (n for n in nodes if all(n in one.runs_at for one in services if one.nodes))
+    # a service that runs once for a cluster has no node in other clusters
+    fitting = (node for node in nodes if all(node in s.runs_at for s in services if s.nodes))
     return next(fitting, nodes[0])
-
-
-def _other_versions(
-    config: Config, trials: Mapping[str, list[ServiceRelease]]
-) -> Iterator[ServiceRelease]:
-    """Yield the releases of a trial demand for each listed version except the default version."""
-    plain = replace(config, overrides={})
-    for name, listed in config.versions.items() if trials else ():
-        node = _trial_node(name, config)
-        for version in listed.versions:
-            if version != listed.default:
-                yield from _services(config.appdefs[name], node, plain, version)
 
 
 def _services(
@@ -85,11 +67,9 @@ def _services(
 def overridden_releases(
     override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield the trial releases that an override may select, changed by the override.
-
-    The effect ``hold`` is left out.
-    """
+    """Yield the trial releases that an override may select, changed by the override."""
     for release in trials:
+        # ``hold`` would keep a file that no trial has
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
         if effects and any(
             not selector.connections and selector.takes(release.key.service, appdef)
@@ -103,11 +83,8 @@ def overridden_releases(
 def render_trial_demands(world: World, evaluate: Evaluate) -> None:
     """Render every service of every appdef, with invented claims on a real node.
 
-    So each appdef is checked before its first demand. A service is rendered for each version that
-    ``registry/versions.yaml`` lists, and with each override that is in effect. If at least one of
-    the appdefs that an override affects can be rendered, the override counts as valid. Overrides
-    are checked only if everything can be rendered without them. If no node is in an access domain,
-    nothing is checked.
+    A service is rendered for each version that ``registry/versions.yaml`` lists, and with each
+    override that is in effect. If no node is in an access domain, nothing is checked.
 
     Raises:
         Refused, InvalidInput: if a service cannot be planned or rendered. The error names the
@@ -115,18 +92,30 @@ def render_trial_demands(world: World, evaluate: Evaluate) -> None:
         OverLimit: if nothing is known to be wrong, but some of it took too long to render.
     """
     config = world.config
-    invented = trial_releases(config)
+    trials = trial_releases(config)
+    plain = replace(config, overrides={})
+    others = (
+        release
+        for appdef, listed in (config.versions.items() if trials else ())
+        for version in listed.versions
+        if version != listed.default
+        for release in _services(
+            config.appdefs[appdef], _trial_node(appdef, config), plain, version
+        )
+    )
     errors = [
         error
-        for releases in (*invented.values(), _other_versions(config, invented))
+        for releases in (*trials.values(), others)
         for error in _render_errors(releases, config, evaluate)
     ]
+    # only if all can be rendered without overrides: else a broken template would blame them
     for override in () if errors else world.overrides:
         overridden = [
             list(overridden_releases(override, releases, appdef, config))
-            for appdef, releases in invented.items()
+            for appdef, releases in trials.items()
         ]
         failed = [_render_errors(releases, config, evaluate) for releases in overridden if releases]
+        # an override that can be rendered for one of the appdefs may be meant for that one only
         if failed and all(failed):
             errors += failed[0]
     if errors:
@@ -139,7 +128,7 @@ def _render_errors(
     releases: Iterable[ServiceRelease], config: Config, evaluate: Evaluate
 ) -> list[InvalidInput]:
     errors: list[InvalidInput] = []
-    late = set[str]()
+    late = set[str]()  # a template that takes too long is tried only once
     for release in releases:
         if config.values_template(release.service) in late:
             continue

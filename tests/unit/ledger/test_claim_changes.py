@@ -15,7 +15,6 @@ from demandops.demand.demand_request import (
     Join,
     Release,
     Shutdown,
-    place_in,
 )
 from demandops.demand.lease import Term
 from demandops.errors import Refused
@@ -28,7 +27,7 @@ HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
 
 
 def item(*requesters: str) -> tuple[Demanded, ...]:
-    return (Demanded(HELD, requesters, place_in("connections[0]"), Term(60)),)
+    return (Demanded(HELD, requesters, "connections[0].{}".format, Term(60)),)
 
 
 def applied(ledger: Ledger, request: DemandRequest, minutes: int) -> tuple[Ledger, Changes]:

@@ -15,7 +15,7 @@ from demandops.connections.ros import ROS
 from demandops.connections.route import Route, merged_routes
 from demandops.connections.zenoh import ZENOH
 from demandops.demand.claim import Claim, demand_id
-from demandops.demand.demand_request import Demanded, Join, place_in
+from demandops.demand.demand_request import Demanded, Join
 from demandops.errors import InvalidInput, Refused
 from demandops.ledger import claim_file
 from demandops.ledger.apply import apply
@@ -32,7 +32,7 @@ def claim(*routes: Route) -> Claim:
 
 def joined(ledger: Ledger, *routes: Route, who: str = "v", **more: Any) -> Ledger:
     asked = replace(Connection("c", MQTT, "s", "t", "", routes), **more)
-    request = Join("r", (Demanded(asked, (who,), place_in("connections[0]")),))
+    request = Join("r", (Demanded(asked, (who,), "connections[0].{}".format),))
     return apply(ledger, request, NOW)[0]
 
 

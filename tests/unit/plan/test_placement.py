@@ -16,7 +16,7 @@ from demandops.config.load import load
 from demandops.config.policy import AccessDomain, Rule
 from demandops.decision import Decision
 from demandops.demand.application import Application, InputTopic, Requirement
-from demandops.demand.demand_request import Demanded, Put, place_in
+from demandops.demand.demand_request import Demanded, Put
 from demandops.ledger.ledger import Ledger
 from demandops.ledger.operations.put import put as book
 from demandops.ledger.world import World
@@ -87,7 +87,7 @@ def demand(random: Random, demand: str = "d", application: str = "app") -> Put:
             capabilities=tuple(c for c in CAPABILITIES if random.random() < 0.3),
         ),
     )
-    one = Demanded(app, ("vehicle0",), place_in("applications[0]"))
+    one = Demanded(app, ("vehicle0",), "applications[0].{}".format)
     return Put(id=demand, demand=demand, own_requesters=("vehicle0",), demanded=(one,))
 
 

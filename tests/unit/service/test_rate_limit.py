@@ -7,7 +7,7 @@ from datetime import datetime, timedelta, timezone
 from demandops.config.config import Config
 from demandops.config.load import load
 from demandops.demand.application import Application
-from demandops.demand.demand_request import Demanded, Join, place_in
+from demandops.demand.demand_request import Demanded, Join
 from demandops.service.timing.rate_limit import RateLimit
 
 from tests.kit.config import configuration, edited
@@ -22,7 +22,7 @@ def limited(most: int) -> Config:
 
 def request(requester: str) -> Join:
     app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
-    return Join("one", (Demanded(app, (requester,), place_in("applications[0]")),))
+    return Join("one", (Demanded(app, (requester,), "applications[0].{}".format),))
 
 
 class Sending:

@@ -44,7 +44,7 @@ def faults_of_demand(
     data = filled(template.data, _SAMPLE)
     if template.action == "demand":
         fixed = [name for name in ("apiVersion", "kind", "operation") if name in data]
-        malformed = demand_goal.form_faults({**_HEAD, **data})
+        malformed = demand_goal.parse({**_HEAD, **data})[1]
     else:
         fixed = ["shutdown"] if "shutdown" in data else []
         malformed = deployment_request_goal.form_faults(data)

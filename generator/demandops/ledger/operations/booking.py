@@ -12,7 +12,7 @@ from demandops.ledger.ledger import Ledger
 
 def book(
     ledger: Ledger,
-    one: Demanded,
+    item: Demanded,
     request: str,
     key: ClaimKey,
     current: Claim | None,
@@ -22,23 +22,15 @@ def book(
 ) -> Ledger:
     """Return the ledger with a claim on a demanded application or connection.
 
-    Args:
-        ledger: the claims.
-        one: what to book.
-        request: the id of the request.
-        key: the key of the claim.
-        current: the demand's claim on the same subject so far, or ``None``.
-        now: when the request was received. A claim of which at most the lease changes keeps its
-            booking time.
-        joined: whether a join books the claim; a join also keeps what ``current`` holds.
+    ``current`` is the demand's claim on the same subject so far. A join keeps what it holds.
     """
     claim = Claim(
-        held=one.held.booked(),
+        held=item.held.booked(),
         demand=key.demand,
         request=request,
-        requesters=tuple(sorted(set(one.requesters))),
+        requesters=tuple(sorted(set(item.requesters))),
         booked=now,
-        lease=renewed(current.lease if current else None, one.term, now),
+        lease=renewed(current.lease if current else None, item.term, now),
         joined=joined,
     )
     if joined and current:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 
 from demandops.connections import route as routes
 from demandops.connections.connection import Connection
-from demandops.connections.route import Route
 from demandops.demand.application import Application
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Demanded
@@ -14,109 +13,98 @@ from demandops.errors import Fault
 from demandops.ledger.ledger import Ledger
 
 
-def conflicts(one: Demanded, ledger: Ledger, *, above: bool = False) -> Iterator[Fault]:
+def conflicts(item: Demanded, ledger: Ledger, *, above: bool = False) -> Iterator[Fault]:
     """Yield the faults of a demanded application or connection that contradicts claims on it.
 
-    With ``above``, the messages say that ``one`` contradicts an earlier item of the same request.
+    With ``above``, the messages say that ``item`` contradicts an earlier item of the same request.
     """
-    if isinstance(one.held, Application):
-        yield from _of_application(one, one.held, ledger, above)
+    if isinstance(item.held, Application):
+        yield from _application_conflicts(item, item.held, ledger, above)
     else:
-        yield from _of_connection(one, one.held, ledger, above)
+        yield from _connection_conflicts(item, item.held, ledger, above)
 
 
 def _contradicts(above: bool) -> str:
     return f"contradicts {'an item above' if above else 'an existing claim'}"
 
 
-def _held(id: str, requesters: Iterable[str], above: bool) -> str:
-    return f"'{id}' is {'listed for' if above else 'held by'} {', '.join(requesters)}"
+def _held(claim: Claim, above: bool) -> str:
+    holders = ", ".join(claim.requesters)
+    return f"'{claim.held.id}' is {'listed for' if above else 'held by'} {holders}"
 
 
-def _of_application(
-    one: Demanded, app: Application, ledger: Ledger, above: bool
+def _application_conflicts(
+    item: Demanded, app: Application, ledger: Ledger, above: bool
 ) -> Iterator[Fault]:
+    # all claims on an application agree about its node and type, so the first speaks for all
     claim = ledger.first_claim(app.subject)
     if claim is None:
         return
-    held, known = _held(app.id, claim.requesters, above), claim.application
+    booked = claim.application
     wait = "" if above else ", or wait until the application is released"
     for name, new, current, holding, remedy in (
-        (
-            "node",
-            app.node,
-            known.node,
-            "on",
-            f"request node '{known.node}'{wait}",
-        ),
-        ("appdef", app.appdef, known.appdef, "as", "use another application id"),
+        ("node", app.node, booked.node, "on", f"request node '{booked.node}'{wait}"),
+        ("appdef", app.appdef, booked.appdef, "as", "use another application id"),
     ):
         if new != current:
-            yield one.fault(
-                name,
-                f"'{new}' {_contradicts(above)}: {held} {holding} '{current}'; {remedy}",
-                code="conflict",
+            message = (
+                f"'{new}' {_contradicts(above)}: {_held(claim, above)} {holding} '{current}'; "
+                f"{remedy}"
             )
+            yield item.fault(name, message, code="conflict")
             return
 
 
-def _of_connection(
-    one: Demanded, demanded: Connection, ledger: Ledger, above: bool
+def _connection_conflicts(
+    item: Demanded, demanded: Connection, ledger: Ledger, above: bool
 ) -> Iterator[Fault]:
     for claim in ledger.connection_claims(demanded.id):
-        held, known = _held(demanded.id, claim.requesters, above), claim.connection
+        booked = claim.connection
         for name, new, current in (
-            ("type", str(demanded.type), str(known.type)),
-            ("source", demanded.source, known.source),
-            ("target", demanded.target, known.target),
-            ("broker", demanded.broker, known.broker),
+            ("type", str(demanded.type), str(booked.type)),
+            ("source", demanded.source, booked.source),
+            ("target", demanded.target, booked.target),
+            ("broker", demanded.broker, booked.broker),
         ):
+            # a broker that only one of the two names is no contradiction
             if new == current or (name == "broker" and not (new and current)):
                 continue
-            yield one.fault(
-                name,
-                f"'{new}' {_contradicts(above)}: {held} with {name} '{current}'; use "
-                f"the same {name}, or another connection id",
-                code="conflict",
+            message = (
+                f"'{new}' {_contradicts(above)}: {_held(claim, above)} with {name} '{current}'; "
+                f"use the same {name}, or another connection id"
             )
+            yield item.fault(name, message, code="conflict")
             return
-        yield from _of_routes(one, demanded, claim, held, above)
+        yield from _route_conflicts(item, demanded, claim, above)
 
 
-def _of_routes(
-    one: Demanded, demanded: Connection, claim: Claim, held: str, above: bool
+def _route_conflicts(
+    item: Demanded, demanded: Connection, claim: Claim, above: bool
 ) -> Iterator[Fault]:
+    held = _held(claim, above)
     by_source = {route.source: route for route in claim.connection.topics}
     carried_back = {route.target: route for route in claim.connection.topics if route.reverse}
     for index, route in enumerate(demanded.topics):
         where, current = f"topics[{index}]", by_source.get(route.source)
-        if current is not None:
-            yield from _of_route(one, where, route, current, held, above)
-        elif route.reverse and (other := carried_back.get(route.target)):
-            yield one.fault(
-                f"{where}.target",
-                f"connection {held} and already carries '{route.target}' back to "
-                f"'{other.source}'; a connection carries a target topic back to only one source "
-                "topic, so use a second connection",
-                code="conflict",
+        if current is None:
+            if route.reverse and (other := carried_back.get(route.target)):
+                message = (
+                    f"connection {held} and already carries '{route.target}' back to "
+                    f"'{other.source}'; a connection carries a target topic back to only one "
+                    "source topic, so use a second connection"
+                )
+                yield item.fault(f"{where}.target", message, code="conflict")
+            continue
+        if current.target != route.target:
+            message = (
+                f"connection {held} and already carries '{route.source}' to '{current.target}'; a "
+                "connection carries a source topic to only one target topic, so use a second "
+                "connection"
             )
-
-
-def _of_route(
-    one: Demanded, where: str, route: Route, current: Route, held: str, above: bool
-) -> Iterator[Fault]:
-    if current.target != route.target:
-        yield one.fault(
-            f"{where}.target",
-            f"connection {held} and already carries '{route.source}' to '{current.target}'; a "
-            "connection carries a source topic to only one target topic, so use a second "
-            "connection",
-            code="conflict",
-        )
-    for name, old, new in routes.contradictions(current, route):
-        yield one.fault(
-            f"{where}.{name}",
-            f"{name} {new} of '{route.source}' {_contradicts(above)}: {held} with "
-            f"{name} {old}; use the same {name}, or a second connection",
-            code="conflict",
-        )
+            yield item.fault(f"{where}.target", message, code="conflict")
+        for name, old, new in routes.contradictions(current, route):
+            message = (
+                f"{name} {new} of '{route.source}' {_contradicts(above)}: {held} with "
+                f"{name} {old}; use the same {name}, or a second connection"
+            )
+            yield item.fault(f"{where}.{name}", message, code="conflict")

@@ -9,26 +9,18 @@ release the claims.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from datetime import datetime
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Decommission
-from demandops.errors import Fault, Refused, fault, suggestion
+from demandops.errors import Refused, suggestion
 from demandops.ledger.claim_changes import Changes, claim_changes
 from demandops.ledger.ledger import Ledger
-from demandops.ledger.waiting import of_requester
 from demandops.subject import Subject, SubjectKind
 
 
 def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger after a node or requester is decommissioned, and the changes.
-
-    If a requester is decommissioned, waiting demands that have no other requester are removed.
-
-    Raises:
-        Refused: if there is no claim to release or reduce, and no waiting demand to remove.
-    """
+    """Return the ledger after a node or requester is decommissioned, and the changes."""
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)
     if "node" in request.kinds:
@@ -37,12 +29,24 @@ def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[
     if "requester" in request.kinds:
         held = ledger.claims_of_requester(request.id)
         claims |= {f"{c.subject} {c.demand}": c for c in held}
-        waiting = tuple(one.demand for one in of_requester(ledger.waiting, request.id))
+        # a waiting demand that names others too stays, because they can still release it
+        demands = ledger.waiting.values()
+        waiting = tuple(each.demand for each in demands if each.requesters == (request.id,))
     for claim in claims.values():
-        ledger = ledger.replace(claim.key, _reduced(claim, request, nodes))
+        left: Claim | None = claim
+        if "requester" in request.kinds and request.id in claim.requesters:
+            left = None
+        for node in nodes:
+            left = left.without_node(node) if left and left.held.needs(node) else left
+        ledger = ledger.replace(claim.key, left)
     changes = claim_changes(start, ledger, [claim.key for claim in claims.values()])
     if not changes and not waiting:
-        raise Refused([_nothing_held(start, request)])
+        names = start.indexed_names("requester") if "requester" in request.kinds else set()
+        if "node" in request.kinds:
+            names |= start.indexed_names("node") | start.indexed_names("link")
+        kinds = " or ".join(sorted(request.kinds))
+        message = f"no claim names a {kinds} '{request.id}'{suggestion(request.id, names)}"
+        raise Refused.at("name", message, code="not-held")
     return ledger.without_waiting(waiting), Changes(claims=changes, waiting=waiting)
 
 
@@ -56,25 +60,3 @@ def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
         for claim in ledger.claims_on(subject)
         if claim.held.needs(node)
     ]
-
-
-def _reduced(claim: Claim, request: Decommission, nodes: Iterable[str]) -> Claim | None:
-    if "requester" in request.kinds and request.id in claim.requesters:
-        return None
-    left: Claim | None = claim
-    for node in nodes:
-        left = left.without_node(node) if left and left.held.needs(node) else left
-    return left
-
-
-def _nothing_held(ledger: Ledger, request: Decommission) -> Fault:
-    names = [ledger.indexed_names("requester")] if "requester" in request.kinds else []
-    names += (
-        [ledger.indexed_names("node"), ledger.indexed_names("link")]
-        if "node" in request.kinds
-        else []
-    )
-    kinds = " or ".join(sorted(request.kinds))
-    close = suggestion(request.id, {name for found in names for name in found})
-    message = f"no claim names a {kinds} '{request.id}'{close}"
-    return fault("name", message, code="not-held")

@@ -9,13 +9,7 @@ from demandops.ledger.operations.ownership import is_waiting, owned_claims
 
 
 def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
-    """Return the ledger without the claims of a demand, and the changes.
-
-    If the demand waits for room, it stops waiting.
-
-    Raises:
-        Refused: if the demand neither holds anything nor waits, or belongs to other requesters.
-    """
+    """Return the ledger in which a demand holds nothing and does not wait, and the changes."""
     waited = (request.demand,) * is_waiting(ledger, request)
     held = ledger.claims_of_demand(request.demand) if waited else owned_claims(ledger, request)
     after = ledger.without(held).without_waiting(waited)

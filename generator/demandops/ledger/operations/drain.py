@@ -17,14 +17,12 @@ from demandops.ledger.ledger import Ledger
 class Drain(DemandRequest):
     """The generator's request to move what it placed on the drained node ``id``.
 
-    ``moves`` are the changes of claims. ``moved`` has a text about each application or service that
-    moves. ``stays`` has a text about each application or service that cannot move.
-
-    A drain looks only for so many nodes. It begins with the application that follows ``after`` in
-    the order of ids. If applications are left for another drain, ``last`` is the last one before
-    them; otherwise it is empty.
+    ``moved`` and ``stays`` have a text about each application or service that moves or cannot move.
     """
 
+    # One drain looks only for so many nodes, because demands wait meanwhile. It begins with the
+    # application that follows ``after`` in the order of ids. If some are left for another drain,
+    # ``last`` is the last one before them.
     after: str = ""
     last: str = ""
     moves: tuple[ClaimChange, ...] = ()
@@ -35,7 +33,6 @@ class Drain(DemandRequest):
 
 
 def drain(ledger: Ledger, request: Drain) -> tuple[Ledger, Changes]:
-    """Apply the moves of a drain; return the ledger and the changes."""
     start = ledger
     for move in request.moves:
         ledger = ledger.replace(move.key, move.after)

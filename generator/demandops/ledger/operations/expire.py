@@ -10,10 +10,6 @@ from demandops.ledger.ledger import Ledger
 
 
 def expire(ledger: Ledger, request: Expire, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger without those claims of a demand whose lease has ended, and the changes.
-
-    Other claims of the demand stay.
-    """
     held = ledger.claims_of_demand(request.demand)
     ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]
     after = ledger.without(ended)

@@ -13,14 +13,8 @@ from demandops.ledger.operations.ownership import is_waiting, owned_claims
 
 
 def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger with each lease of a demand renewed for its term, and the changes.
-
-    Claims without a lease stay as they are. Nothing changes for a waiting demand, because it has no
-    lease yet.
-
-    Raises:
-        Refused: if the demand neither holds anything nor waits, or belongs to other requesters.
-    """
+    """Return the ledger with each lease of a demand renewed for its term, and the changes."""
+    # a demand that waits has no lease yet, but its client may renew it already
     if is_waiting(ledger, request) and not ledger.claims_of_demand(request.demand):
         return ledger, Changes()
     start = ledger

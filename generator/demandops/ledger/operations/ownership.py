@@ -10,15 +10,13 @@ from collections.abc import Iterable
 
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import DemandRequest
-from demandops.errors import Refused, fault
+from demandops.errors import Refused
 from demandops.ledger.ledger import Ledger
 
 
 def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
-    """Return whether the request's demand waits for room.
-
-    Raises:
-        Refused: if the demand waits and belongs to other requesters.
+    """Return whether the request's demand waits; raise :class:`Refused` if it is of other
+    requesters.
     """
     waiting = ledger.waiting.get(request.demand)
     if waiting is not None:
@@ -27,11 +25,7 @@ def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
 
 
 def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
-    """Return the claims of the request's demand.
-
-    Raises:
-        Refused: if the demand holds nothing or belongs to other requesters.
-    """
+    """Return the claims of the demand; raise Refused if it holds none or is of others."""
     held = ledger.claims_of_demand(request.demand)
     if not held:
         demands = sorted(
@@ -42,10 +36,11 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
                 if claim.keeping_override is None
             }
         )
-        never = "the demand has ended, or was never booked; see 'demandops log'"
-        known = f"the requesters of this request hold, for example, {', '.join(demands[:5])}"
-        message = f"'{request.demand}' holds nothing; {known if demands else never}"
-        raise Refused([fault("demand", message, code="not-held")])
+        hint = "the demand has ended, or was never booked; see 'demandops log'"
+        if demands:
+            hint = f"the requesters of this request hold, for example, {', '.join(demands[:5])}"
+        message = f"'{request.demand}' holds nothing; {hint}"
+        raise Refused.at("demand", message, code="not-held")
     refuse_other_owners(held, request)
     return held
 
@@ -62,4 +57,4 @@ def _refuse_others(owners: Iterable[str], request: DemandRequest) -> None:
             f"'{request.demand}' is a demand of {', '.join(owners)}; name one of them, or choose "
             "another demand id"
         )
-        raise Refused([fault("demand", message, code="not-yours")])
+        raise Refused.at("demand", message, code="not-yours")

@@ -15,12 +15,7 @@ from demandops.ledger.operations.ownership import is_waiting, refuse_other_owner
 
 
 def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger in which the demand holds only what ``request`` lists, and the changes.
-
-    Raises:
-        Refused: if the demand belongs to other requesters, conflicts with other demands, or lists
-            an application or a connection twice.
-    """
+    """Return the ledger in which the demand holds only what ``request`` lists, and the changes."""
     start, demand = ledger, request.demand
     held = ledger.claims_of_demand(demand)
     refuse_other_owners(held, request)
@@ -29,13 +24,13 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
     ledger = others = ledger.without(held)
     faults: list[Fault] = []
     keys = [claim.key for claim in held]
-    for one in request.demanded:
-        faults += conflicts(one, others)
-        key = ClaimKey(one.held.subject, demand)
+    for item in request.demanded:
+        faults += conflicts(item, others)
+        key = ClaimKey(item.held.subject, demand)
         if ledger.get(key) is not None:
             message = f"'{key.subject.id}' is listed twice; list it once, with all its topics"
-            faults.append(one.fault("id", message))
-        ledger = book(ledger, one, request.id, key, start.get(key), now)
+            faults.append(item.fault("id", message))
+        ledger = book(ledger, item, request.id, key, start.get(key), now)
         keys.append(key)
     if faults:
         raise Refused(faults)

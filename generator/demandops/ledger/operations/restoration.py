@@ -1,7 +1,6 @@
 """A restoration books the claims of an earlier commit again.
 
-A restoration undoes newer claims only if the request says so. A restored lease runs for its full
-term from now on, because its old end may have passed. After a restoration, as after every change,
+A restoration undoes newer claims only if the request says so. Afterwards, as after every change,
 :mod:`demandops.plan.overrides.claim_overrides` updates the claims that overrides keep.
 """
 
@@ -14,7 +13,7 @@ from datetime import datetime
 from demandops.demand import admission, permission
 from demandops.demand.claim import Claim
 from demandops.demand.demand_request import Demanded, DemandRequest, Put
-from demandops.demand.lease import Lease, Term
+from demandops.demand.lease import Term
 from demandops.errors import Fault, Refused, fault
 from demandops.ledger.claim_changes import Changes, ClaimChange, claim_changes
 from demandops.ledger.claim_file import path_of
@@ -26,12 +25,7 @@ _SHOWN = 20
 
 @dataclass(frozen=True, slots=True)
 class Restoration(DemandRequest):
-    """A request to restore the ledger of an earlier commit.
-
-    ``to`` is the earlier commit, ``made`` is its time, and ``claims`` are the claims of its ledger.
-    ``drop_newer`` says that newer claims are undone. ``by`` and ``email`` name the person who
-    requests the restoration.
-    """
+    """A person's request to restore the claims of the commit ``to``, which was made at ``made``."""
 
     to: str = ""
     made: datetime | None = None
@@ -47,20 +41,22 @@ class Restoration(DemandRequest):
 def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger with the claims of the earlier commit, and the changes.
 
-    A restored claim gets its whole lease from ``now``.
-
     Raises:
         Refused: if the restoration drops or changes a claim of the present ledger, and
             ``drop_newer`` is not set. Claims that overrides keep, and renewals, do not count.
     """
     changes = _changes(ledger, request)
-    if not request.drop_newer:
-        newer = [c for c in changes if c.before is not None and c.before.keeping_override is None]
-        if newer:
-            raise Refused(_newer_faults(newer))
+    # claims that overrides keep do not count, because they are made again
+    newer = [c for c in changes if c.before is not None and c.before.keeping_override is None]
+    if newer and not request.drop_newer:
+        raise Refused(_newer_faults(newer))
     start = ledger
     for change in changes:
-        ledger = ledger.replace(change.key, _with_full_lease(change, now))
+        claim = change.after
+        if claim and claim.lease:  # from now on, because its old end may have passed
+            lease = Term(claim.lease.seconds, claim.lease.slack).lease_from(now)
+            claim = replace(claim, lease=lease)
+        ledger = ledger.replace(change.key, claim)
     booked = {who for change in changes if change.after for who in change.after.requesters}
     shutdowns, forgotten = start.shutdowns.forget(now, booked)
     return replace(ledger, shutdowns=shutdowns), Changes(
@@ -70,32 +66,20 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    """Return the changes of claims that restore the earlier commit, sorted by path.
-
-    A claim stays as it is if the earlier claim differs only in the length or the end of the lease.
-    """
-    restored = {claim.key: claim for claim in request.claims}
-    gone = [ClaimChange(claim, None) for claim in ledger if claim.key not in restored]
-    back = [ClaimChange(ledger.get(key), claim) for key, claim in restored.items()]
-    back = [change for change in back if not _same(change.before, change.after)]
-    return sorted([*gone, *back], key=lambda change: path_of(change.key))
-
-
-def _same(one: Claim | None, other: Claim | None) -> bool:
-    if one is None or other is None:
-        return one is other
-    if one.keeping_override is not None:  # the booking time of a kept claim does not matter
-        one = replace(one, booked=other.booked)
-    return replace(one, lease=other.lease) == other and bool(one.lease) == bool(other.lease)
-
-
-def _with_full_lease(change: ClaimChange, now: datetime) -> Claim | None:
-    claim = change.after
-    if claim is None or claim.lease is None:
-        return claim
-    term = Term(claim.lease.seconds, claim.lease.slack)
-    lease: Lease = term.lease_from(now)
-    return replace(claim, lease=lease)
+    """Return the changes of claims that restore the earlier commit, sorted by path."""
+    earlier = {claim.key: claim for claim in request.claims}
+    changes = [ClaimChange(claim, None) for claim in ledger if claim.key not in earlier]
+    for key, claim in earlier.items():
+        current = ledger.get(key)
+        if current is not None:
+            # a renewal is no change, and neither is a claim that an override kept at another time
+            is_kept = current.keeping_override is not None
+            booked = claim.booked if is_kept else current.booked
+            same_lease = bool(current.lease) == bool(claim.lease)
+            if same_lease and replace(current, booked=booked, lease=claim.lease) == claim:
+                continue
+        changes.append(ClaimChange(current, claim))
+    return sorted(changes, key=lambda change: path_of(change.key))
 
 
 def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
@@ -115,25 +99,18 @@ def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
 
 
 def faults(request: Restoration, world: World) -> Iterator[Fault]:
-    """Yield the faults of claims that the restoration changes or books.
-
-    There is a fault if the current configuration does not allow the claim. Claims that overrides
-    keep are not checked.
-    """
+    """Yield a fault for each claim to restore that the current configuration does not allow."""
     for change in _changes(world.ledger, request):
         after = change.after
         if after is None or after.keeping_override is not None:
             continue
-        booking = request_for(after)
-        for found in (
-            *admission.faults(booking, world.config),
-            *permission.faults(booking, world.config),
-        ):
-            yield found.within(path_of(change.key))
+        booking, config = request_for(after), world.config
+        for each in (*admission.faults(booking, config), *permission.faults(booking, config)):
+            yield each.within(path_of(change.key))
 
 
 def request_for(claim: Claim) -> Put:
-    """Return a request that books this claim; its faults are located at fields of the claim."""
+    """Return a request that books this claim; its faults name fields of the claim."""
     return Put(
         id=claim.request,
         demanded=(Demanded(claim.held, claim.requesters, str),),

@@ -27,24 +27,26 @@ from demandops.subject import TopicKey
 
 
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger without the holds that a shutdown lists, and the changes.
-
-    If the ledger has a record of the same shutdown from the last 15 minutes, nothing changes.
-
-    Raises:
-        Refused: if the requesters have none of the listed holds.
-    """
+    """Return the ledger without the holds that a shutdown lists, and the changes."""
     record = RecentShutdown.of(request, now)
     repeats = ledger.shutdowns.earlier(record)
     if repeats is not None:
         return ledger, Changes(repeats=repeats)
     start, not_held = ledger, list[str]()
     taken: dict[tuple[ClaimKey, str], set[TopicKey]] = {}
-    for one in request.demanded:
-        for requester in one.requesters:
+    for item in request.demanded:
+        own = demand_id(request.id, item.requesters)
+        for requester in item.requesters:
             # look in the ledger before the request, so that a topic listed twice is taken once
-            claims = _claims_meant(start, request, one, requester)
-            for words, claim, held in _holds(one, requester, claims):
+            claims = sorted(
+                (
+                    claim
+                    for claim in start.claims_held_by(requester, item.held.subject)
+                    if claim.joined and claim.held.matches_listed(item.held)
+                ),
+                key=lambda c: (c.demand != own, c.request != request.id, c.booked, c.demand),
+            )
+            for words, claim, held in _holds(item, requester, claims):
                 if claim is None:
                     not_held.append(words)
                 else:
@@ -64,35 +66,21 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
     )
 
 
-def _claims_meant(ledger: Ledger, request: Shutdown, one: Demanded, requester: str) -> list[Claim]:
-    """Return the requester's claims that an item of a shutdown may mean, the likeliest first."""
-    own = demand_id(request.id, one.requesters)
-    claims = ledger.claims_held_by(requester, one.held.subject)
-    return sorted(
-        (claim for claim in claims if claim.joined and claim.held.matches_listed(one.held)),
-        key=lambda c: (c.demand != own, c.request != request.id, c.booked, c.demand),
-    )
-
-
 def _holds(
-    one: Demanded, requester: str, claims: list[Claim]
+    item: Demanded, requester: str, claims: list[Claim]
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
     """Yield (text, claim, keys) for each topic that a shutdown lists.
 
-    ``text`` describes the listed topic. ``claim`` is the first claim in which the requester holds a
-    matching topic, or ``None``. ``keys`` are the keys of the matching topics that the requester
-    holds in ``claim``.
-
-    If no topic is listed or ``claims`` is empty, yield once: ``text`` describes the subject,
-    ``claim`` is the first of ``claims`` or ``None``, and ``keys`` has all its topics.
+    ``claim`` is the first in which the requester holds matching topics, whose keys are ``keys``.
     """
-    subject = one.held.subject
-    listed = [words for words, _ in one.held.listed_topics(one.held)]
+    subject = item.held.subject
+    listed = [words for words, _ in item.held.listed_topics(item.held)]
+    # who lists no topic means all of the first claim
     if not claims or not listed:
         first = next(iter(claims), None)
         yield f"{subject} for {requester}", first, list(first.held.topic_keys()) if first else []
         return
-    by_claim = [(claim, dict(claim.held.listed_topics(one.held))) for claim in claims]
+    by_claim = [(claim, dict(claim.held.listed_topics(item.held))) for claim in claims]
     for words in listed:
         for claim, meant in by_claim:
             held = [topic for topic in meant[words] if requester in claim.holders(topic)]
@@ -103,15 +91,14 @@ def _holds(
             yield f"{subject}: {words} for {requester}", None, []
 
 
-def _origin(claim: Claim) -> str:
-    if claim.joined:
-        return f"request '{claim.request}'"
-    return f"demand '{claim.demand}', which a shutdown cannot end"
-
-
 def _nothing_held(ledger: Ledger, request: Shutdown) -> Fault:
+    def origin(claim: Claim) -> str:
+        if claim.joined:
+            return f"request '{claim.request}'"
+        return f"demand '{claim.demand}', which a shutdown cannot end"
+
     near = [
-        f"{claim.subject} for {', '.join(claim.requesters)} ({_origin(claim)})"
+        f"{claim.subject} for {', '.join(claim.requesters)} ({origin(claim)})"
         for subject in request.subjects()
         for claim in ledger.claims_on(subject)
     ] or [

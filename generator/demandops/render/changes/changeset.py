@@ -6,6 +6,7 @@ A file whose text stays the same is not in the changeset, so an unchanged releas
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
@@ -15,11 +16,12 @@ from demandops.config.repo_settings import ROOT_FILE
 from demandops.errors import OverLimit, Refused, fault
 from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
 from demandops.ledger.claim_changes import Changes
+from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.checks import name_clash
 from demandops.plan.planner import plan
 from demandops.plan.release import Release, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey
+from demandops.plan.release_keys import ReleaseKey, all_keys
 from demandops.quoting import one_line
 from demandops.render import release_file
 from demandops.render.gitops import manifests
@@ -29,19 +31,16 @@ from demandops.templating.values import Evaluate
 
 Change = Literal["start", "change", "stop"]
 
+# the order in which lists of changes show them
 CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
-"""The kinds of changes, in the order in which lists of changes show them."""
 
+# returns the text of a state repo's file, or None if the file is missing
 FileReader = Callable[[str], str | None]
-"""A function that returns the text of a state repo's file, or None if the file is missing."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReleaseChange:
-    """A release that starts, changes or stops.
-
-    ``details`` has a line for each changed fact of a release that changes; otherwise it is empty.
-    """
+    """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
 
     name: str
     what: str
@@ -51,7 +50,6 @@ class ReleaseChange:
 
     @property
     def order(self) -> tuple[int, str]:
-        """The key by which a list of changes is sorted."""
         return CHANGE_ORDER.index(self.change), self.name
 
 
@@ -61,17 +59,14 @@ class Changeset:
 
     files: Mapping[str, str | None]
     releases: tuple[ReleaseChange, ...]
+    # the paths of the overrides that have an effect on the written files, ``hold`` included
     overrides: tuple[str, ...] = ()
-    """The paths of the overrides that have an effect on the written files, ``hold`` included."""
+    # a warning for each release that a ``hold`` override keeps from changing
     blocked: tuple[str, ...] = ()
-    """A warning for each release that a ``hold`` override keeps from changing."""
+    # each release that the change may affect, as it is after the change; None if it is gone
     plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """Each release that the change may affect, as it is after the change; None if it is gone."""
+    # the same releases before the change; None if there was none, or if it could not be planned
     former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
-    """Each release of ``plans``, as it was before the change.
-
-    None if there was no such release, or if it could not be planned.
-    """
 
 
 def build_changeset(  # noqa: PLR0913 - each is an input of its own
@@ -91,40 +86,22 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
     Args:
         before, after: the world before and after the change, with the same configuration.
         changes: the differences between both ledgers.
-        keys: the keys of the releases that may differ
-            (:func:`demandops.plan.release_keys.affected_keys`).
+        keys: the keys of the releases that may differ.
         evaluate: computes the values of services.
         read: returns the text of a file of the state repo before the change.
         plans: releases of ``before`` that the caller has planned already.
         keeps_late: whether a release whose values take too long to compute keeps its file, instead
-            of OverLimit. A release that does not change keeps it in any case.
+            of OverLimit.
         checkpoint: called for each file and release; it may raise an exception to end the work.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered, or if a file would not be
-            valid (:func:`demandops.render.output_check.check_files`) or would be too large.
+            valid or would be too large.
     """
-    files: dict[str, str | None] = {}
     most = after.config.repo_settings.limits.file_bytes
-    for change in changes.claims:
-        checkpoint()
-        path = claim_file.path_of(change.key)
-        files[path] = claim_file.text_of(change.after) if change.after else None
+    files = _ledger_files(after.ledger, changes, checkpoint)
     # before anything is planned, because a claim's file is the smallest of the files that need it
     _refuse_large(files, most, read)
-    for digest in changes.shutdowns:
-        shutdown = after.ledger.shutdowns.by_digest.get(digest)
-        files[recent_shutdowns.path_of(digest)] = (
-            recent_shutdowns.text_of(shutdown) if shutdown else None
-        )
-    for instance in changes.kept:
-        steps = after.ledger.kept.steps.get(instance)
-        files[kept_replicas.path_of(instance)] = (
-            kept_replicas.text_of(instance, steps) if steps else None
-        )
-    for demand in changes.waiting:
-        waits = after.ledger.waiting.get(demand)
-        files[waiting.path_of(demand)] = waiting.text_of(waits) if waits else None
     releases = []
     shaped: set[str] = set()
     blocked: list[str] = []
@@ -132,7 +109,9 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
     for key in keys:  # all before any is rendered, because that takes longer
         checkpoint()
         now[key] = plan(after, key)
-        former[key] = plans.get(key) or _plan_leniently(before, key)
+        former[key] = plans.get(key)
+        with suppress(Refused):  # what could not be planned before must not stop its remedy
+            former[key] = former[key] or plan(before, key)
     texts = _Texts(after.config, evaluate)
     for key, new in now.items():
         checkpoint()
@@ -141,11 +120,12 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
         new_path = path_of(new) if new else None
         current = read(new_path) if new_path else None
         try:
-            text = texts.of(new, current) if new else None
+            text = texts.text_of(new, current) if new else None
         except OverLimit:
             if keeps_late or old == new:  # what only renews a lease needs no template
                 continue
             raise
+        # the path has the node, so a release that moves to another node leaves a file behind
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
         blocked += _blocked(old, new) if current is not None else ()
@@ -162,10 +142,33 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked), now, former)
 
 
+def _ledger_files(
+    ledger: Ledger, changes: Changes, checkpoint: Callable[[], None]
+) -> dict[str, str | None]:
+    files: dict[str, str | None] = {}
+    for change in changes.claims:
+        checkpoint()
+        path = claim_file.path_of(change.key)
+        files[path] = claim_file.text_of(change.after) if change.after else None
+    for digest in changes.shutdowns:
+        shutdown = ledger.shutdowns.by_digest.get(digest)
+        path = recent_shutdowns.path_of(digest)
+        files[path] = recent_shutdowns.text_of(shutdown) if shutdown else None
+    for instance in changes.kept:
+        steps = ledger.kept.steps.get(instance)
+        path = kept_replicas.path_of(instance)
+        files[path] = kept_replicas.text_of(instance, steps) if steps else None
+    for demand in changes.waiting:
+        waits = ledger.waiting.get(demand)
+        files[waiting.path_of(demand)] = waiting.text_of(waits) if waits else None
+    return files
+
+
 def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
-    """Raise Refused if a file has more than ``most`` bytes and is larger than before."""
     faults = []
     for path, text in files.items():
+        # A file that is too large already may shrink. Else its claims could not be released.
+        # A character has at most four bytes, so most files need not be encoded to be measured.
         size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
         if size > max(most, len((read(path) or "").encode()) if size > most else 0):
             message = (
@@ -180,36 +183,29 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
 def render_all(
     world: World,
     evaluate: Evaluate,
-    keys: Iterable[ReleaseKey],
     current: Mapping[str, str],
     *,
-    keeps_late: bool = False,
+    keeps_late: bool,
 ) -> dict[str, str]:
     """Return all generated files except those of the ledger, by path.
 
-    Args:
-        world: the configuration and the ledger.
-        evaluate: computes the values of services.
-        keys: the keys of all releases (:func:`demandops.plan.release_keys.all_keys`).
-        current: the generated files in the state repo, which ``hold`` overrides may preserve.
-        keeps_late: whether a release whose values take too long to compute keeps its file, instead
-            of OverLimit.
+    ``current`` are the generated files in the state repo. With ``keeps_late``, a release whose
+    values take too long to compute keeps its file.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered, or if two need one name.
     """
-    config = world.config
+    config, keys = world.config, all_keys(world)
     files = manifests.base_files(config)
     texts = _Texts(config, evaluate)
-    keys = tuple(keys)
-    name_clash.refuse_shared_names(world, keys)
+    name_clash.refuse_shared_names(world, keys)  # one would overwrite the file of the other
     for key in keys:
         release = plan(world, key)
         if release is None:
             continue
         path = path_of(release)
         try:
-            files[path] = texts.of(release, current.get(path))
+            files[path] = texts.text_of(release, current.get(path))
         except OverLimit:
             if not keeps_late:
                 raise
@@ -225,11 +221,7 @@ class _Texts:
         self._config, self._evaluate = config, evaluate
         self._late: dict[str, OverLimit] = {}
 
-    def of(self, release: Release, current: str | None) -> str:
-        """Return the text of a release's file; ``current`` is its text in the state repo.
-
-        Raises OverLimit if the release, or an earlier one of its template, takes too long.
-        """
+    def text_of(self, release: Release, current: str | None) -> str:
         template = ""
         if isinstance(release, ServiceRelease):
             template = self._config.values_template(release.service)
@@ -242,43 +234,27 @@ class _Texts:
             raise
 
 
-def _plan_leniently(world: World, key: ReleaseKey) -> Release | None:
-    try:
-        return plan(world, key)
-    except Refused:
-        return None
+def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
+    if new is not None and new.shaping.held and (old and old.facts()) != new.facts():
+        by = " and ".join(each.path for each, effects in new.shaping.by if "hold" in effects)
+        yield f"{new.name} will not change until the 'hold' of {by} ends"
 
 
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
-    """Return how a release changes; ``existed`` is true if the release had a file before.
-
-    ``old`` or ``new`` is None if the release does not exist before or after the change, but not
-    both.
-    """
+    """Return how a release changes; ``existed`` says that it had a file before."""
     release = new or old
     assert release is not None  # noqa: S101 - a change has at least one side
     kind: Change = "stop" if not new else "change" if existed else "start"
-    details = _differences(old, new) if new and existed else ()
-    return ReleaseChange(release.name, release.description, path_of(release), kind, details)
-
-
-def _differences(old: Release | None, new: Release) -> tuple[str, ...]:
-    before, after = _overrides(old), _overrides(new)
-    if not new.shaping.held:  # in a held file, only the comments that name overrides change
-        before = (old.facts() if old else []) + before
-        after = new.facts() + after
-    old_facts, new_facts = frozenset(before), frozenset(after)
-    removed = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
-    added = [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
-    return (*removed, *added)
-
-
-def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
-    """Yield a warning if an override with the effect ``hold`` prevents a change of a release."""
-    if new is None or not new.shaping.held or (old and old.facts()) == new.facts():
-        return
-    by = " and ".join(override.path for override, effects in new.shaping.by if "hold" in effects)
-    yield f"{new.name} will not change until the 'hold' of {by} ends"
+    details: list[str] = []
+    if new and existed:
+        before, after = _overrides(old), _overrides(new)
+        if not new.shaping.held:  # in a held file, only the comments that name overrides change
+            before = (old.facts() if old else []) + before
+            after = new.facts() + after
+        old_facts, new_facts = frozenset(before), frozenset(after)
+        details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
+        details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
+    return ReleaseChange(release.name, release.description, path_of(release), kind, tuple(details))
 
 
 def _overrides(release: Release | None) -> list[str]:

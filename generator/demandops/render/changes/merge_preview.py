@@ -1,10 +1,7 @@
 """The releases and files that differ between two commits, or before and after a merge.
 
 A demand's changeset covers only the releases that the demand touches. A change of the configuration
-may affect any release, so this module compares all releases. The files decide whether a release
-differs, because the clusters follow the files. The former and the new plan of a release show how
-the release differs.
-The functions here are pure.
+may affect any release, so this module compares all. The functions here are pure.
 """
 
 from __future__ import annotations
@@ -28,8 +25,8 @@ from demandops.templating.values import Evaluate
 
 _MOST_FACTS = 20
 
+# marks a missing value, because None is a value of YAML
 ABSENT = object()
-"""Marks a missing value."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,13 +39,11 @@ class FileChange:
 
     @property
     def change(self) -> Literal["added", "changed", "removed"]:
-        """How the file changes."""
         if self.before is None:
             return "added"
         return "removed" if self.after is None else "changed"
 
     def diff(self) -> Iterator[str]:
-        """Return the lines of a unified diff from ``before`` to ``after``."""
         return difflib.unified_diff(
             (self.before or "").splitlines(),
             (self.after or "").splitlines(),
@@ -60,22 +55,16 @@ class FileChange:
 
 @dataclass(frozen=True, slots=True)
 class MergePreview:
-    """The releases that start, change or stop, and the files that change.
-
-    ``other_files`` are the changed files that belong to no release.
-    """
+    """The releases that start, change or stop, and the files that change."""
 
     releases: tuple[ReleaseChange, ...]
     files: tuple[FileChange, ...]
+    # the paths of the changed files that belong to no release
     other_files: tuple[str, ...]
 
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
-    """Return all releases that can be planned, by key.
-
-    Raises:
-        Refused: if the definition of a claimed application is missing.
-    """
+    """Return all releases that can be planned, by key."""
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
         try:
@@ -96,29 +85,28 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
     Raises:
         Refused: if the definition of a claimed application is missing.
     """
-    faults: list[Fault] = []
-    files: dict[ReleaseKey, list[str]] = {}
+    errors: list[tuple[ReleaseKey, InvalidInput]] = []
     for key in all_keys(world):
         try:
             release = plan(world, key)
             if release is not None:
                 manifests.render(release, world.config, evaluate)
         except InvalidInput as error:
-            files = files or _claim_files(world)
-            claims = files.get(key, [])
-            edited_claim = next((path for path in claims if path in edited), "")
-            for fault in error.faults:
-                faults.append(fault.within(edited_claim or fault.file or (claims or [""])[0]))
-    return list(dict.fromkeys(faults))
-
-
-def _claim_files(world: World) -> dict[ReleaseKey, list[str]]:
-    by_release: dict[ReleaseKey, list[str]] = {}
+            errors.append((key, error))
+    if not errors:
+        return []
+    files: dict[ReleaseKey, list[str]] = {}
     for subject in sorted(world.ledger.claims, key=str):
         paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
         for key in keys_of(world, subject):
-            by_release.setdefault(key, []).extend(paths)
-    return by_release
+            files.setdefault(key, []).extend(paths)
+    faults: list[Fault] = []
+    for key, failure in errors:
+        claims = files.get(key, [])
+        edited_claim = next((path for path in claims if path in edited), "")
+        for fault in failure.faults:
+            faults.append(fault.within(edited_claim or fault.file or (claims or [""])[0]))
+    return list(dict.fromkeys(faults))
 
 
 def preview(
@@ -130,10 +118,8 @@ def preview(
     """Return the releases and the files that a merge changes.
 
     Args:
-        old: the releases before the merge.
-        new: the releases after the merge.
-        current: path → text of the generated files before the merge.
-        files: path → text of the generated files after the merge.
+        old, new: the releases before and after the merge.
+        current, files: path → text of the generated files before and after the merge.
     """
     file_changes = tuple(
         FileChange(path, current.get(path), files.get(path))
@@ -143,8 +129,15 @@ def preview(
     changed = {change.path for change in file_changes}
     of_releases = set[str]()
     releases = []
-    for before, after in _pairs(old, new):
+    # a release whose key changes is paired with the former release of the same name
+    gone = {release.name: release for key, release in old.items() if key not in new}
+    pairs: list[tuple[Release | None, Release | None]] = [
+        (old.get(key) or gone.pop(release.name, None), release) for key, release in new.items()
+    ]
+    pairs += [(release, None) for release in gone.values()]
+    for before, after in pairs:
         old_path, new_path = (path_of(side) if side else "" for side in (before, after))
+        # the files decide whether a release differs, because the clusters follow the files
         if not changed & {old_path, new_path}:
             continue
         of_releases |= {old_path, new_path}
@@ -162,19 +155,6 @@ def preview(
     return MergePreview(tuple(releases), file_changes, others)
 
 
-def _pairs(
-    old: Mapping[ReleaseKey, Release], new: Mapping[ReleaseKey, Release]
-) -> Iterator[tuple[Release | None, Release | None]]:
-    """Yield (release before, release after); None stands for a release that does not exist.
-
-    A release whose key changes is paired with the former release of the same name.
-    """
-    gone = {release.name: release for key, release in old.items() if key not in new}
-    for key, release in new.items():
-        yield old.get(key) or gone.pop(release.name, None), release
-    yield from ((release, None) for release in gone.values())
-
-
 def _facts(before: str, after: str) -> Iterator[str]:
     """Yield texts for the first differences between two manifests, and then a count of the rest."""
     try:
@@ -182,7 +162,7 @@ def _facts(before: str, after: str) -> Iterator[str]:
     except InvalidInput:
         return
     for path, old, new in differing[:_MOST_FACTS]:
-        was, now = ("none" if one is ABSENT else short_repr(one) for one in (old, new))
+        was, now = ("none" if side is ABSENT else short_repr(side) for side in (old, new))
         yield f"{path.removeprefix('[0].')}: {was} → {now}"
     if len(differing) > _MOST_FACTS:
         yield f"and {len(differing) - _MOST_FACTS} more"
@@ -191,15 +171,15 @@ def _facts(before: str, after: str) -> Iterator[str]:
 def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
     """Yield (path, old, new) for each smallest part that differs between two values.
 
-    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`. Two lists of
-    different lengths are one part.
+    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`.
     """
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
             inner = f"{path}.{key}" if path else str(key)
             yield from leaf_differences(old.get(key, ABSENT), new.get(key, ABSENT), inner)
+    # lists of different lengths are one part: it is not known which of their items is new
     elif isinstance(old, list) and isinstance(new, list) and len(old) == len(new):
         for index, (left, right) in enumerate(zip(old, new, strict=True)):
             yield from leaf_differences(left, right, f"{path}[{index}]")
-    elif type(old) is not type(new) or old != new:
+    elif type(old) is not type(new) or old != new:  # Python treats 1, 1.0 and True as equal
         yield path, old, new

@@ -10,12 +10,8 @@ from demandops.render.gitops.paths import path_of
 
 
 def override_state(entry: Entry, world: World, not_rendered: Collection[str]) -> State:
-    """Return the state of an override.
-
-    The state is ``not rendered yet``, instead of ``in force``, while ``not_rendered`` contains a
-    file that the override affects.
-    """
+    """Return the state of an override; ``not_rendered`` are paths of files."""
     if entry.state != "in force" or not not_rendered:
         return entry.state
-    paths = {path_of(one) for one in affected_releases(entry, world)}
+    paths = {path_of(release) for release in affected_releases(entry, world)}
     return "not rendered yet" if paths & {*not_rendered} else entry.state

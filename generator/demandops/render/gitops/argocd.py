@@ -25,20 +25,16 @@ from demandops.render.gitops.paths import (
 from demandops.settings import MAIN_BRANCH
 from demandops.templating import engine
 
+# The address by which Argo CD reaches the cluster that it runs in
 IN_CLUSTER = "https://kubernetes.default.svc"
-"""The address by which Argo CD reaches the cluster that it runs in."""
 
 
 def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
-    """Return the name of a domain's AppProject.
-
-    The Application that applies the domain's folder has the same name.
-    """
+    """Return the name of a domain's AppProject, and of the Application of the domain's folder."""
     return f"{repository.source}-{domain.name}"
 
 
 def render(release: ServiceRelease, values: Mapping[str, Any], repository: RepoSettings) -> str:
-    """Return the text of a service's file: an Application."""
     return engine.text(
         "argocd/release.yaml.j2",
         release=release,
@@ -65,6 +61,13 @@ def base_files(config: Config) -> dict[str, str]:
 
 
 def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config) -> str:
+    section = config.repo_settings.argocd
+    assert section is not None  # noqa: S101 - required when gitops is "argocd"
+    # Applications may fetch only from these: the state repo and the charts' repositories
+    charts = {
+        source.oci or source.http for chart in config.charts.values() for source in chart.sources()
+    }
+    urls = [section.url, *sorted(url for url in charts if url and url != section.url)]
     return with_digest(
         lambda digest: engine.text(
             "argocd/bootstrap.yaml.j2",
@@ -74,19 +77,9 @@ def _bootstrap(cluster: str, domains: list[AccessDomain], config: Config) -> str
             node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
             folders={domain.name: domain_folder(cluster, domain) for domain in domains},
             projects={domain.name: project_of(domain, config.repo_settings) for domain in domains},
-            urls=_sources(config),
+            urls=urls,
             repository=config.repo_settings,
             branch=MAIN_BRANCH,
             server=IN_CLUSTER,
         )
     )
-
-
-def _sources(config: Config) -> list[str]:
-    """Return the URLs that Applications may fetch from: those of the state repo and of charts."""
-    section = config.repo_settings.argocd
-    assert section is not None  # noqa: S101 - required when gitops is "argocd"
-    charts = {
-        source.oci or source.http for chart in config.charts.values() for source in chart.sources()
-    }
-    return [section.url, *sorted(url for url in charts if url and url != section.url)]

@@ -42,10 +42,7 @@ def digest_of(item: Mapping[str, Any]) -> str:
 
 @lru_cache(maxsize=1024)  # the web page asks for the same files repeatedly
 def digest_in(text: str) -> str:
-    """Return the digest in the text of a bootstrap file.
-
-    The result is empty if there is none, or if the text is not valid YAML.
-    """
+    """Return the digest in the text of a bootstrap file; empty if there is none."""
     try:
         items = list(strict_yaml.load_all(text))
     except InvalidInput:

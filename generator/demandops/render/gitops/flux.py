@@ -27,7 +27,6 @@ from demandops.templating import engine
 
 
 def render(release: ServiceRelease, values: Mapping[str, Any]) -> str:
-    """Return the text of a service's file: a HelmRelease."""
     chart = release.chart
     return engine.text(
         "flux/release.yaml.j2",
@@ -44,11 +43,8 @@ def chart_object(name: str, chart: ChartSource) -> str:
 
 
 def base_files(config: Config) -> dict[str, str]:
-    """Return the files that do not depend on demands, by path.
-
-    These are the bootstrap files, if ``flux.url`` is set in ``demandops.yaml``. For each access
-    domain of a cluster, they are also its chart sources and a file that keeps its folder.
-    """
+    """Return the files that do not depend on demands, by path."""
+    # without the URL of the repo, there is nothing that a bootstrap file could make Flux follow
     flux = config.repo_settings.flux
     files = {
         bootstrap_path(cluster): _bootstrap(cluster, domains, config)

@@ -18,9 +18,7 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
 
     Raises:
         Refused: if the registry has no image for a communication client.
-        InvalidInput: if the values of a service are not valid
-            (:func:`demandops.render.helm_values.values_of`), or if the configuration of a client is
-            not valid (:func:`demandops.render.connection_client.render`).
+        InvalidInput: if the values of a service or the configuration of a client are not valid.
     """
     if not isinstance(release, ServiceRelease):
         return connection_client.render(release, config)
@@ -31,14 +29,9 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
 
 
 def base_files(config: Config) -> dict[str, str]:
-    """Return the files that exist even without demands, by path.
-
-    Each cluster has a bootstrap file, which makes the cluster's controller follow the repo. For
-    Flux, there are no bootstrap files without ``flux.url``. Each access domain of a cluster has a
-    placeholder file, which keeps the domain's folder in Git. Without the folder, Flux and Argo CD
-    would fail instead of removing what is no longer demanded. For Flux, each access domain of a
-    cluster also has the sources of all charts.
-    """
+    """Return the files that exist even without demands, by path."""
+    # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
+    # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
     if config.repo_settings.gitops == "argocd":
         return argocd.base_files(config)
     return flux.base_files(config)

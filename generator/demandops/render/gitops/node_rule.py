@@ -21,8 +21,7 @@ _SELECTOR = "variables.selector"
 def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
     """Return the expression that is true if a pod's selector has all labels of a node's selector.
 
-    Only nodes of the domain count. A node with ``selector: {}`` makes the expression true for
-    every pod.
+    Only nodes of the domain count.
     """
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
@@ -42,21 +41,15 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
         _has(label, f" in [{', '.join(map(_text, sorted(values)))}]")
         for label, values in sorted(by_label.items())
     ]
-    parts += [
-        "("
-        + (" && ".join(_has(label, f" == {_text(value)}") for label, value in one) or "true")
-        + ")"
-        for one in sorted(selectors)
-    ]
+    for selector in sorted(selectors):
+        labels = " && ".join(_has(label, f" == {_text(value)}") for label, value in selector)
+        parts.append(f"({labels or 'true'})")  # a node with ``selector: {}`` takes every pod
     return " || ".join(parts)
 
 
 def expression_of(pattern: str) -> str:
-    """Return a pattern of the policy as a regular expression of RE2, without ``^`` and ``$``.
-
-    The pattern may contain ``*`` and ``?``.
-    """
-    return "".join({"*": ".*", "?": "."}.get(one, re.escape(one)) for one in pattern)
+    """Return a pattern of the policy as a regular expression of RE2, without ``^`` and ``$``."""
+    return "".join({"*": ".*", "?": "."}.get(char, re.escape(char)) for char in pattern)
 
 
 def _has(label: str, test: str) -> str:

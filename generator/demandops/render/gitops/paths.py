@@ -20,13 +20,12 @@ def domain_folder(cluster: str, domain: AccessDomain) -> str:
 
 
 def path_of(release: Release) -> str:
-    """Return ``clusters/<cluster>/<access domain>/<node>/<release>.yaml``."""
+    # clusters/<cluster>/<access domain>/<node>/<release>.yaml
     folder = domain_folder(release.node.cluster, release.domain)
     return f"{folder}/{naming.object_name('', release.node.id)}/{release.name}.yaml"
 
 
 def bootstrap_path(cluster: str) -> str:
-    """Return the path of a cluster's bootstrap file."""
     return f"{BOOTSTRAP_ROOT}/{cluster}.yaml"
 
 
