@@ -19,6 +19,8 @@ from demandops.errors import DemandOpsError, InvalidInput, Unsound
 from demandops.quoting import OneLineFormatter
 from demandops.staterepo.git import slow_git
 
+# Maps a command's name to the package of the command's module, and to the short help.
+# A package without a dot is below `demandops.cli`, except `demandops_ros`.
 COMMANDS = {
     "approve": ("actions", "Approve a proposed demand: merge its branch in your own name."),
     "bookkeeping": ("views", "Show who requests which service and connection."),
@@ -54,21 +56,15 @@ COMMANDS = {
     "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
-"""Maps a command's name to the package of the command's module, and to the short help.
-
-A package without a dot is below ``demandops.cli``, except ``demandops_ros``.
-"""
 
 
+# The commands that always run until they are stopped.
+# They log or fill the screen, so they do not show the progress of git operations.
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-"""The commands that always run until they are stopped.
-
-They log or fill the screen, so they do not show the progress of git operations.
-"""
 
 
+# Errors about a file: its path is wrong, or permissions are missing.
 _OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
-"""Errors about a file: its path is wrong, or permissions are missing."""
 
 
 class ExitCode(IntEnum):

@@ -15,14 +15,12 @@ from rich.cells import cell_len
 from demandops.quoting import one_line
 
 _GAP = "  "
+# The smallest width, in characters, to which a column is narrowed by wrapping its text.
+# If the terminal has no room for this width, columns are left out.
 _COMFORT = 12
-"""The smallest width, in characters, to which a column is narrowed by wrapping its text.
 
-If the terminal has no room for this width, columns are left out.
-"""
-
+# The text of a cell, or its lines.
 Cell = str | Sequence[str]
-"""The text of a cell, or its lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +45,10 @@ class Table:
     rows: Sequence[Sequence[Cell]]
     title: str = ""
     empty: str = "(nothing)"
+    # The colors of cells, by the text of the cell, for a terminal that shows colors.
     styles: dict[str, str] = field(default_factory=dict)
-    """The colors of cells, by the text of the cell, for a terminal that shows colors."""
+    # Whether to keep every column and wrap nothing, however wide the table gets.
     whole: bool = False
-    """Whether to keep every column and wrap nothing, however wide the table gets."""
 
     def lines(self, width: int | None, style: Callable[[str, str], str] | None = None) -> list[str]:
         """Return the table as lines.

@@ -190,14 +190,12 @@ def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Comm
     return lambda command: option(_context_option(command))
 
 
+# The option `--state-repo` of a command that only reads; it may name a checkout.
 state_repo_option = _state_repo(readable_repo, "the checkout that you are in")
-"""The option ``--state-repo`` of a command that only reads; it may name a checkout."""
 
+# The option `--state-repo` of a command that writes.
+# If the checkout has no remote, the default with `--dry-run` is the checkout itself.
 writable_repo_option = _state_repo(_writable, "the remote of the checkout that you are in")
-"""The option ``--state-repo`` of a command that writes.
-
-If the checkout has no remote, the default with ``--dry-run`` is the checkout itself.
-"""
 
 dry_run_option = click.option(
     "--dry-run",

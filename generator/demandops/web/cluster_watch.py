@@ -17,8 +17,8 @@ from demandops.staterepo.git.repository import StateRepository
 from demandops.web.situation import HealthChange
 from demandops.web.views.health_word import word_of
 
+# How many changes of health are kept; older ones are dropped.
 _KEPT = 2_000
-"""How many changes of health are kept; older ones are dropped."""
 
 
 class ClusterWatch:

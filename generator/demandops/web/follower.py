@@ -33,16 +33,14 @@ from demandops.web.situation import Commit, CommitState, HealthChange, Situation
 
 log = logging.getLogger("demandops")
 
+# How many of the newest commits the time line and the rates show.
 MOST_COMMITS = 5_000
-"""How many of the newest commits the time line and the rates show."""
 
+# The pause in seconds between checks of a local repository, which cost little.
 _LOOK_S = 0.2
-"""The pause in seconds between checks of a local repository, which cost little."""
+# After a new situation, the follower pauses this many times as long as the computation took.
+# The pause keeps the load of the processor low. It lasts at most one second.
 _PAUSE_FACTOR = 4
-"""After a new situation, the follower pauses this many times as long as the computation took.
-
-The pause keeps the load of the processor low. It lasts at most one second.
-"""
 _MOST_COMMIT_STATES = 8
 
 
@@ -77,10 +75,10 @@ class Follower:
         self._watch = ClusterWatch(clusters, self._wake.set, runtime)
         self._commit_states: dict[str, CommitState] = {}
         self._loading = runtime.lock()
+        # How often the situation has changed since the start.
         self.version = 0
-        """How often the situation has changed since the start."""
+        # The newest commits, at most `MOST_COMMITS`, newest first.
         self.history: tuple[Commit, ...] = ()
-        """The newest commits, at most ``MOST_COMMITS``, newest first."""
         self._newest = self._situation_at(self._first_commit_state(progress))
         self._thread = runtime.keep_running("page", self._run)
 

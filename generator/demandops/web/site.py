@@ -51,24 +51,22 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+# HTTP headers that allow the inline scripts and styles of the documentation.
+# This is safe, because the documentation contains no data of a state repo.
 _DOCS_HEADERS = _HEADERS | {
     "Content-Security-Policy": (
         "default-src 'self'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
         "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     )
 }
-"""HTTP headers that allow the inline scripts and styles of the documentation.
-
-This is safe, because the documentation contains no data of a state repo.
-"""
 _LOOK_S = 0.1
 _HEARTBEAT_S = 15.0
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
+# The parameters with which a view reads commits, which may take seconds.
 _SLOW = {"at", "id", "name"}
-"""The parameters with which a view reads commits, which may take seconds."""
+# How many views may be rendered at the same time; slow ones may not delay the others.
 _AT_ONCE, _SLOW_AT_ONCE = 20, 4
-"""How many views may be rendered at the same time; slow ones may not delay the others."""
 _MOST_WAITING = 20
 
 

@@ -78,17 +78,15 @@ class CommitState:
         self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
     ) -> None:
         self.snapshot, self.entry, self.problems = snapshot, entry, problems
+        # The rows of each list that was shown, by the list's name.
         self.rows: dict[str, ReusableRows] = {}
-        """The rows of each list that was shown, by the list's name."""
         self._entries: list[Entry] | None = None
         self._planned: dict[ReleaseKey, Planned | None] | None = None
+        # The newest commit, up to this one, that changed each path that was looked up.
+        # The value is None if no commit changed the path.
         self.last_changes: dict[str, LogEntry | None] = {}
-        """The newest commit, up to this one, that changed each path that was looked up.
-
-        The value is None if no commit changed the path.
-        """
+        # The files that a generator must still write or remove; None until they are looked up.
         self.not_rendered: frozenset[str] | None = None
-        """The files that a generator must still write or remove; None until they are looked up."""
 
     @property
     def commit(self) -> str:

@@ -26,9 +26,10 @@ from demandops.web.views import (
 from demandops.web.views.filtered_table import Filter, Link, Row
 from demandops.web.views.lists import LISTS, rows_of
 
+# The parameters that a link to another view keeps: the chosen commit or time, and the filter.
 _KEPT = ("at", "q")
-"""The parameters that a link to another view keeps: the chosen commit or time, and the filter."""
 
+# The path and the title of each view in the navigation bar.
 NAVIGATION = (
     ("", "Not ready"),
     ("map", "Map"),
@@ -37,7 +38,6 @@ NAVIGATION = (
     ("overrides", "Overrides"),
     ("rates", "Rates"),
 )
-"""The path and the title of each view in the navigation bar."""
 
 _MOST_CAUSES = 100
 
@@ -176,6 +176,7 @@ def _rates(asked: ViewRequest) -> tuple[str, Data]:
     return "rates.html.j2", data | {"width": rates.WIDTH, "height": rates.HEIGHT}
 
 
+# A map from the address of each view to the function that returns its template and data.
 VIEWS: Mapping[str, View] = {
     "/": _not_ready,
     "/map": _map,
@@ -186,4 +187,3 @@ VIEWS: Mapping[str, View] = {
     "/overrides": _overrides,
     "/rates": _rates,
 }
-"""A map from the address of each view to the function that returns its template and data."""

@@ -42,10 +42,10 @@ class Document:
 
     file: str
     goal: Any
+    # The text of the file.
     text: str
-    """The text of the file."""
+    # The index of the document in the file, from 0.
     number: int
-    """The index of the document in the file, from 0."""
 
     @property
     def request_id(self) -> str:

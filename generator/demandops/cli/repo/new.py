@@ -319,6 +319,7 @@ def _image(text: str) -> Image:
     )
 
 
+# Maps an option to the arguments of `_asked` that ask for the option's values.
 _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
     "--input": (
         "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; separate several by spaces",
@@ -333,7 +334,6 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
     ),
     "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
 }
-"""Maps an option to the arguments of :func:`_asked` that ask for the option's values."""
 
 
 def _example_node(config: Config) -> str:

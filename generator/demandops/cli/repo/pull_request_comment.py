@@ -17,11 +17,11 @@ from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange
 from demandops.staterepo.pull_request.merge_check import CheckResult
 from demandops.staterepo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
 
+# The first line of every report. A pipeline finds its earlier comment by this line.
 MARK = "<!-- demandops check -->"
-"""The first line of every report. A pipeline finds its earlier comment by this line."""
 
+# The default limit of a report in characters. GitHub allows 65,536, GitLab more.
 LONGEST = 60_000
-"""The default limit of a report in characters. GitHub allows 65,536, GitLab more."""
 
 _LONGEST_SPAN = 500
 _ROOM_FOR_NOTE = 200

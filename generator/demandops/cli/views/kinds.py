@@ -39,8 +39,8 @@ class Source:
     repo: Reader
     snapshot: Snapshot
     now: datetime
+    # The generated files that a generator has yet to write or remove.
     not_rendered: Collection[str] = ()
-    """The generated files that a generator has yet to write or remove."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ from demandops.staterepo.history import revisions
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.reader import Reader
 
+# The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
     "join",
     "shutdown",
@@ -42,7 +43,6 @@ OPERATIONS = (
     "init",
     "by-hand",
 )
-"""The operations that ``--operation`` accepts. ``by-hand`` selects the commits by people."""
 
 _TRAILERS = {
     "requester": "Requester",

@@ -161,8 +161,8 @@ class Status:
     old_bootstraps: tuple[OldBootstrap, ...]
     orphans: tuple[Orphan, ...]
     missing_inputs: tuple[MissingInput, ...]
+    # The reasons why clusters' objects cannot be read, by the name of the cluster.
     unreadable: Mapping[str, str]
-    """The reasons why clusters' objects cannot be read, by the name of the cluster."""
 
     @classmethod
     def of(

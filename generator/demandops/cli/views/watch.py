@@ -26,11 +26,9 @@ from demandops.staterepo.reader import Reader
 
 _PAUSE_S = 2.0
 _COMMITS = 6
+# How many lines are not for the three parts.
+# Two lines are the title, one before each part is empty, and one at the bottom stays free.
 _OTHER_LINES = 6
-"""How many lines are not for the three parts.
-
-Two lines are the title, one before each part is empty, and one at the bottom stays free.
-"""
 
 
 @click.command()

@@ -9,8 +9,8 @@ from datetime import datetime
 from functools import cached_property
 from typing import TypeAlias
 
+# How many rows a page of a list has at most.
 PAGE = 100
-"""How many rows a page of a list has at most."""
 
 _MOST_PARTS = 4
 

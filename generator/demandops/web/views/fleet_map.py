@@ -59,24 +59,24 @@ class Picture:
     width: float
     height: float
     boxes: tuple[Box, ...]
+    # The nodes that are drawn one by one, with details.
     nodes: tuple[NodeCard, ...]
-    """The nodes that are drawn one by one, with details."""
+    # The lines that are drawn one by one.
     lines: tuple[Line, ...]
-    """The lines that are drawn one by one."""
+    # The other nodes, drawn as one shape for each color.
     many_nodes: tuple[Mass, ...]
-    """The other nodes, drawn as one shape for each color."""
+    # The other lines, drawn as one shape for each color.
     many_lines: tuple[Mass, ...]
-    """The other lines, drawn as one shape for each color."""
+    # The number of all nodes.
     total: int
-    """The number of all nodes."""
+    # Whether only lit nodes are drawn.
     only_lit: bool
-    """Whether only lit nodes are drawn."""
     layout: str
     layouts: tuple[str, ...]
+    # Whether the parts that are not lit are drawn dimmed.
     is_dimmed: bool
-    """Whether the parts that are not lit are drawn dimmed."""
+    # The number of lit nodes.
     lit: int
-    """The number of lit nodes."""
 
 
 @dataclass(slots=True)

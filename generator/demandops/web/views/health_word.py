@@ -7,6 +7,7 @@ from datetime import datetime
 
 from demandops.cluster.release_status import ReleaseStatus
 
+# The words for a health, each with its color on the page, from the worst to the best health.
 WORDS = {
     "failing": "bad",
     "waiting": "busy",
@@ -14,10 +15,9 @@ WORDS = {
     "unknown": "none",
     "healthy": "good",
 }
-"""The words for a health, each with its color on the page, from the worst to the best health."""
 
+# The index of each word in `WORDS`; a lower index means worse health.
 RANKS = {word: float(place) for place, word in enumerate(WORDS)}
-"""The index of each word in ``WORDS``; a lower index means worse health."""
 
 
 def word_of(status: ReleaseStatus) -> str:

@@ -15,6 +15,7 @@ from demandops.staterepo.history.commit_log import GENERATOR_NAME, LogEntry
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
 
+# The color of each kind of cause, in the order in which the view lists the kinds.
 KINDS: dict[str, str] = {
     "unread": "bad",
     "failing": "bad",
@@ -24,10 +25,9 @@ KINDS: dict[str, str] = {
     "waiting": "busy",
     "starting": "busy",
 }
-"""The color of each kind of cause, in the order in which the view lists the kinds."""
 
+# A function that returns the newest commit that changed a file or folder, or None.
 LastChange = Callable[[str], "LogEntry | None"]
-"""A function that returns the newest commit that changed a file or folder, or None."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,14 +13,15 @@ from demandops.web.situation import Commit, HealthChange
 from demandops.web.views.filtered_table import Filter, Row, cell
 from demandops.web.views.health_word import WORDS
 
+# The title of each lane of the time line, from top to bottom, by the lane's name.
 LANES = {
     "demands": "Demands",
     "overrides": "Overrides",
     "people": "People and generator",
     "health": "Health",
 }
-"""The title of each lane of the time line, from top to bottom, by the lane's name."""
 
+# The spans of time that a person can choose, in seconds; 0 means all known events.
 SPANS = {
     "15min": 900,
     "1h": 3600,
@@ -30,7 +31,6 @@ SPANS = {
     "30d": 30 * 86400,
     "all": 0,
 }
-"""The spans of time that a person can choose, in seconds; 0 means all known events."""
 
 WIDTH = 1000
 _BINS = 60
