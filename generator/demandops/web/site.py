@@ -34,7 +34,7 @@ from demandops.config.durations import relative
 from demandops.errors import DemandOpsError
 from demandops.quoting import escaped, lines
 from demandops.web.follower import Follower
-from demandops.web.view_pages import NAVIGATION, VIEWS, Data, View, ViewRequest
+from demandops.web.view_pages import NAVIGATION, VIEWS, View, ViewRequest
 from demandops.web.views import filtered_table
 
 log = logging.getLogger("demandops")
@@ -60,13 +60,16 @@ _DOCS_HEADERS = _HEADERS | {
     )
 }
 _LOOK_S = 0.1
+# Something is sent at least this often, so that no proxy takes a quiet stream for a dead one.
 _HEARTBEAT_S = 15.0
+# How long a browser waits before it opens a stream again that has ended.
 _RETRY_MS = 1_000
 _MOST_LISTENERS = 100
 # The parameters with which a view reads commits, which may take seconds.
 _SLOW = {"at", "id", "name"}
 # How many views may be rendered at the same time; slow ones may not delay the others.
 _AT_ONCE, _SLOW_AT_ONCE = 20, 4
+# How many requests may wait for a place; further ones are refused at once.
 _MOST_WAITING = 20
 
 
@@ -96,15 +99,16 @@ class Site:
             loader=FileSystemLoader(_HERE / "pages"),
             autoescape=True,
             undefined=StrictUndefined,
-            finalize=_visible,
+            # text with escapes for invisible characters; markup has been escaped already
+            finalize=lambda value: value if isinstance(value, Markup) else lines(str(value)),
             trim_blocks=True,
             lstrip_blocks=True,
         )
         self._templates.filters |= {
-            "when": _when,
+            "when": lambda at: escaped(f"{at.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S UTC}"),
             "clock": _clock,
             "ago": relative,
-            "iso": _iso,
+            "iso": lambda at: f"{at.astimezone(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
             "sh": shlex.quote,
         }
         self.application = Starlette(
@@ -142,35 +146,31 @@ class Site:
             with self._follower.reading():
                 asked = ViewRequest(self._follower, request)
                 template, data = view(asked)
-                return self._page(asked, template, {**data, "version": version})
+                common = {
+                    "navigation": NAVIGATION,
+                    "here": asked,
+                    "now": asked.situation.now,
+                    "situation": asked.situation,
+                    "commit_state": asked.situation.commit_state,
+                    "exactly": filtered_table.exactly,
+                    "program": __version__,
+                    "has_docs": self._has_docs,
+                    "version": version,
+                }
+                return HTMLResponse(self._templates.get_template(template).render(common | data))
         except DemandOpsError as error:
-            return self._message(request, "Nothing to show", str(error), 404)
+            return self._message("Nothing to show", str(error), 404)
         except Exception:  # the visitor must learn where to look
             log.exception("view %s of the page does not work", request.url.path)
             text = "a fault of the program; see its log"
-            return self._message(request, "This view does not work", text, 500)
+            return self._message("This view does not work", text, 500)
 
-    def _page(self, asked: ViewRequest, template: str, data: Data, status: int = 200) -> Response:
-        common = {
-            "navigation": NAVIGATION,
-            "here": asked,
-            "now": asked.situation.now,
-            "situation": asked.situation,
-            "commit_state": asked.situation.commit_state,
-            "exactly": filtered_table.exactly,
-            "program": __version__,
-            "has_docs": self._has_docs,
-        }
-        text = self._templates.get_template(template).render(common | data)
-        return HTMLResponse(text, status)
-
-    def _message(self, request: Request, title: str, text: str, status: int) -> Response:
+    def _message(self, title: str, text: str, status: int) -> Response:
         page = self._templates.get_template("message.html.j2")
-        shown = {"title": title, "text": text, "path": request.url.path}
-        return HTMLResponse(page.render(shown), status)
+        return HTMLResponse(page.render(title=title, text=text), status)
 
     async def _nothing_here(self, request: Request, error: Exception) -> Response:
-        return self._message(request, "Nothing here", "there is no such view or file", 404)
+        return self._message("Nothing here", "there is no such view or file", 404)
 
     async def _health(self, request: Request) -> Response:
         unread = self._follower.newest.unread
@@ -232,15 +232,13 @@ _REFUSAL = PlainTextResponse("another site asked for this; open the page itself\
 
 
 def _is_foreign(headers: Headers) -> bool:
-    """Return whether another site made the browser send a request.
-
-    A link to the page may be on any site: the browser shows the page in a tab of its own, where no
-    other site can read it. It may not be opened before somebody follows the link.
-    """
+    """Return whether another site made the browser send a request."""
     site = headers.get("sec-fetch-site")
     if site is None:  # an old browser, a program, or a page without TLS on another machine
         origin = headers.get("origin")
         return origin is not None and origin.partition("://")[2] != headers.get("host")
+    # A link to the page may be on any site: the browser shows the page in a tab of its own, where
+    # no other site can read it. `sec-purpose` says that nobody has followed the link yet.
     is_link = (
         headers.get("sec-fetch-mode") == "navigate"
         and headers.get("sec-fetch-dest") == "document"
@@ -249,23 +247,7 @@ def _is_foreign(headers: Headers) -> bool:
     return site not in ("same-origin", "none") and not is_link
 
 
-# ---- filters of the templates ----
-
-
-def _visible(value: object) -> object:
-    """Return markup unchanged, and other values as text with escapes for invisible characters."""
-    return value if isinstance(value, Markup) else lines(str(value))
-
-
-def _iso(at: datetime) -> str:
-    return at.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def _when(at: datetime) -> str:
-    return escaped(at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC"))
-
-
 def _clock(at: datetime, now: datetime) -> str:
-    """Return a time as text in UTC: with seconds on the day of ``now``, else with the date."""
+    """Return a time in UTC: with seconds on the day of ``now``, else with the date."""
     at, today = at.astimezone(timezone.utc), now.astimezone(timezone.utc).date()
     return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")

@@ -12,6 +12,7 @@ from typing import TypeAlias
 # How many rows a page of a list has at most.
 PAGE = 100
 
+# How many texts of a cell the page shows.
 _MOST_PARTS = 4
 
 
@@ -49,12 +50,10 @@ class Cell:
 
     @property
     def shown(self) -> tuple[Part, ...]:
-        """The texts of the cell that the page shows: the first few."""
         return self.parts[:_MOST_PARTS]
 
     @property
     def more(self) -> int:
-        """The number of texts of the cell that the page leaves out."""
         return max(0, len(self.parts) - _MOST_PARTS)
 
     @property
@@ -86,10 +85,12 @@ class Row:
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
         """The texts of each column and hidden field; lower case, because filters ignore case."""
-        found = {key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()}
+        all_texts = {
+            key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()
+        }
         for key, texts in self.hidden.items():
-            found[key] = (*found.get(key, ()), *texts)
-        return {key: tuple(text.casefold() for text in texts) for key, texts in found.items()}
+            all_texts[key] = (*all_texts.get(key, ()), *texts)
+        return {key: tuple(text.casefold() for text in texts) for key, texts in all_texts.items()}
 
     @cached_property
     def all_texts(self) -> str:
@@ -114,13 +115,12 @@ class Table:
 
     @property
     def pages(self) -> int:
-        """The number of pages of the filtered list."""
         return max(1, -(-self.matching // PAGE))
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
     """Return a cell with all of ``texts`` that are not empty."""
-    parts = (one if isinstance(one, Part) else Part(str(one)) for one in texts)
+    parts = (text if isinstance(text, Part) else Part(str(text)) for text in texts)
     return Cell(tuple(part for part in parts if part.text), tone=tone, order=order)
 
 
@@ -140,25 +140,24 @@ class Filter:
         self._words = [word.casefold() for word in words]
 
     def __bool__(self) -> bool:
-        """Return whether the filter has any words."""
         return bool(self._words)
 
     def matches(self, row: Row) -> bool:
         """Return whether a row contains all words of the filter."""
-        return all(_has(row, word) for word in self._words)
 
+        def has(word: str) -> bool:
+            for sign in ":=":
+                key, separator, wanted = word.partition(sign)
+                if separator and key in row.texts:
+                    texts = row.texts[key]
+                    return wanted in texts if sign == "=" else any(wanted in text for text in texts)
+            return word in row.all_texts
 
-def _has(row: Row, word: str) -> bool:
-    for sign in ":=":
-        key, found, wanted = word.partition(sign)
-        if found and key in row.texts:
-            texts = row.texts[key]
-            return wanted in texts if sign == "=" else any(wanted in text for text in texts)
-    return word in row.all_texts
+        return all(map(has, self._words))
 
 
 def exactly(key: str, value: str) -> str:
-    """Return the filter text for rows that have exactly this value in the field ``key``."""
+    """Return the filter text for rows whose field ``key`` has exactly this value."""
     return shlex.quote(f"{key}={value}")
 
 
@@ -170,12 +169,12 @@ def table(
     An unknown ``sort`` means the first column. A page number out of range means the nearest page.
     """
     every = list(rows)
-    found = [row for row in every if wanted.matches(row)]
+    matching = [row for row in every if wanted.matches(row)]
     key = sort.removeprefix("-")
     if key not in {column.key for column in columns}:
         sort = key = columns[0].key
-    found.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
-    last = max(1, -(-len(found) // PAGE))
+    matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
+    last = max(1, -(-len(matching) // PAGE))
     page = min(max(page, 1), last)
-    shown = tuple(found[(page - 1) * PAGE : page * PAGE])
-    return Table(tuple(columns), shown, len(every), len(found), sort, page)
+    shown = tuple(matching[(page - 1) * PAGE : page * PAGE])
+    return Table(tuple(columns), shown, len(every), len(matching), sort, page)

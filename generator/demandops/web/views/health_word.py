@@ -21,7 +21,6 @@ RANKS = {word: float(place) for place, word in enumerate(WORDS)}
 
 
 def word_of(status: ReleaseStatus) -> str:
-    """Return the word for the health of a release."""
     if status.state == "unknown":
         return "unknown"
     if status.health.failing:

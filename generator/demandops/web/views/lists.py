@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Any, TypeAlias
 
 from demandops.config.durations import duration_text
@@ -40,12 +39,10 @@ class ListKind:
 
 
 def release_part(name: str) -> Part:
-    """Return a release's name with a link to the view of the release."""
     return Part(name, Link("release", {"name": name}))
 
 
 def demand_part(id: str) -> Part:
-    """Return a demand's id with a link to the view of the demand."""
     return Part(id, Link("demand", {"id": id}))
 
 
@@ -59,18 +56,16 @@ def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
     return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
 
 
-def _requesters(of: Iterable[str]) -> Cell:
-    return cell(*_filtered("demands", "requester", of))
+def _requesters(requesters: Iterable[str]) -> Cell:
+    return cell(*_filtered("demands", "requester", requesters))
 
 
 def _services(now: Situation) -> Iterator[tuple[str, Values]]:
     for release, _ in now.commit_state.targets:
         if isinstance(release, ServiceRelease):
             name = release.name
-            yield (
-                name,
-                (release, now.commit_state.claims_of_releases[name], word_of(now.status(name))),
-            )
+            claims = now.commit_state.claims_of_releases[name]
+            yield name, (release, claims, word_of(now.status(name)))
 
 
 def _service(world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
@@ -93,9 +88,9 @@ def _service(world: World, release: ServiceRelease, claims: list[Claim], word: s
 
 
 def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
-    ledger, carrying = now.commit_state.active.ledger, clients_of(now.commit_state)
+    ledger, clients_by_connection = now.commit_state.active.ledger, _clients(now.commit_state)
     for id in ledger.subjects(SubjectKind.CONNECTION):
-        claims, clients = ledger.connection_claims(id), carrying.get(id, [])
+        claims, clients = ledger.connection_claims(id), clients_by_connection.get(id, [])
         if claims:  # at least one claim is not suspended
             yield id, (claims, clients, worst_word(map(now.status, clients)))
 
@@ -120,14 +115,13 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
     )
 
 
-def clients_of(commit_state: CommitState) -> dict[str, list[str]]:
-    """Return a map from each connection's id to the names of the releases that carry it."""
-    found: dict[str, list[str]] = {}
+def _clients(commit_state: CommitState) -> dict[str, list[str]]:
+    clients: dict[str, list[str]] = {}
     for name, release in commit_state.releases.items():
         if not isinstance(release, ServiceRelease):
             for id in release.connections:
-                found.setdefault(id, []).append(name)
-    return found
+                clients.setdefault(id, []).append(name)
+    return clients
 
 
 def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
@@ -135,8 +129,8 @@ def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
     for id, claims in commit_state.claims_of_demands.items():
         releases = commit_state.releases_of_demands.get(id, [])
         yield id, (claims, releases, worst_word(map(now.status, releases)))
-    for one in commit_state.state.ledger.waiting.values():
-        yield f"waiting {one.demand}", (one, [], "waiting")
+    for demand in commit_state.state.ledger.waiting.values():
+        yield f"waiting {demand.demand}", (demand, [], "waiting")
 
 
 def _demand(
@@ -158,8 +152,8 @@ def _demand(
             "requester": _requesters(held.requesters),
             "application": cell(*_filtered("services", "application", held.applications)),
             "connection": cell(*_filtered("connections", "connection", held.connections)),
-            "since": _time(held.since),
-            "lease": _time(held.lease.until if held.lease else None),
+            "since": Cell(time=held.since),
+            "lease": Cell(time=held.lease.until if held.lease else None),
             "health": health,
         },
         {"release": releases, "node": held.nodes},
@@ -177,7 +171,7 @@ def _lease(world: World, claim: Claim) -> Row:
     assert lease is not None  # noqa: S101 - only claims with a lease are listed
     return Row(
         {
-            "ends": _time(lease.until),
+            "ends": Cell(time=lease.until),
             "subject": cell(claim.subject.id),
             "kind": cell(claim.subject.kind.value[:-1]),
             "demand": cell(demand_part(claim.demand)),
@@ -189,10 +183,6 @@ def _lease(world: World, claim: Claim) -> Row:
     )
 
 
-def _time(at: datetime | None) -> Cell:
-    return Cell(time=at)
-
-
 def _columns(*named: str) -> tuple[Column, ...]:
     return tuple(Column(*each.split("|")) for each in named)
 
@@ -200,17 +190,16 @@ def _columns(*named: str) -> tuple[Column, ...]:
 def rows_of(now: Situation, name: str) -> list[Row]:
     """Return the rows of a list; reuse the rows of entries that have not changed."""
     commit_state, kind = now.commit_state, LISTS[name]
-    known = commit_state.rows.get(name, ReusableRows(None, {}))
-    if known.statuses is not now.statuses:
-        made: dict[str, tuple[Values, Row]] = {}
+    reusable = commit_state.rows.get(name, ReusableRows(None, {}))
+    if reusable.statuses is not now.statuses:
+        rows: dict[str, tuple[Values, Row]] = {}
         for id, values in kind.entries(now):
-            before = known.rows.get(id)
-            is_same = before is not None and before[0] == values
-            made[id] = (
-                before if before and is_same else (values, kind.row(commit_state.state, *values))
-            )
-        known = commit_state.rows[name] = ReusableRows(now.statuses, made)
-    return [row for _, row in known.rows.values()]
+            before = reusable.rows.get(id)
+            if before is None or before[0] != values:
+                before = values, kind.row(commit_state.state, *values)
+            rows[id] = before
+        reusable = commit_state.rows[name] = ReusableRows(now.statuses, rows)
+    return [row for _, row in reusable.rows.values()]
 
 
 LISTS = {
