@@ -67,24 +67,20 @@ output_option = output_formats("text", "json")
 
 
 def show(output: str, data: object, text: Iterable[str | Table]) -> None:
-    """Print ``data`` as JSON if ``output`` is ``json``; otherwise print ``text``.
-
-    ``text`` consists of lines and tables. Lines are not wrapped.
-    """
+    """Print ``data`` as JSON if ``output`` is ``json``; otherwise print the lines and tables."""
     if output == "json":
         print_json(data)
         return
-    print_lines([line for each in text for line in _lines_of(each)])
-
-
-def _lines_of(each: str | Table) -> list[str]:
-    if isinstance(each, str):
-        return lines(each).split("\n")
-    return each.lines(terminal_width(), painted)
+    printed: list[str] = []
+    for each in text:
+        if isinstance(each, Table):
+            printed += each.lines(terminal_width(), painted)
+        else:
+            printed += lines(each).split("\n")
+    print_lines(printed)
 
 
 def print_json(data: object) -> None:
-    """Print ``data`` as JSON, with escapes for characters that are not visible."""
     click.echo(json_escaped(json.dumps(data, indent=2, ensure_ascii=False)))
 
 
@@ -105,12 +101,11 @@ def time_text(time: str) -> str:
 
 
 def subject_data(subject: Subject) -> Json:
-    """Return a subject as JSON data."""
     return {"kind": subject.kind.value[:-1], "id": subject.id}
 
 
 def lease_data(lease: Lease | None) -> Json | None:
-    """Return a lease as JSON data; ``until`` is None if the lease has not started."""
+    """Return a lease as JSON data."""
     if lease is None:
         return None
     return {
@@ -121,7 +116,6 @@ def lease_data(lease: Lease | None) -> Json | None:
 
 
 def claim_data(claim: Claim) -> Json:
-    """Return a claim as JSON data."""
     app = claim.application if claim.is_on_application else None
     return {
         "subject": subject_data(claim.subject),
@@ -149,7 +143,6 @@ def place_data(release: Release) -> Json:
 
 
 def release_data(release: Release) -> Json:
-    """Return a release as JSON data."""
     return {"name": release.name, **place_data(release), "file": path_of(release)}
 
 

@@ -19,8 +19,8 @@ from demandops.errors import DemandOpsError, InvalidInput, Unsound
 from demandops.quoting import OneLineFormatter
 from demandops.staterepo.git import slow_git
 
-# Maps a command's name to the package of the command's module, and to the short help.
-# A package without a dot is below `demandops.cli`, except `demandops_ros`.
+# The package of each command's module, and the short help, which `--help` shows without importing
+# the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
 COMMANDS = {
     "approve": ("actions", "Approve a proposed demand: merge its branch in your own name."),
     "bookkeeping": ("views", "Show who requests which service and connection."),
@@ -58,8 +58,8 @@ COMMANDS = {
 }
 
 
-# The commands that always run until they are stopped.
-# They log or fill the screen, so they do not show the progress of git operations.
+# These commands run until they are stopped. They log or fill the screen, so they do not show the
+# progress of git operations.
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
 
 
@@ -78,11 +78,7 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import and return a command.
-
-    Raises:
-        click.ClickException: a Python package that the command needs, or git, is not installed.
-    """
+    """Import and return a command; a ClickException says if git or a Python package is missing."""
     room = COMMANDS[name][0]
     ros = room.split(".")[0] == "demandops_ros"
     word = name.replace("-", "_")
@@ -112,10 +108,10 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        name, command, rest = super().resolve_command(ctx, args)
+        name, command, arguments = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             slow_git.listen(show_slow)
-        return name, load(name) if name else command, rest
+        return name, load(name) if name else command, arguments
 
 
 @click.group(
@@ -138,7 +134,6 @@ def cli(verbose: bool) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run the command line and exit with its code."""
     sys.exit(run(args))
 
 
@@ -151,9 +146,8 @@ def run(args: list[str] | None = None) -> int:
         error.show()
         return ExitCode.WRONG_USAGE
     except click.Abort:
-        errors.print(
-            "\ninterrupted" if sys.stderr.isatty() else "interrupted"
-        )  # the terminal has shown ^C
+        # a terminal has shown ^C in this line
+        errors.print("\ninterrupted" if sys.stderr.isatty() else "interrupted")
         return ExitCode.INTERRUPTED
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")
