@@ -87,22 +87,18 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
         name, kinds=chosen, by=str(by), reason=" ".join((reason or "").split())
     ).goal()
     if dry_run or is_asked(yes, output):
-        row = _dry_run(goal, state_repo, output) or _row(goal, "unchanged", None, ())
+        row = _dry_run(goal, state_repo, output)
         show(output, row, _lines(row, True))
         if dry_run or row["outcome"] == "unchanged":
             return
         confirm("Continue?", yes, output)
-    row = _book(goal, by, state_repo, signing_key) or _row(goal, "unchanged", None, ())
+    row = _book(goal, by, state_repo, signing_key)
     show(output, row, _lines(row, False))
 
 
 def _book(
     goal: dict[str, Any], by: Person, state_repo: str, signing_key: Path | None
-) -> dict[str, Any] | None:
-    """Book the decommissioning; return the command's result as JSON data.
-
-    Return None if the inventory has the node but no claim concerns the node. This is no error.
-    """
+) -> dict[str, Any]:
     with started_generator(state_repo, signing_key) as generator:
         warned_if_unnamed(by)
         try:
@@ -113,11 +109,11 @@ def _book(
         except Refused as error:
             if not _is_unclaimed_node(error, goal, generator.snapshot):
                 raise
-            return None
+            return _row(goal, "unchanged", None, ())
     return _row(goal, receipt.outcome, receipt.commit, receipt.changes)
 
 
-def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any] | None:
+def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any]:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(progress=report)
         try:
@@ -125,7 +121,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
         except Refused as error:
             if not _is_unclaimed_node(error, goal, snapshot):
                 raise
-            return None
+            return _row(goal, "unchanged", None, ())
     if output == "text":
         print_consequences(decision)
     return _row(goal, decision.outcome, None, decision.changes.claims)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -42,14 +41,12 @@ class Document:
 
     file: str
     goal: Any
-    # The text of the file.
-    text: str
-    # The index of the document in the file, from 0.
-    number: int
+    text: str  # of the whole file
+    number: int  # of the document in the file, from 0
 
     @property
     def request_id(self) -> str:
-        """Return the id of the goal's request or demand; empty if the id is missing or no text."""
+        """The id of the goal's request or demand; empty if the id is missing or no text."""
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
@@ -98,9 +95,13 @@ def request(
       demandops request visit.yaml --release
       demandops request - --wait
     """
-    documents = [document for file in files for document in _documents(file)]
+    documents = []
+    for file in files:
+        name, text = read_input(file)
+        goals = enumerate(strict_yaml.load_all(text, name))
+        documents += [Document(name, goal, text, at) for at, goal in goals if goal is not None]
     if release:
-        documents = [replace(one, goal=_release_of(one.goal)) for one in documents]
+        documents = [replace(each, goal=_release_of(each.goal)) for each in documents]
     if not documents:
         raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     if any(form_faults(document.goal) for document in documents):
@@ -122,25 +123,14 @@ def request(
 
 
 def _is_unanswered(row: dict[str, Any]) -> bool:
-    """Return whether a request has no answer yet.
-
-    A request that waits for room on a node has an answer: the commit that records the wait.
-    """
+    """Return whether a request has no answer yet."""
+    # a request that waits for room on a node has an answer: the commit that records the wait
     return row["outcome"] == "waiting" and row["commit"] is None
 
 
-def _documents(file: str) -> Iterable[Document]:
-    name, text = read_input(file)
-    goals = enumerate(strict_yaml.load_all(text, name))
-    return [Document(name, goal, text, number) for number, goal in goals if goal is not None]
-
-
 def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
-    """Return the goal that releases what ``goal`` demands.
-
-    If ``goal`` is not a mapping, return it unchanged, because the check of goals refuses it later.
-    """
-    if not isinstance(goal, dict):
+    """Return the goal that releases what ``goal`` demands."""
+    if not isinstance(goal, dict):  # the check of goals refuses it later
         return goal
     if not is_demand_goal(goal):
         return {**goal, "shutdown": True}
@@ -215,23 +205,18 @@ def _book(
 
 
 def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]:
-    """Return the outcome of a request as a row of the output.
-
-    Raises:
-        Unsound: if it is not known whether the request was booked.
-    """
     try:
         result = answer.result(timeout=0)
     except (ShuttingDown, TimeoutError):  # the command was interrupted
         return _row(index, document.request_id, "waiting")
-    except Unsound:
+    except Unsound:  # it is not known whether the request was booked
         raise
     except DemandOpsError as error:
         return _refused(index, document, error)
     if not isinstance(result, Receipt):
         return _row(index, document.request_id, "proposed", proposal=result)
-    told = {name: getattr(result, name) for name in ("commit", "warnings", "not_held", "placed")}
-    return _row(index, result.request_id, result.outcome, **told)
+    more = {name: getattr(result, name) for name in ("commit", "warnings", "not_held", "placed")}
+    return _row(index, result.request_id, result.outcome, **more)
 
 
 def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
@@ -264,14 +249,12 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[dict[str, Any]]:
-    """Return the outcome of each request as a row of the output, without booking.
-
-    Each request is decided as if the requests before it were booked.
-    """
+    """Return the outcome of each request as a row of the output, without booking."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_render_version()
         state = repo.snapshot(progress=report).state
+        # each request is decided as if the requests before it were booked
         committed, written = repo.file_reader(), dict[str, str | None]()
 
         def read(path: str) -> str | None:
@@ -303,16 +286,6 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
     return rows
 
 
-def _unit_warnings(goal: Any) -> Iterable[str]:  # noqa: ANN401 - as it was read
-    """Yield a warning if the lease has no unit.
-
-    A lease without a unit counts as seconds, but its author may have meant minutes.
-    """
-    lease = goal.get("lease") if isinstance(goal, dict) else None
-    if isinstance(lease, int) and not isinstance(lease, bool):
-        yield f"lease: {lease} is {lease} seconds; write the unit, like {lease}s or {lease}m"
-
-
 def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
@@ -328,7 +301,13 @@ def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool)
             out.print(f"{title} {told}", soft_wrap=True)
         for choice in row["placed"]:
             out.print(f"  {choice}", soft_wrap=True)
-        for warning in (*_unit_warnings(document.goal), *row["warnings"]):
+        warnings = [*row["warnings"]]
+        lease = document.goal.get("lease") if isinstance(document.goal, dict) else None
+        if isinstance(lease, int) and not isinstance(lease, bool):
+            # it counts as seconds, but its author may have meant minutes
+            told = f"lease: {lease} is {lease} seconds; write the unit, like {lease}s or {lease}m"
+            warnings.insert(0, told)
+        for warning in warnings:
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:
             errors.print(f"  listed, but not held by the requester: {item}")

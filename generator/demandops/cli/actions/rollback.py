@@ -126,9 +126,8 @@ def _roll_back(
 ) -> dict[str, Any]:
     """Roll back with a generator; return the outcome as JSON data.
 
-    The caller knows the consequences on top of the commit ``base``. If the rollback was decided on
-    another commit, the data has the consequences on top of that commit. If the rollback was refused
-    or had no effect, the data says that there are none.
+    The caller knows the consequences on top of the commit ``base``. The data has others if the
+    rollback was decided on another commit, was refused or had no effect.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:
@@ -143,7 +142,7 @@ def _roll_back(
         return result | _consequences(None)
     with reader.opened(state_repo) as repo:
         decided_on = repo.commit(f"{receipt.commit}~1")
-        if decided_on != base:  # main has moved since
+        if decided_on != base:  # main has moved since the consequences were shown
             result |= _dry_run(repo, goal, decided_on)
     return result
 
