@@ -39,17 +39,16 @@ class Source:
     repo: Reader
     snapshot: Snapshot
     now: datetime
-    # The generated files that a generator has yet to write or remove.
-    not_rendered: Collection[str] = ()
+    not_rendered: Collection[str] = ()  # files that a generator has yet to write or remove
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
     """A kind of thing: its items, each with a ``name``, and how they are shown.
 
-    ``cells`` returns an item's cells, first for ``columns`` and then for ``wide``. Only ``-o wide``
-    shows the columns in ``wide``. ``filters`` maps an option to a function from an item to
-    values. An item is listed if the option matches one of the values.
+    ``cells`` returns an item's cells, first for ``columns`` and then for ``wide``, which only ``-o
+    wide`` shows. ``filters`` maps an option to a function from an item to values. An item is listed
+    if the option matches one of the values.
     """
 
     items: Callable[[Source], list[Json]]
@@ -60,15 +59,14 @@ class Kind:
 
 
 def _demands(source: Source) -> list[Json]:
-    found = demand_list.demands(source.snapshot.state)
     return [
         {
-            **asdict(one),
-            "state": _now(one.state, one.lease, source.now),
-            "since": time_data(one.since),
-            "lease": lease_data(one.lease),
+            **asdict(demand),
+            "state": _now(demand.state, demand.lease, source.now),
+            "since": time_data(demand.since),
+            "lease": lease_data(demand.lease),
         }
-        for one in found
+        for demand in demand_list.demands(source.snapshot.state)
     ]
 
 
@@ -77,24 +75,28 @@ def _now(state: str, lease: Lease | None, now: datetime) -> str:
 
 
 def _leases(source: Source) -> list[Json]:
-    leased = [one for one in _demands(source) if one["lease"]]
-    return sorted(leased, key=lambda one: (one["lease"]["until"] or "~", one["name"]))
+    leased = [demand for demand in _demands(source) if demand["lease"]]
+    # "~" sorts a lease that has not started behind every time
+    return sorted(leased, key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]))
 
 
 def _nodes(source: Source) -> list[Json]:
     world = source.snapshot.state
-    found = node_list.nodes(world, release_causes.releases(world))
     return [
-        {**asdict(one), "position": one.position.model_dump() if one.position else None}
-        for one in found
+        {**asdict(node), "position": node.position.model_dump() if node.position else None}
+        for node in node_list.nodes(world, release_causes.releases(world))
     ]
 
 
 def _services(source: Source) -> list[Json]:
     world = source.snapshot.state
     return [
-        {"name": name, "domains": demand_list.domains_of([one.node], world.config), **asdict(one)}
-        for name, one in bookkeeping(world).services.items()
+        {
+            "name": name,
+            "domains": demand_list.domains_of([service.node], world.config),
+            **asdict(service),
+        }
+        for name, service in bookkeeping(world).services.items()
     ]
 
 
@@ -103,10 +105,10 @@ def _connections(source: Source) -> list[Json]:
     return [
         {
             "name": name,
-            "domains": demand_list.domains_of([one.source, one.target], world.config),
-            **asdict(one),
+            "domains": demand_list.domains_of([each.source, each.target], world.config),
+            **asdict(each),
         }
-        for name, one in bookkeeping(world).connections.items()
+        for name, each in bookkeeping(world).connections.items()
     ]
 
 
@@ -159,7 +161,7 @@ def _lease_text(lease: Json | None, now: datetime) -> str:
 
 
 def effect_words(override: Json) -> list[str]:
-    """Return each effect of an override as text for people. ``override`` is JSON data."""
+    """Return each effect of an override as text. ``override`` is JSON data."""
     shown = ("version", "replicas", "node")
     listed = ("images", "values")
     return [
@@ -173,14 +175,15 @@ def effect_words(override: Json) -> list[str]:
 
 
 def _override_targets(item: Json) -> list[str]:
-    claims = (f"{one['subject']['kind']} {one['subject']['id']}" for one in item["claims"])
+    subjects = (claim["subject"] for claim in item["claims"])
+    claims = (f"{subject['kind']} {subject['id']}" for subject in subjects)
     return [*dict.fromkeys((*(release["name"] for release in item["releases"]), *claims))]
 
 
 def _key(name: str) -> Values:
     def values(item: Json) -> Iterable[str]:
-        found = item[name]
-        return [found] if isinstance(found, str) else found or ()
+        value = item[name]
+        return [value] if isinstance(value, str) else value or ()
 
     return values
 
@@ -341,9 +344,11 @@ KINDS: dict[str, Kind] = {
         ),
         (Column("Priority"), Column("Until (UTC)")),
         {
-            "node": lambda item: [one["node"] for one in item["releases"]],
-            "domain": lambda item: [one["domain"] for one in item["releases"]],
-            "requester": lambda item: [who for one in item["claims"] for who in one["requesters"]],
+            "node": lambda item: [release["node"] for release in item["releases"]],
+            "domain": lambda item: [release["domain"] for release in item["releases"]],
+            "requester": lambda item: [
+                who for claim in item["claims"] for who in claim["requesters"]
+            ],
         },
     ),
     "proposals": Kind(
