@@ -107,14 +107,19 @@ def application(  # noqa: PLR0913 - as many as options
     given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
 
     def made(config: Config) -> Files:
+        # before the questions, so that nobody answers them in vain
         new_application.refuse_name(name, config)
-        values = _completed(given)
-        made_services = tuple(_service(one) for one in values["--service"])
+        missing = [option for option, values in given.items() if not values]
+        if missing and not sys.stdin.isatty():
+            options = ", ".join(f"'{option}'" for option in missing)
+            raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
+        values = {option: given[option] or _asked(*_QUESTIONS[option]) for option in given}
+        planned_services = tuple(map(_service, values["--service"]))
         plan = ApplicationPlan(
             name,
-            description or f"Runs {', '.join(one.name for one in made_services)}",
-            dict(_input(one) for one in values["--input"]),
-            made_services,
+            description or f"Runs {', '.join(service.name for service in planned_services)}",
+            dict(map(_input, values["--input"])),
+            planned_services,
             _image(values["--image"][0]),
             node or _example_node(config),
         )
@@ -241,26 +246,11 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
     _write(directory, new_image.files(name, repository, url, texts), output, then)
 
 
-def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return a map from option to values; ask for the values that are missing.
-
-    Raises:
-        click.UsageError: if values are missing and there is no terminal to ask at.
-    """
-    missing = [option for option, values in given.items() if not values]
-    if missing and not sys.stdin.isatty():
-        options = ", ".join(f"'{option}'" for option in missing)
-        raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
-    return {option: values or _asked(*_QUESTIONS[option]) for option, values in given.items()}
-
-
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
     """Ask the question until the answer is valid; return the words of the answer.
 
-    Args:
-        question: the text to show.
-        check: raises a click exception for a word that is not valid.
-        most: the highest number of words; None for any number.
+    ``check`` raises a click exception for a word that is not valid. ``most`` is the highest number
+    of words; None for any number.
     """
 
     def valid(answer: str) -> tuple[str, ...]:
@@ -275,47 +265,48 @@ def _asked(question: str, check: Callable[[str], object], most: int | None) -> t
             check(word)
         return words
 
-    found: tuple[str, ...] = click.prompt(
+    words: tuple[str, ...] = click.prompt(
         question, default="", show_default=False, value_proc=valid
     )
-    return found
+    return words
 
 
 def _input(text: str) -> tuple[str, str]:
-    found = _INPUT.fullmatch(text)
-    if not found:
+    match = _INPUT.fullmatch(text)
+    if not match:
         raise click.BadParameter(
             f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
             param_hint="--input",
         )
-    if short := _SHORT_TYPE.fullmatch(found["type"]):
+    if short := _SHORT_TYPE.fullmatch(match["type"]):
         raise click.BadParameter(
             f"'{text}' has no message type of ROS 2; write "
-            f"{found['role']}={short['package']}/msg/{short['name']}",
+            f"{match['role']}={short['package']}/msg/{short['name']}",
             param_hint="--input",
         )
-    return found["role"], found["type"]
+    return match["role"], match["type"]
 
 
 def _service(text: str) -> ServicePlan:
-    found = _SERVICE.fullmatch(text)
-    if not found:
+    match = _SERVICE.fullmatch(text)
+    if not match:
         raise click.BadParameter(
             f"'{text}' is not NAME=PACKAGE/FILE; write it like "
             "detector=my_package/detector.launch.py",
             param_hint="--service",
         )
-    return ServicePlan(found["name"], found["package"], found["file"])
+    return ServicePlan(match["name"], match["package"], match["file"])
 
 
 def _image(text: str) -> Image:
-    found = _IMAGE.fullmatch(text)
-    if not found or not (found["tag"] or found["digest"]):
+    match = _IMAGE.fullmatch(text)
+    if not match or not (match["tag"] or match["digest"]):
         raise click.BadParameter(
             f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
         )
+    # not checked here, because `load` checks it with all the other new files
     return Image.model_construct(
-        repository=found["repository"], tag=found["tag"], digest=found["digest"]
+        repository=match["repository"], tag=match["tag"], digest=match["digest"]
     )
 
 
@@ -337,13 +328,7 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
 
 
 def _example_node(config: Config) -> str:
-    """Return the id of a node for the example demand: an edge server if there is one.
-
-    Only nodes in an access domain are considered.
-
-    Raises:
-        StateRepoError: if there is no such node.
-    """
+    # only nodes in an access domain can be named in a demand; an edge server comes first
     nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
     if not nodes:
         raise StateRepoError(
@@ -358,39 +343,31 @@ def _lay_down(
 ) -> None:
     """Write new files, but only if the whole configuration is valid with them.
 
-    Args:
-        directory: the checkout of the state repo.
-        made: returns the new files for the current configuration.
-        then: further hints to print after the names of the files.
-
-    Raises:
-        InvalidInput: a file is not valid, with or without the new files.
-        StateRepoError: the folder is not a checkout, a file exists, or a name is not a file name.
+    ``made`` returns the new files for the current configuration. ``then`` has further hints to
+    print after the names of the files.
     """
     with busy("reading the state repo"):
         files, faults = edited_checkout.files_of(directory)
         if faults:
             raise InvalidInput(faults)
-        known = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
-        config = load(known)
-    found = made(config)
-    if strange := [path for path in found if ".." in path.split("/") or "//" in path]:
+        existing = {
+            path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS
+        }
+        config = load(existing)
+    new_files = made(config)
+    if strange := [path for path in new_files if ".." in path.split("/") or "//" in path]:
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
     with busy("rendering an example of each application"):
-        try_configuration(State(load({**known, **found}), Ledger(), EVALUATE))
-    _write(
-        directory,
-        found,
-        output,
-        [f"to check the files: demandops check {directory}", *(then or [])],
-    )
+        try_configuration(State(load({**existing, **new_files}), Ledger(), EVALUATE))
+    hints = [f"to check the files: demandops check {directory}", *(then or [])]
+    _write(directory, new_files, output, hints)
 
 
-def _write(directory: Path, found: Files, output: str, then: list[str]) -> None:
-    if there := [path for path in found if (directory / path).exists()]:
+def _write(directory: Path, files: Files, output: str, then: list[str]) -> None:
+    if there := [path for path in files if (directory / path).exists()]:
         raise StateRepoError(f"{directory / there[0]} exists; move it away (nothing was changed)")
-    for path, text in found.items():
+    for path, text in files.items():
         (directory / path).parent.mkdir(parents=True, exist_ok=True)
         (directory / path).write_text(text, encoding="utf-8")
-    lines = [f"new: {directory / path}" for path in sorted(found)]
-    show(output, {"files": sorted(found)}, [*lines, *then])
+    lines = [f"new: {directory / path}" for path in sorted(files)]
+    show(output, {"files": sorted(files)}, [*lines, *then])
