@@ -91,7 +91,6 @@ def faults_of(error: DemandOpsError) -> list[Json]:
 
 
 def time_data(moment: datetime | None) -> str | None:
-    """Return a time as text for JSON, in UTC; None without a time."""
     return format_time(moment) if moment else None
 
 
@@ -105,7 +104,6 @@ def subject_data(subject: Subject) -> Json:
 
 
 def lease_data(lease: Lease | None) -> Json | None:
-    """Return a lease as JSON data."""
     if lease is None:
         return None
     return {
@@ -132,7 +130,6 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return a release's description, cluster, access domain, namespace and node as JSON data."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,
@@ -147,7 +144,6 @@ def release_data(release: Release) -> Json:
 
 
 def version_data(release: Release, ledger: Ledger) -> Json:
-    """Return the version of a release and the versions that its demands name, as JSON data."""
     if not isinstance(release, ServiceRelease):
         return {"version": None, "application_version": None, "versions_asked": {}}
     return {
@@ -179,7 +175,6 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
 
 
 def commit_data(entry: LogEntry) -> Json:
-    """Return a commit as JSON data: its author, the parts of its message and most trailers."""
     return {
         "commit": entry.commit,
         "time": time_data(entry.time),

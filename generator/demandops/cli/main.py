@@ -68,8 +68,6 @@ _OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, Permission
 
 
 class ExitCode(IntEnum):
-    """The exit codes of all commands."""
-
     DONE = 0
     USER_ERROR = 1
     WRONG_USAGE = 2
@@ -138,7 +136,6 @@ def main(args: list[str] | None = None) -> None:
 
 
 def run(args: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
     try:
         code = cli.main(args=args, prog_name="demandops", standalone_mode=False)
         return code if isinstance(code, int) else ExitCode.DONE
@@ -159,7 +156,7 @@ def run(args: list[str] | None = None) -> int:
         for each in error.faults if isinstance(error, InvalidInput) else [error]:
             errors.print(f"error: {each}")
         return ExitCode.USER_ERROR
-    except BrokenPipeError:  # `demandops log | head`
+    except BrokenPipeError:  # `demandops log | head`; Python would report it again at the exit
         sys.stderr.close()
         return ExitCode.DONE
     except Exception as error:

@@ -42,6 +42,7 @@ def console(stderr: bool = False) -> Console:
     # into a file or a pipe, no line is wrapped that a program may read
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _WIDE
+    # rich would take [bold] and :smile: in the texts of people for its own markup
     return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
@@ -55,6 +56,7 @@ def terminal_width() -> int | None:
 
 def painted(text: str, style: str) -> str:
     """Return text in a style (``bold``, ``dim`` or a color), or unchanged without colors."""
+    # NO_COLOR is a convention of many programs: https://no-color.org
     colors = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     if not colors or not style or os.environ.get("TERM") == "dumb":
         return text
@@ -84,7 +86,6 @@ errors = _Errors()
 
 
 def warn_of(problems: Iterable[object]) -> None:
-    """Warn about invalid files."""
     for problem in problems:
         errors.print(f"warning: {problem}; the file's last valid version, if any, is in effect")
 

@@ -46,6 +46,7 @@ def _chosen(around: Path | None) -> Context | None:
     """Return the context that applies, and remember it for :func:`_from_context`."""
     from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
 
+    # clusters and signing key of a context apply only to its own state repo
     ctx = click.get_current_context()
     name = ctx.meta.get(_NAME)
     content = contexts.read()
@@ -80,6 +81,7 @@ def _writable() -> str | None:
     context = _chosen(around)
     if around is None:
         return context.state_repo if context else None
+    # a generator never writes to a checkout; a dry run needs no place to write to
     origin = origin_of(around)
     if origin is None and click.get_current_context().params.get("dry_run"):
         return str(around)
@@ -114,7 +116,6 @@ def _remember_name(ctx: click.Context, param: click.Parameter, value: str | None
 
 
 def context_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    """Return the names of contexts with which a shell completes a word."""
     from demandops.cli import contexts  # noqa: PLC0415
 
     return [name for name in contexts.read().contexts if name.startswith(incomplete)]

@@ -17,7 +17,7 @@ from demandops.staterepo.git.repository import StateRepository
 from demandops.web.situation import HealthChange
 from demandops.web.views.health_word import word_of
 
-# How many changes of health are kept; older ones are dropped.
+# How many changes of health are kept. They are in memory only, because the page writes nothing.
 _KEPT = 2_000
 
 
@@ -58,6 +58,8 @@ class ClusterWatch:
         self, targets: Iterable[Target], commit: str, repository: StateRepository
     ) -> dict[str, ReleaseStatus]:
         """Return the status of each release, by the name of the release."""
+        # Health is judged by the file that the cluster has applied. Judged by the newest commit,
+        # everything would be `waiting` for seconds after each commit.
         targets = list(targets)
         self._watch(target.domain for target in targets)
         reported = statuses(targets, commit, self._caches, repository, repository.changed_paths)

@@ -46,8 +46,6 @@ _MOST_COMMIT_STATES = 8
 
 
 class Follower:
-    """Provides the newest situation of a state repo, and situations at earlier commits."""
-
     def __init__(
         self,
         reader: Reader,

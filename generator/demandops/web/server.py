@@ -19,8 +19,6 @@ _LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 
 class WebServer:
-    """A running web server."""
-
     def __init__(self, address: str, option: str, follower: Follower) -> None:
         """Start the server.
 

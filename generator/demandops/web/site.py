@@ -74,8 +74,6 @@ _MOST_WAITING = 20
 
 
 class Site:
-    """The ASGI application of the page."""
-
     def __init__(
         self,
         follower: Follower,
@@ -125,6 +123,7 @@ class Site:
             ],
             exception_handlers={404: self._nothing_here},
         )
+        # Starlette would redirect to an address with the Host header, which the client chooses.
         self.application.router.redirect_slashes = False
 
     def _shows(self, view: View) -> Callable[[Request], Any]:
@@ -234,7 +233,7 @@ _REFUSAL = PlainTextResponse("another site asked for this; open the page itself\
 def _is_foreign(headers: Headers) -> bool:
     """Return whether another site made the browser send a request."""
     site = headers.get("sec-fetch-site")
-    if site is None:  # an old browser, a program, or a page without TLS on another machine
+    if site is None:  # an old browser, a program, or another machine's page without TLS
         origin = headers.get("origin")
         return origin is not None and origin.partition("://")[2] != headers.get("host")
     # A link to the page may be on any site: the browser shows the page in a tab of its own, where

@@ -66,11 +66,9 @@ class ReusableRows:
 
 
 class CommitState:
-    """The state at one commit: what runs, and for whom.
+    """The state at one commit, with everything that the page derives from it.
 
-    Most attributes are computed at their first use, and then kept. :meth:`take_over` takes the
-    unchanged releases and rows from an earlier commit state, so that for a new commit only the
-    changed ones must be computed.
+    Most attributes are computed at their first use, and then kept.
     """
 
     def __init__(
@@ -181,7 +179,7 @@ class CommitState:
         """The planned releases by key.
 
         The value is None if an override denies the release, if overrides suspend all claims that
-        need the release, or if the client of a connection carries no topic.
+        need it, or if the client of a connection carries no topic.
         """
         if self._planned is None:
             self._planned = {key: self._plan(key) for key in all_keys(self.state)}
@@ -194,7 +192,6 @@ class CommitState:
 
     @cached_property
     def targets(self) -> list[tuple[Release, Target]]:
-        """Every planned release and its target, sorted by cluster and name."""
         return [(planned.release, planned.target) for planned in self._sorted]
 
     @cached_property
@@ -266,7 +263,6 @@ class Situation:
 
     @property
     def unwatched(self) -> list[str]:
-        """The clusters with releases that the page does not watch, sorted."""
         used = {target.domain.cluster for _, target in self.commit_state.targets}
         return sorted(used - self.watched)
 

@@ -61,6 +61,7 @@ class ViewRequest:
 
     def page(self) -> int:
         """Return the number of the requested page; 1 if the request gives no number."""
+        # `isdigit` accepts "²", of which `int` makes no number
         text = self.get("page")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
 

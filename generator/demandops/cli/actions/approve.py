@@ -60,7 +60,6 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
 
 
 def print_proposal(proposal: PendingProposal, output: str) -> None:
-    """Print which proposal it is on stderr, unless output is JSON."""
     if output == "text":
         for line in (
             f"{proposal.branch} at commit {proposal.commit}",

@@ -99,6 +99,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
 def _book(
     goal: dict[str, Any], by: Person, state_repo: str, signing_key: Path | None
 ) -> dict[str, Any]:
+    # through the journal, like a demand, so it may run beside other generators
     with started_generator(state_repo, signing_key) as generator:
         warned_if_unnamed(by)
         try:
@@ -128,6 +129,7 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
 
 
 def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
+    # a node that holds nothing is no error; any other name that holds nothing may be misspelled
     codes = {each.code for each in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 

@@ -29,7 +29,6 @@ def await_answer(future: Future[Any]) -> None:
 
 @contextmanager
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
-    """Yield a started generator, and close it at the end of the block."""
     # within the block, SIGTERM acts like Ctrl-C
     before = signal.getsignal(signal.SIGTERM)
     with suppress(ValueError):  # only the main thread may set a handler
@@ -38,7 +37,7 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
         with progress("reading the ledger") as report:
             generator = Generator(
                 state_repo,
-                requester_limit=None,
+                requester_limit=None,  # the command is its only client
                 start_offline=False,
                 signing_key=signing_key,
                 progress=report,
@@ -58,7 +57,6 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
 
 
 def print_consequences(decision: Decision) -> None:
-    """Print the releases that a decision changes, and the files that it writes or removes."""
     out = console()
     for line in release_lines(decision.releases):
         out.print(f"  {line}", soft_wrap=True)

@@ -227,7 +227,6 @@ def print_edit(edit: Edit, entry: Entry, published: Published | None, output: st
 
 
 def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
-    """Return one line for each release and claim that the override affects."""
     verb = "affects" if edit.text is not None else "no longer affects"
     lines = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
     lines += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
@@ -235,7 +234,6 @@ def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
 
 
 def warn_of_idle(entry: Entry) -> None:
-    """Warn about an override that has no effect now."""
     override = entry.override
     if entry.state == "matches nothing":
         errors.print(f"warning: {override.path} has no effect on anything that is demanded now")

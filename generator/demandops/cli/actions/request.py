@@ -37,8 +37,6 @@ from demandops.staterepo import reader
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A goal, and the file that it comes from."""
-
     file: str
     goal: Any
     text: str  # of the whole file
@@ -123,13 +121,11 @@ def request(
 
 
 def _is_unanswered(row: dict[str, Any]) -> bool:
-    """Return whether a request has no answer yet."""
     # a request that waits for room on a node has an answer: the commit that records the wait
     return row["outcome"] == "waiting" and row["commit"] is None
 
 
 def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
-    """Return the goal that releases what ``goal`` demands."""
     if not isinstance(goal, dict):  # the check of goals refuses it later
         return goal
     if not is_demand_goal(goal):
@@ -249,7 +245,6 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[dict[str, Any]]:
-    """Return the outcome of each request as a row of the output, without booking."""
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_render_version()

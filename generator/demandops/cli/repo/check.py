@@ -153,7 +153,6 @@ def _lines(checked: CheckResult) -> Iterator[str]:
 
 
 def _file_lines(consequence: MergePreview) -> Iterator[str]:
-    """Yield lines that list the files that a merge changes, and then their diffs."""
     others, files = {*consequence.other_files}, consequence.files
     if not files:
         return

@@ -53,7 +53,6 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
 def differences(
     repo: Reader, before: str, after: str
 ) -> tuple[tuple[EntryChange, ...], MergePreview]:
-    """Return what differs between two commits, in the bookkeeping and in what runs."""
     old, new = (loaded(repo, revision) for revision in (before, after))
     commits = str(old.commit), str(new.commit)
     differing = repo.changed_files(*commits, (CLUSTERS_ROOT,))

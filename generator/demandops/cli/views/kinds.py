@@ -34,8 +34,6 @@ Values = Callable[[Json], Iterable[str]]
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The data for every list: the state repo, its state at a commit, and the time."""
-
     repo: Reader
     snapshot: Snapshot
     now: datetime
@@ -161,7 +159,6 @@ def _lease_text(lease: Json | None, now: datetime) -> str:
 
 
 def effect_words(override: Json) -> list[str]:
-    """Return each effect of an override as text. ``override`` is JSON data."""
     shown = ("version", "replicas", "node")
     listed = ("images", "values")
     return [

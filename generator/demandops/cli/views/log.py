@@ -229,6 +229,7 @@ def log_table(rows: list[Json], now: datetime, *, wide: bool = False) -> Table:
     cells = []
     for row in rows:
         requesters = row["requesters"] or [row["author"]]
+        # the trailers name the requesters whose claims changed; a person asked for it
         if row["operation"] == "rollback":
             requesters = [f"{row['author']}, for {', '.join(row['requesters'])}"]
         shown = (

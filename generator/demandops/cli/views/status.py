@@ -282,7 +282,6 @@ _COLUMNS = (
 
 
 def releases_table(rows: Iterable[Json]) -> Table:
-    """Return a table of releases, which ``rows`` has as JSON data."""
     cells = [
         (
             row["name"],

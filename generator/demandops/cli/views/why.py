@@ -232,7 +232,6 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
 
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
-    """Return the commits that started, changed and stopped the object of ``match``."""
     if match.kind in ("node", "requester"):  # `demandops log` lists their commits
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":

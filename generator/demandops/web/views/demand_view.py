@@ -46,11 +46,7 @@ class ExplainedDemand:
 
 
 def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand:
-    """Return a demand with its claims, and what would change if it were released.
-
-    Raises:
-        StateRepoError: if the demand holds nothing.
-    """
+    """Return a demand and what would change if it were released; refuse one that holds nothing."""
     claims = now.commit_state.claims_of_demands.get(id)
     if not claims:
         waiting = now.commit_state.state.ledger.waiting.values()

@@ -18,16 +18,12 @@ _MOST_PARTS = 4
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A link to a view: the path of the view, and its parameters."""
-
     path: str
     params: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A text, and its link to a view, if any."""
-
     text: str
     link: Link | None = None
 
@@ -69,8 +65,6 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A field of every row: its name in filters, and its title."""
-
     key: str
     title: str
 
@@ -94,7 +88,6 @@ class Row:
 
     @cached_property
     def all_texts(self) -> str:
-        """All texts of the row in lower case, each on its own line."""
         return "\n".join(text for texts in self.texts.values() for text in texts)
 
 
@@ -143,8 +136,6 @@ class Filter:
         return bool(self._words)
 
     def matches(self, row: Row) -> bool:
-        """Return whether a row contains all words of the filter."""
-
         def has(word: str) -> bool:
             for sign in ":=":
                 key, separator, wanted = word.partition(sign)
@@ -164,7 +155,7 @@ def exactly(key: str, value: str) -> str:
 def table(
     columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
 ) -> Table:
-    """Return a page of the rows that match the filter ``wanted``.
+    """Return a page of the rows that match the filter.
 
     An unknown ``sort`` means the first column. A page number out of range means the nearest page.
     """

@@ -35,8 +35,6 @@ _MOST_LINES = 300
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The connections from one node to another, drawn as one line."""
-
     path: str
     tone: str
     is_lit: bool
@@ -75,14 +73,10 @@ class Picture:
 
 
 def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
-    """Return the map of a situation.
+    """Return the map of a situation; services, connections and nodes that match are lit.
 
-    Args:
-        now: the situation to draw.
-        wanted: the filter; services, connections and nodes that match are lit.
-        layout: ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
-            position, and ``cluster`` otherwise. If no node that is drawn has a position, nodes are
-            always drawn by cluster.
+    ``layout`` is ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
+    position, else ``cluster``. If no drawn node has a position, nodes are drawn by cluster.
     """
     config = now.commit_state.config
     nodes = list(config.nodes.values())

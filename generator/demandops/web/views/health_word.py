@@ -30,7 +30,7 @@ def word_of(status: ReleaseStatus) -> str:
 
 def since_of(status: ReleaseStatus) -> datetime | None:
     """Return when a release's state last changed; None if the cluster reports no valid time."""
-    try:
+    try:  # Python 3.10 reads no "Z"
         since = datetime.fromisoformat(status.since.replace("Z", "+00:00"))
     except ValueError:
         return None

@@ -14,7 +14,7 @@ from demandops.plan.planner import connection_topics
 from demandops.plan.release import ServiceRelease
 from demandops.plan.views import demand_list
 from demandops.subject import SubjectKind
-from demandops.web.situation import CommitState, ReusableRows, Situation
+from demandops.web.situation import ReusableRows, Situation
 from demandops.web.views.filtered_table import Cell, Column, Link, Part, Row, cell, exactly
 from demandops.web.views.health_word import RANKS, WORDS, word_of, worst_word
 
@@ -88,9 +88,14 @@ def _service(world: World, release: ServiceRelease, claims: list[Claim], word: s
 
 
 def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
-    ledger, clients_by_connection = now.commit_state.active.ledger, _clients(now.commit_state)
+    ledger = now.commit_state.active.ledger
+    clients_of: dict[str, list[str]] = {}
+    for name, release in now.commit_state.releases.items():
+        if not isinstance(release, ServiceRelease):
+            for id in release.connections:
+                clients_of.setdefault(id, []).append(name)
     for id in ledger.subjects(SubjectKind.CONNECTION):
-        claims, clients = ledger.connection_claims(id), clients_by_connection.get(id, [])
+        claims, clients = ledger.connection_claims(id), clients_of.get(id, [])
         if claims:  # at least one claim is not suspended
             yield id, (claims, clients, worst_word(map(now.status, clients)))
 
@@ -113,15 +118,6 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
             "node": [held.source, held.target],
         },
     )
-
-
-def _clients(commit_state: CommitState) -> dict[str, list[str]]:
-    clients: dict[str, list[str]] = {}
-    for name, release in commit_state.releases.items():
-        if not isinstance(release, ServiceRelease):
-            for id in release.connections:
-                clients.setdefault(id, []).append(name)
-    return clients
 
 
 def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
@@ -191,6 +187,8 @@ def rows_of(now: Situation, name: str) -> list[Row]:
     """Return the rows of a list; reuse the rows of entries that have not changed."""
     commit_state, kind = now.commit_state, LISTS[name]
     reusable = commit_state.rows.get(name, ReusableRows(None, {}))
+    # the follower makes a new mapping of statuses whenever it looks, so the same mapping means that
+    # nothing has changed
     if reusable.statuses is not now.statuses:
         rows: dict[str, tuple[Values, Row]] = {}
         for id, values in kind.entries(now):

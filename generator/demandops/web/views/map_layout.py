@@ -17,8 +17,6 @@ _TYPES = ("cloud", "edge", "station", "vehicle")
 
 @dataclass(frozen=True, slots=True)
 class ServiceMark:
-    """A service as it is drawn on the card of its node."""
-
     name: str
     text: str
     tone: str
@@ -56,8 +54,6 @@ class NodeCard:
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A cluster as it is drawn: a box around the cards of its nodes."""
-
     name: str
     x: float
     y: float
@@ -99,6 +95,7 @@ def _box(
     step = first.width + gap
     fitting = max(1, int((WIDTH - 2 * _GAP + gap) / step))
     widest = max(len(group) for group in groups.values())
+    # about 2.5 times as many columns as rows, but at least 4
     columns = min(fitting, widest, max(4, math.ceil(math.sqrt(total * 2.5))))
     order = {name: place for place, name in enumerate(_TYPES)}
     width = WIDTH if is_alone else max(130.0, 2 * _GAP + step * columns - gap)
@@ -129,6 +126,7 @@ def by_place(
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
     widest = max(cards[id].width for id in spots)
+    # the same in both directions, so that distances on the map can be compared
     scale = min(
         (WIDTH - widest) / max(max(xs) - min(xs), 1.0),
         _PLACE_HEIGHT / max(max(ys) - min(ys), 1.0),

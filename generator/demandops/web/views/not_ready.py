@@ -48,7 +48,6 @@ class Cause:
         return KINDS[self.kind]
 
     def row(self) -> Row:
-        """Return the cause as a row, to which filters can be applied."""
         texts = {
             "release": self.releases,
             "application": self.applications,
@@ -79,11 +78,8 @@ def causes(
 ) -> list[Cause]:
     """Return every cause that matches the filter, the worst kind first, then the oldest.
 
-    Args:
-        now: the situation.
-        wanted: the filter.
-        last_change: returns the newest commit that changed a file or folder.
-        pending: the generated files that a generator must still write or remove.
+    ``last_change`` returns the newest commit that changed a file or folder. ``pending`` are the
+    generated files that a generator must still write or remove.
     """
     all_causes = [
         *_unread_or_invalid(now, last_change),

@@ -48,13 +48,8 @@ class Plot:
     table: tuple[tuple[datetime, str], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """A measured value, and the time at which it was measured."""
-
-    time: datetime
-    value: float
-
+# A measured value, and the time at which it was measured.
+Sample = tuple[datetime, float]
 
 _BOOKED = {"join", "put"}
 _RELEASED = {"shutdown", "release", "expire", "decommission"}
@@ -75,13 +70,11 @@ def plots(
     demands = [commit.entry for commit in commits if commit.entry.first("Operation-Id")]
     # The author's time of a demand's commit is when the generator received the demand.
     waits = [
-        Sample(entry.time, (entry.time - entry.authored).total_seconds())
+        (entry.time, (entry.time - entry.authored).total_seconds())
         for entry in demands
         if entry.authored and entry.first("Operation") in _BOOKED | _RELEASED
     ]
-    ready = [
-        Sample(change.time, change.lasted_s) for change in health if change.lasted_s is not None
-    ]
+    ready = [(change.time, change.lasted_s) for change in health if change.lasted_s is not None]
     make = _PlotMaker(start, span_s)
     return [
         make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
@@ -110,14 +103,12 @@ def _times(commits: Iterable[Commit], operations: set[str]) -> list[datetime]:
 
 
 class _PlotMaker:
-    """Makes plots of one span of time, which it divides into bins of equal length."""
-
     def __init__(self, start: datetime, span_s: float) -> None:
         self._start, self._bin_s = start, span_s / _BINS
         self._span = span_s
 
     def counts(self, title: str, times: Iterable[datetime], about: str) -> Plot:
-        bins = self._bins(Sample(at, 1.0) for at in times)
+        bins = self._bins((at, 1.0) for at in times)
         total = sum(map(len, bins))
         per_hour = total * 3600 / self._span
         summary = f"{total} in all, {per_hour:.3g} an hour"
@@ -136,16 +127,16 @@ class _PlotMaker:
 
     def _bins(self, samples: Iterable[Sample]) -> list[list[float]]:
         bins: list[list[float]] = [[] for _ in range(_BINS)]
-        for sample in samples:
-            place = int((sample.time - self._start).total_seconds() / self._bin_s)
-            if sample.time >= self._start:
-                bins[min(place, _BINS - 1)].append(sample.value)
+        for time, value in samples:
+            place = int((time - self._start).total_seconds() / self._bin_s)
+            if time >= self._start:
+                bins[min(place, _BINS - 1)].append(value)
         return bins
 
     def _plot(
         self, title: str, unit: str, about: str, values: list[float], summary: str, suffix: str
     ) -> Plot:
-        top = max(*values, 1.0)
+        top = max(*values, 1.0)  # at least 1, so that bins without a value divide by no zero
         width = WIDTH / _BINS
         starts = [self._start + timedelta(seconds=self._bin_s * n) for n in range(_BINS)]
         texts = [f"{value:.3g}{suffix}" for value in values]

@@ -75,8 +75,7 @@ class Explained:
 def explained(now: Situation, reader: Reader, name: str) -> Explained:
     """Return why a release runs, and the release's history.
 
-    Raises:
-        StateRepoError: if the situation's commit has no such release, and no earlier one had.
+    A StateRepoError says that the situation's commit has no such release, and no earlier one had.
     """
     commit_state = now.commit_state
     release = commit_state.releases.get(name)

@@ -44,8 +44,6 @@ _BY_DEMANDS = {"join", "shutdown", "put", "release", "renew", "expire", "decommi
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of the time line: a commit, or a change of a release's health."""
-
     lane: str
     time: datetime
     word: str
@@ -56,7 +54,6 @@ class Event:
     tone: str = ""
 
     def row(self) -> Row:
-        """Return the event as a row, to which filters can be applied."""
         return Row(
             {"lane": cell(self.lane), "word": cell(self.word), "summary": cell(self.summary)},
             {"who": [self.who], "commit": [self.commit], "release": [self.release]},
@@ -82,8 +79,6 @@ class Dot:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A mark with a label for a time, below the time line."""
-
     x: float
     label: str
 
@@ -115,7 +110,7 @@ def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Ev
 
 def of_commit(commit: Commit) -> Event:
     entry = commit.entry
-    word = entry.first("Operation") or "by hand"
+    word = entry.first("Operation") or "by hand"  # only generators write this trailer
     lane = "people"
     if word in _BY_DEMANDS or PROPOSAL in entry.trailers:
         lane = "demands"
@@ -137,13 +132,10 @@ def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
 def strip(
     events: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
 ) -> Strip:
-    """Return the picture of the time line.
+    """Return the picture of the time line that ends at ``now``, for events that are newest first.
 
-    Args:
-        events: the events, newest first.
-        now: the time at the end of the line.
-        span: a key of ``SPANS``; any other value means the shortest span that has enough events.
-        chosen: the time and the id of the chosen commit; None if no earlier commit is chosen.
+    If ``span`` is no key of ``SPANS``, it is the shortest that has enough events. ``chosen`` is the
+    time and the id of the chosen commit; None if no earlier commit is chosen.
     """
     if span not in SPANS:
         # enough events are 20, or three quarters of all events, whichever is less
@@ -165,10 +157,16 @@ def strip(
         if event.time >= start:
             x = min(x_of(event.time), WIDTH - 1e-6)  # an event of this moment is in the last bin
             bins.setdefault((event.lane, int(x * _BINS / WIDTH)), []).append(event)
-    dots = tuple(
-        _dot(lane, (place + 0.5) * WIDTH / _BINS, group, chosen[1] if chosen else "")
-        for (lane, place), group in sorted(bins.items())
-    )
+    dots = []
+    for (lane, place), group in sorted(bins.items()):
+        newest, count = group[0], len(group)
+        more = f", and {count - 1} more" if count > 1 else ""
+        what = " ".join(filter(None, (newest.release, newest.summary)))
+        label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
+        tone = "bad" if any(event.tone == "bad" for event in group) else newest.tone
+        is_chosen = chosen is not None and any(event.commit == chosen[1] for event in group)
+        x, radius = (place + 0.5) * WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
+        dots.append(Dot(lane, x, radius, count, label, newest.commit, tone, is_chosen))
     step = next((each for each in _STEPS_S if length / each <= _TICKS), length / _TICKS)
     form = "%H:%M:%S" if step < 60 else "%H:%M" if step < 86400 else "%m-%d"
     ticks, at = list[Tick](), math.ceil(start.timestamp() / step) * step
@@ -178,15 +176,4 @@ def strip(
         at += step
     mark = x_of(chosen[0]) if chosen else None
     shown = mark if mark is not None and 0 <= mark <= WIDTH else None
-    return Strip(span, dots, tuple(ticks), shown)
-
-
-def _dot(lane: str, x: float, group: Sequence[Event], chosen: str) -> Dot:
-    newest, count = group[0], len(group)
-    more = f", and {count - 1} more" if count > 1 else ""
-    what = " ".join(filter(None, (newest.release, newest.summary)))
-    label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
-    tone = next((event.tone for event in group if event.tone == "bad"), newest.tone)
-    radius = min(4.0 + math.log2(count), 8.0)
-    is_chosen = bool(chosen) and any(event.commit == chosen for event in group)
-    return Dot(lane, x, radius, count, label, newest.commit, tone, is_chosen)
+    return Strip(span, tuple(dots), tuple(ticks), shown)
