@@ -28,10 +28,7 @@ class ClusterWatch:
     """
 
     def __init__(
-        self,
-        clusters: Mapping[str, ClusterAccess],
-        on_change: Callable[[], None],
-        runtime: Runtime,
+        self, clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None], runtime: Runtime
     ) -> None:
         self._runtime = runtime
         self._caches = {

@@ -75,10 +75,7 @@ _MOST_WAITING = 20
 
 class Site:
     def __init__(
-        self,
-        follower: Follower,
-        hosts: tuple[str, ...] = ("*",),
-        documentation: Path | None = None,
+        self, follower: Follower, hosts: tuple[str, ...] = ("*",), documentation: Path | None = None
     ) -> None:
         """Make the site.
 

@@ -23,12 +23,7 @@ from demandops.cli.json_output import (
 )
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors, progress
-from demandops.cli.target import (
-    dry_run_option,
-    hint_to_pull,
-    signing_option,
-    writable_repo_option,
-)
+from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
 from demandops.config.base_model import parse_file
 from demandops.config.override import Override, OverrideFile
 from demandops.forge import ForgeError, forge_for

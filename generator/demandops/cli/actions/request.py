@@ -18,12 +18,7 @@ from demandops.cli.actions.ledger_change import (
 )
 from demandops.cli.json_output import faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
-from demandops.cli.target import (
-    dry_run_option,
-    hint_to_pull,
-    signing_option,
-    writable_repo_option,
-)
+from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
 from demandops.decision import admit, decide, form_faults
 from demandops.demand.demand_goal import is_demand_goal
 from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, Withdrawn, fault

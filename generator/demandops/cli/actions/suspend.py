@@ -40,11 +40,7 @@ def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
     help="When the suspension ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
 )
 @editing
-def suspend(
-    expires: str | None,
-    options: EditOptions,
-    **selected: tuple[str, ...],
-) -> None:
+def suspend(expires: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Stop applications and connections; their claims stay booked.
 
     Nothing runs for these claims, and new demands that match the options are refused. To end the

@@ -45,12 +45,7 @@ _CRASH = re.compile(r"CrashLoop|exit code|OOMKilled|RunContainerError", re.I)
 
 
 def remedy_of(
-    kind: Kind,
-    release: Release,
-    config: Config,
-    object: str,
-    reason: str,
-    last_change: LastChange,
+    kind: Kind, release: Release, config: Config, object: str, reason: str, last_change: LastChange
 ) -> Remedy:
     """Return who can probably fix a release, and how.
 
