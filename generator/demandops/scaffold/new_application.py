@@ -53,8 +53,7 @@ def refuse_name(name: str, config: Config) -> None:
     """Refuse a name that is not valid, or that an application, a chart or an image has already."""
     if not _NAME.fullmatch(name):
         raise InvalidInput.at(
-            "NAME",
-            f"{quoted(name)} cannot be used here; write {PATTERN_WORDS[_NAME.pattern]}",
+            "NAME", f"{quoted(name)} cannot be used here; write {PATTERN_WORDS[_NAME.pattern]}"
         )
     if name in config.appdefs or name in config.charts or name in config.images:
         raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")

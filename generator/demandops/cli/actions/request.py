@@ -173,10 +173,7 @@ def _book(
 ) -> list[dict[str, Any]]:
     answers: list[_Answer] = []
     try:
-        with (
-            started_generator(state_repo, signing_key) as generator,
-            progress("booking") as report,
-        ):
+        with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
             for document in documents:
                 answers.append(_submitted(generator, document, wait))
             for done, answer in enumerate(answers, start=1):

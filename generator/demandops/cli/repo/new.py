@@ -134,7 +134,7 @@ def application(  # noqa: PLR0913 - as many as options
 
     then = [
         "when the files are on main, try the application: demandops request --dry-run "
-        f"{directory / 'appdefs' / name / 'demand.yaml'}",
+        f"{directory / 'appdefs' / name / 'demand.yaml'}"
     ]
     _lay_down(directory, made, output, then)
 

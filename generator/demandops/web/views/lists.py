@@ -80,10 +80,7 @@ def _service(world: World, release: ServiceRelease, claims: list[Claim], word: s
             "requester": _requesters(release.requesters),
             "health": health_cell(word),
         },
-        {
-            "demand": [*dict.fromkeys(claim.demand for claim in claims)],
-            "type": [release.node.type],
-        },
+        {"demand": [*dict.fromkeys(claim.demand for claim in claims)], "type": [release.node.type]},
     )
 
 
@@ -113,10 +110,7 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
             "release": cell(*map(release_part, clients)),
             "health": health_cell(word),
         },
-        {
-            "demand": [claim.demand for claim in claims],
-            "node": [held.source, held.target],
-        },
+        {"demand": [claim.demand for claim in claims], "node": [held.source, held.target]},
     )
 
 
