@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import click
@@ -12,7 +13,6 @@ from demandops import strict_yaml
 from demandops.cli.json_output import Json, output_formats, print_json, show
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import at_option, errors, painted, progress, warn_of, warn_of_not_rendered
-from demandops.cli.table import Table
 from demandops.cli.target import state_repo_option
 from demandops.cli.views.kinds import KINDS, Kind, Source
 from demandops.config.policy import matches
@@ -204,10 +204,8 @@ def _print(kind: str, source: Source, items: list[Json], output: str, watch: boo
     elif output == "name":
         show(output, None, [item["name"] for item in items])
     else:
-        wide = output == "wide"
-        columns = [*shown.columns, *(shown.wide if wide else ())]
-        rows = [shown.cells(item, source.now)[: len(columns)] for item in items]
-        table = Table(columns, rows, empty=f"no {kind}", styles=_COLORS, whole=wide)
+        table = shown.table(items, source.now, wide=output == "wide")
+        table = replace(table, empty=f"no {kind}", styles=_COLORS)
         when = f"{source.now:%H:%M:%S} UTC, " if watch else ""
         note = painted(f"{when}at {commit[:10]}", "dim")
         show(output, None, [table, *([note] if watch else [])])

@@ -93,8 +93,7 @@ def _screen(
     last = _part("Latest commits", commits, width, height // 3)
     room = height - _OTHER_LINES - len(last)
     first = _part("Releases", releases_table(releases), width, room * 2 // 3)
-    cells = [demands.cells(item, now)[: len(demands.columns)] for item in items]
-    middle = _part("Demands", Table(demands.columns, cells), width, room - len(first))
+    middle = _part("Demands", demands.table(items, now), width, room - len(first))
     title = [painted(head, "bold"), f"{counts}; {health}"]
     return [*title, "", *first, "", *middle, "", *last][: height - 1]
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
@@ -83,8 +83,7 @@ def causes(
     """
     all_causes = [
         *_unread_or_invalid(now, last_change),
-        *_suspended(now.commit_state, last_change),
-        *_denied(now.commit_state, last_change),
+        *_overridden(now.commit_state, last_change),
         *_of_releases(now, last_change),
         *_awaited(now, sorted(pending)),
     ]
@@ -163,53 +162,46 @@ def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Caus
         )
 
 
-def _suspended(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
+def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
+    """Yield a cause for each override that suspends claims, and for each release that one denies.
+
+    The claims that need a denied release are not suspended as a whole.
+    """
     by_override: dict[str, tuple[Override, list[Claim]]] = {}
     for claim, override in suspended_claims(commit_state.state):
         by_override.setdefault(override.name, (override, []))[1].append(claim)
+    denials: list[tuple[Override, Part, str, Sequence[Claim], Iterable[str], tuple[str, ...]]] = []
+    claims: Sequence[Claim]
+    applications: Iterable[str]
     for override, claims in by_override.values():
-        names = [claim.subject.id for claim in claims]
-        change = last_change(override.path)
-        yield Cause(
-            "suspended",
-            Part(" and ".join(dict.fromkeys(names)), Link("overrides")),
-            f"is booked, but {override.path} denies it",
-            _by_owner(override),
-            told=override.reason,
-            applications=tuple(dict.fromkeys(_applications_with(commit_state, claims))),
-            requesters=requesters_of(claims),
-            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
-            since=change.time if change else None,
-        )
-
-
-def _denied(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
-    """Yield a cause for each release that an override denies, apart from suspended claims."""
-    ledger = commit_state.active.ledger
+        names = dict.fromkeys(claim.subject.id for claim in claims)
+        what = Part(" and ".join(names), Link("overrides"))
+        applications = _applications_with(commit_state, claims)
+        denials.append((override, what, "is booked", claims, applications, ()))
     for release, override in commit_state.denied:
-        claims = release_causes.claims_behind(ledger, release)
+        claims = release_causes.claims_behind(commit_state.active.ledger, release)
+        what = Part(release.description, Link("release", {"name": release.name}))
+        applications = release.applications if isinstance(release, ServiceRelease) else ()
+        denials.append((override, what, "is needed", claims, applications, (release.name,)))
+    for override, what, state, claims, applications, releases in denials:
+        ends = f", or wait until the override ends at {override.expires}"
         change = last_change(override.path)
         yield Cause(
             "suspended",
-            Part(release.description, Link("release", {"name": release.name})),
-            f"is needed, but {override.path} denies it",
-            _by_owner(override),
+            what,
+            f"{state}, but {override.path} denies it",
+            Remedy(
+                f"{override.owner}, who owns the override",
+                f"remove the file by pull request{ends if override.expires else ''}",
+                shlex.join(["git", "rm", override.path]),
+            ),
             told=override.reason,
-            releases=(release.name,),
-            applications=tuple(release.applications) if isinstance(release, ServiceRelease) else (),
+            releases=releases,
+            applications=tuple(dict.fromkeys(applications)),
             requesters=requesters_of(claims),
             demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
             since=change.time if change else None,
         )
-
-
-def _by_owner(override: Override) -> Remedy:
-    ends = f", or wait until the override ends at {override.expires}" if override.expires else ""
-    return Remedy(
-        f"{override.owner}, who owns the override",
-        f"remove the file by pull request{ends}",
-        shlex.join(["git", "rm", override.path]),
-    )
 
 
 def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
