@@ -16,7 +16,7 @@ from demandops.cli.actions.ledger_change import (
     print_refusal,
     started_generator,
 )
-from demandops.cli.json_output import faults_of, output_option, print_json
+from demandops.cli.json_output import Json, faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
 from demandops.decision import admit, decide, form_faults
@@ -115,7 +115,7 @@ def request(
         raise click.exceptions.Exit(1)
 
 
-def _is_unanswered(row: dict[str, Any]) -> bool:
+def _is_unanswered(row: Json) -> bool:
     # a request that waits for room on a node has an answer: the commit that records the wait
     return row["outcome"] == "waiting" and row["commit"] is None
 
@@ -129,7 +129,7 @@ def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
     return {name: goal[name] for name in names if name in goal} | {"operation": "release"}
 
 
-def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
+def _row(index: int, request_id: str, outcome: str, **more: object) -> Json:
     return {
         "index": index,
         "request": request_id,
@@ -142,7 +142,7 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
     } | more
 
 
-def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]]:
+def _unbooked(documents: list[Document], state_repo: str) -> list[Json]:
     """Return a refusal for each document, because at least one of them does not parse."""
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         state = repo.snapshot(progress=report).state
@@ -159,7 +159,7 @@ def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]
     return rows
 
 
-def _refused(index: int, document: Document, error: DemandOpsError) -> dict[str, Any]:
+def _refused(index: int, document: Document, error: DemandOpsError) -> Json:
     lines = field_lines.lines(document.text, document.number)
     faults = [
         each | {"line": field_lines.nearest(each["field"], lines)} if not each["file"] else each
@@ -170,7 +170,7 @@ def _refused(index: int, document: Document, error: DemandOpsError) -> dict[str,
 
 def _book(
     documents: list[Document], state_repo: str, wait: bool, signing_key: Path | None
-) -> list[dict[str, Any]]:
+) -> list[Json]:
     answers: list[_Answer] = []
     try:
         with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
@@ -192,7 +192,7 @@ def _book(
     return [_answered(index, document, answer) for index, (document, answer) in pairs]
 
 
-def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]:
+def _answered(index: int, document: Document, answer: _Answer) -> Json:
     try:
         result = answer.result(timeout=0)
     except (ShuttingDown, TimeoutError):  # the command was interrupted
@@ -236,7 +236,7 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
     return answer
 
 
-def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[dict[str, Any]]:
+def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Json]:
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_render_version()
@@ -261,7 +261,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
                 for rule in decision.approval:
                     console().print(f"  needs approval: {rule} requires it")
                 print_consequences(decision)
-            more: dict[str, Any] = {
+            more: Json = {
                 "warnings": decision.warnings,
                 "not_held": decision.changes.not_held,
                 "placed": decision.placed,
@@ -273,7 +273,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
     return rows
 
 
-def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool) -> None:
+def _print(rows: list[Json], documents: list[Document], dry_run: bool) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"

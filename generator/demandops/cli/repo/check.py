@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import click
 
-from demandops.cli.json_output import output_formats, print_json
+from demandops.cli.json_output import Json, output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.repo import pull_request_comment
 from demandops.cli.views.diff import entry_lines, release_lines
@@ -79,7 +78,7 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
         raise click.exceptions.Exit(1)
 
 
-def _data(checked: CheckResult) -> dict[str, Any]:
+def _data(checked: CheckResult) -> Json:
     merge, entries, charts = checked.preview, checked.bookkeeping, None
     if checked.charts is not None:
         charts = {

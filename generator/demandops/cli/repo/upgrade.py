@@ -6,11 +6,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import click
 
-from demandops.cli.json_output import output_option, show
+from demandops.cli.json_output import Json, output_option, show
 from demandops.cli.output import Progress, busy
 from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.render.gitops.paths import bootstrap_path, domains_by_cluster
@@ -108,7 +107,7 @@ def _shown() -> Iterator[Progress]:
         yield report
 
 
-def _steps_after(result: Upgrade) -> list[dict[str, Any]]:
+def _steps_after(result: Upgrade) -> list[Json]:
     return [
         {
             "cluster": cluster,

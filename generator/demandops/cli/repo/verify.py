@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
 
 import click
 
-from demandops.cli.json_output import output_option, show
+from demandops.cli.json_output import Json, output_option, show
 from demandops.cli.output import progress
 from demandops.cli.target import state_repo_option
 from demandops.errors import fault
@@ -48,7 +47,7 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
         progress("rendering again") as report,
     ):
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
-    rows: list[dict[str, Any]] = []
+    rows: list[Json] = []
     for verdict in verdicts:
         row = {name: None if value == "" else value for name, value in asdict(verdict).items()}
         message = row.pop("fault")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import click
 
 from demandops.cli.json_output import (
+    Json,
     claim_data,
     commit_data,
     output_option,
@@ -92,12 +92,10 @@ def why(
     show(output, answer, why_text.lines_of(answer))
 
 
-def _answer(
-    repo: Reader, snapshot: Snapshot, match: Match, at: str | None, most: int
-) -> dict[str, Any]:
+def _answer(repo: Reader, snapshot: Snapshot, match: Match, at: str | None, most: int) -> Json:
     """Return the explanation as JSON data; ``most`` limits the list of changes."""
     world = snapshot.state
-    answer: dict[str, Any] = {
+    answer: Json = {
         "commit": str(snapshot.commit),
         "kind": match.kind,
         "name": match.name,
@@ -115,7 +113,7 @@ def _answer(
     return answer | {"file": match.path or None, **_commits(repo, snapshot, match, most)}
 
 
-def _described(world: World, match: Match) -> dict[str, Any]:
+def _described(world: World, match: Match) -> Json:
     """Return as JSON data what the object of ``match`` is, and who needs it."""
     name, config = match.name, world.config
     if match.release is not None:
@@ -194,7 +192,7 @@ def _described(world: World, match: Match) -> dict[str, Any]:
     return {"runs": False}
 
 
-def _held(world: World, what: str, is_held: Callable[[Claim], bool]) -> dict[str, Any]:
+def _held(world: World, what: str, is_held: Callable[[Claim], bool]) -> Json:
     claims = sorted(
         filter(is_held, world.ledger), key=lambda claim: (str(claim.subject), claim.demand)
     )
@@ -211,7 +209,7 @@ def _held(world: World, what: str, is_held: Callable[[Claim], bool]) -> dict[str
     }
 
 
-def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
+def _claims(claims: list[Claim], world: World) -> Json:
     rows = []
     for claim in claims:
         suspended = suspended_by(claim, world)
@@ -231,7 +229,7 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
     }
 
 
-def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
+def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> Json:
     if match.kind in ("node", "requester"):  # `demandops log` lists their commits
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":
@@ -246,10 +244,10 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
     return _history(repo, PathHistory(first, tuple(newer[:most]), more, stopped))
 
 
-def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
+def _history(repo: Reader, history: PathHistory) -> Json:
     """Return commits as JSON data, each with the people's commits that it carries out."""
 
-    def row(entry: LogEntry | None) -> dict[str, Any] | None:
+    def row(entry: LogEntry | None) -> Json | None:
         if entry is None:
             return None
         behind = repo.person_commits_behind(entry, _MOST_CARRIED_OUT)
