@@ -105,38 +105,45 @@ def application(  # noqa: PLR0913 - as many as options
       demandops new application tracking --input camera=sensor_msgs/msg/Image
     """
     given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
-
-    def made(config: Config) -> Files:
-        # before the questions, so that nobody answers them in vain
-        new_application.refuse_name(name, config)
-        missing = [option for option, values in given.items() if not values]
-        if missing and not sys.stdin.isatty():
-            options = ", ".join(f"'{option}'" for option in missing)
-            raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
-        values = {option: given[option] or _asked(*_QUESTIONS[option]) for option in given}
-        planned_services = tuple(map(_service, values["--service"]))
-        plan = ApplicationPlan(
-            name,
-            description or f"Runs {', '.join(service.name for service in planned_services)}",
-            dict(map(_input, values["--input"])),
-            planned_services,
-            _image(values["--image"][0]),
-            node or _example_node(config),
+    existing, config = _read(directory)
+    # before the questions, so that nobody answers them in vain
+    new_application.refuse_name(name, config)
+    missing = [option for option, values in given.items() if not values]
+    if missing and not sys.stdin.isatty():
+        options = ", ".join(f"'{option}'" for option in missing)
+        raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
+    values = {option: given[option] or _asked(*_QUESTIONS[option]) for option in given}
+    planned_services = tuple(map(_service, values["--service"]))
+    planned_inputs = dict(map(_input, values["--input"]))
+    planned_image = _image(values["--image"][0])
+    # a demand can name only nodes in an access domain
+    nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
+    if not (node or nodes):
+        raise StateRepoError(
+            "the inventory has no node in an access domain, so no demand can be made; add one "
+            "first, in inventory/nodes.yaml"
         )
-        if domain := new_application.closed_domain(plan, config):
-            then.insert(
-                0,
-                f"no rule of access domain '{domain.name}' allows demands for this application on "
-                f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
-                f"{config.file_of(DOMAINS_FILE, domain.name)}",
-            )
-        return new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
-
+    plan = ApplicationPlan(
+        name,
+        description or f"Runs {', '.join(service.name for service in planned_services)}",
+        planned_inputs,
+        planned_services,
+        planned_image,
+        node or nodes[0],
+    )
     then = [
         "when the files are on main, try the application: demandops request --dry-run "
         f"{directory / 'appdefs' / name / 'demand.yaml'}"
     ]
-    _lay_down(directory, made, output, then)
+    if domain := new_application.closed_domain(plan, config):
+        then.insert(
+            0,
+            f"no rule of access domain '{domain.name}' allows demands for this application on "
+            f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
+            f"{config.file_of(DOMAINS_FILE, domain.name)}",
+        )
+    files = new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
+    _lay_down(directory, existing, files, output, then)
 
 
 @new.command()
@@ -183,26 +190,19 @@ def override(  # noqa: PLR0913 - as many as options
     select = {field: [*values] for field, values in given.items() if values}
     if not select:
         raise click.UsageError("say what the override selects: --service, --application or --node")
-    effects = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
-    does = {
-        effect: value
-        for effect, value in {**effects, "replicas": replicas}.items()
-        if value is not None
-    }
+    flags = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
+    options = {**flags, "replicas": replicas}
+    does = {effect: value for effect, value in options.items() if value is not None}
     if len(does) != 1:
         raise click.UsageError("give exactly one effect: --hold, --deny, --keep or --replicas")
-
-    def made(config: Config) -> Files:
-        if name in config.overrides:
-            raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
-        path = f"overrides/{name}.yaml"
-        fields = {"reason": reason, "owner": owner, "select": [select], **does}
-        note = (
-            "overrides/README.md lists all effects and selectors of overrides, and when they end."
-        )
-        return {path: document(path, "override", "Override", fields, note)}
-
-    _lay_down(directory, made, output)
+    existing, config = _read(directory)
+    if name in config.overrides:
+        raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
+    path = f"overrides/{name}.yaml"
+    fields = {"reason": reason, "owner": owner, "select": [select], **does}
+    note = "overrides/README.md lists all effects and selectors of overrides, and when they end."
+    text = document(path, "override", "Override", fields, note)
+    _lay_down(directory, existing, {path: text}, output, [])
 
 
 @new.command()
@@ -265,9 +265,8 @@ def _asked(question: str, check: Callable[[str], object], most: int | None) -> t
             check(word)
         return words
 
-    words: tuple[str, ...] = click.prompt(
-        question, default="", show_default=False, value_proc=valid
-    )
+    words: tuple[str, ...]
+    words = click.prompt(question, default="", show_default=False, value_proc=valid)
     return words
 
 
@@ -327,39 +326,25 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
 }
 
 
-def _example_node(config: Config) -> str:
-    # only nodes in an access domain can be named in a demand; an edge server comes first
-    nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
-    if not nodes:
-        raise StateRepoError(
-            "the inventory has no node in an access domain, so no demand can be made; add one "
-            "first, in inventory/nodes.yaml"
-        )
-    return nodes[0]
-
-
-def _lay_down(
-    directory: Path, made: Callable[[Config], Files], output: str, then: list[str] | None = None
-) -> None:
-    """Write new files, but only if the whole configuration is valid with them.
-
-    ``made`` returns the new files for the current configuration. ``then`` has further hints to
-    print after the names of the files.
-    """
+def _read(directory: Path) -> tuple[Files, Config]:
+    """Return the files that people edit in a checkout, and the configuration in them."""
     with busy("reading the state repo"):
         files, faults = edited_checkout.files_of(directory)
         if faults:
             raise InvalidInput(faults)
-        existing = {
-            path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS
-        }
-        config = load(existing)
-    new_files = made(config)
+        people = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
+        return people, load(people)
+
+
+def _lay_down(
+    directory: Path, existing: Files, new_files: Files, output: str, then: list[str]
+) -> None:
+    """Write new files, but only if the whole configuration is valid with them."""
     if strange := [path for path in new_files if ".." in path.split("/") or "//" in path]:
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
     with busy("rendering an example of each application"):
         try_configuration(State(load({**existing, **new_files}), Ledger(), EVALUATE))
-    hints = [f"to check the files: demandops check {directory}", *(then or [])]
+    hints = [f"to check the files: demandops check {directory}", *then]
     _write(directory, new_files, output, hints)
 
 

@@ -88,29 +88,27 @@ def why(
     with reader.opened(state_repo) as repo:
         snapshot = loaded(repo, at)
         with busy("looking through the commits"):
-            answer = _answer(repo, snapshot, match_of(repo, snapshot, name, kind), at, most)
+            match = match_of(repo, snapshot, name, kind)
+            answer: Json = {
+                "commit": str(snapshot.commit),
+                "kind": match.kind,
+                "name": match.name,
+                **_described(snapshot.state, match),
+            }
+            claim_files = {claim["file"] for claim in answer.get("claims", ())}
+            reasons = (
+                f"application '{missing.application}': {missing.reason}"
+                for missing in missing_inputs(snapshot.state)
+                if missing.file in claim_files
+            )
+            answer["missing_inputs"] = list(dict.fromkeys(reasons))
+            files = {match.path, *(release["file"] for release in answer.get("releases", ()))}
+            not_rendered = [] if at else sorted(files & repo.not_rendered(snapshot))
+            if not_rendered and answer.get("state") == "in force":
+                answer["state"] = "not rendered yet"
+            answer["not_rendered"] = not_rendered
+            answer |= {"file": match.path or None, **_commits(repo, snapshot, match, most)}
     show(output, answer, why_text.lines_of(answer))
-
-
-def _answer(repo: Reader, snapshot: Snapshot, match: Match, at: str | None, most: int) -> Json:
-    """Return the explanation as JSON data; ``most`` limits the list of changes."""
-    world = snapshot.state
-    answer: Json = {
-        "commit": str(snapshot.commit),
-        "kind": match.kind,
-        "name": match.name,
-        **_described(world, match),
-    }
-    claim_files = {claim["file"] for claim in answer.get("claims", ())}
-    missing = (each for each in missing_inputs(world) if each.file in claim_files)
-    reasons = (f"application '{each.application}': {each.reason}" for each in missing)
-    answer["missing_inputs"] = list(dict.fromkeys(reasons))
-    files = {match.path, *(release["file"] for release in answer.get("releases", ()))}
-    not_rendered = [] if at else sorted(files & repo.not_rendered(snapshot))
-    if not_rendered and answer.get("state") == "in force":
-        answer["state"] = "not rendered yet"
-    answer["not_rendered"] = not_rendered
-    return answer | {"file": match.path or None, **_commits(repo, snapshot, match, most)}
 
 
 def _described(world: World, match: Match) -> Json:
