@@ -39,7 +39,7 @@ def console(stderr: bool = False) -> Console:
         def render_str(self, text: str, **how: Any) -> Text:  # noqa: ANN401 - as rich has it
             return super().render_str(quoting.lines(text), **how)
 
-    # into a file or a pipe, no line is wrapped that a program may read
+    # elsewhere than on a terminal, a program may read the lines, so they are not wrapped
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _WIDE
     # rich would take [bold] and :smile: in the texts of people for its own markup
@@ -140,10 +140,10 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 
     Yield a function that replaces the title.
     """
-    shown_title = [title]
 
     def say(text: str) -> None:
-        shown_title[0] = text
+        nonlocal title
+        title = text
 
     if not sys.stderr.isatty():
         yield say
@@ -155,7 +155,7 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
         while not ended.wait(1):
             seconds += 1
             shown.set()
-            show_slow(f"{shown_title[0]}, {seconds} s")
+            show_slow(f"{title}, {seconds} s")
 
     thread = REAL.start_thread("busy", tick)
     try:

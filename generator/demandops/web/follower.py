@@ -15,10 +15,7 @@ from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from itertools import islice
 
-from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.orphans import Orphan
-from demandops.cluster.release_status import ReleaseStatus
 from demandops.errors import DemandOpsError
 from demandops.quoting import one_line
 from demandops.runtime import REAL, Runtime
@@ -66,12 +63,13 @@ class Follower:
             runtime: provides the time and the threads.
         """
         self._reader, self._runtime = reader, runtime
+        # without an interval, the follower waits until `wake`
         self._interval = _LOOK_S if reader.repository.always_current else interval or None
         self._wake, self.closed = runtime.event(), runtime.event()
         self._watch = ClusterWatch(clusters, self._wake.set, runtime)
         self._commit_states: dict[str, CommitState] = {}
         self._loading = runtime.lock()
-        # How often the situation has changed since the start.
+        # Browsers fetch the page again when this number changes.
         self.version = 0
         # The newest commits, at most `MOST_COMMITS`, newest first.
         self.history: tuple[Commit, ...] = ()
@@ -112,6 +110,7 @@ class Follower:
             commit_state = self._commit_states.pop(commit, None) or _commit_state(
                 reader, reader.last_valid_snapshot(commit)
             )
+            # added again at the end, so that the state that was not used for longest is dropped
             self._commit_states[commit] = commit_state
             if len(self._commit_states) > _MOST_COMMIT_STATES:
                 del self._commit_states[next(iter(self._commit_states))]
@@ -160,6 +159,7 @@ class Follower:
                     if commit != commit_state.commit:
                         snapshot = self._reader.snapshot_after(commit_state.snapshot)
                         commit_state = _commit_state(self._reader, snapshot)
+                        # so that only the releases that new claims affect are planned
                         commit_state.take_over(before.commit_state)
                     now = self._situation_at(commit_state)
             except DemandOpsError as error:
@@ -176,24 +176,22 @@ class Follower:
 
     def _situation_at(self, commit_state: CommitState) -> Situation:
         self._read_history(commit_state.commit)
-        statuses: Mapping[str, ReleaseStatus] = {}
-        old: tuple[OldBootstrap, ...] = ()
-        orphans: tuple[Orphan, ...] = ()
-        if self._watch.clusters:
-            targets = [target for _, target in commit_state.targets]
-            repository = self._reader.repository
-            statuses = self._watch.statuses(targets, commit_state.commit, repository)
-            domains = rollout_targets.domains_of_state(commit_state.state)
-            old = self._watch.old_bootstraps(domains, self._reader.file_reader(commit_state.commit))
-            orphans = self._watch.orphans(domains, targets, commit_state.commit, repository)
-        return Situation(
+        watch, repository, commit = self._watch, self._reader.repository, commit_state.commit
+        situation = Situation(
             commit_state,
             self._runtime.now(),
-            statuses=statuses,
-            watched=self._watch.clusters,
-            proposals=tuple(pending_proposals(self._reader.repository)),
-            old_bootstraps=old,
-            orphans=orphans,
+            watched=watch.clusters,
+            proposals=tuple(pending_proposals(repository)),
+        )
+        if not watch.clusters:
+            return situation
+        targets = [target for _, target in commit_state.targets]
+        domains = rollout_targets.domains_of_state(commit_state.state)
+        return replace(
+            situation,
+            statuses=watch.statuses(targets, commit, repository),
+            old_bootstraps=watch.old_bootstraps(domains, self._reader.file_reader(commit)),
+            orphans=watch.orphans(domains, targets, commit, repository),
         )
 
     def _read_history(self, tip: str) -> None:
