@@ -121,18 +121,16 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     changed: list[str] = []
     if asked.get("at"):
         changed = asked.follower.reader().files_changed_by(now.commit_state.commit)
-    last = max(1, -(-len(events) // _EVENTS_ON_A_PAGE))
-    page = min(max(asked.page(), 1), last)
-    start = (page - 1) * _EVENTS_ON_A_PAGE
+    shown, page, pages = filtered_table.page_of(events, asked.page(), _EVENTS_ON_A_PAGE)
     return "timeline.html.j2", {
         "strip": time_line.strip(events, now.now, asked.get("span"), chosen),
         "lanes": time_line.LANES,
         "lane": lane,
         "spans": time_line.SPANS,
-        "events": events[start : start + _EVENTS_ON_A_PAGE],
+        "events": shown,
         "total": len(events),
         "page": page,
-        "pages": last,
+        "pages": pages,
         "changed": changed,
         "is_cut": len(asked.follower.history) >= MOST_COMMITS,
     }

@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from demandops.cli.actions.ledger_change import (
-    await_answer,
+    booked,
     claim_text,
     print_consequences,
     started_generator,
@@ -22,7 +22,7 @@ from demandops.cli.actions.person_change import (
 )
 from demandops.cli.json_output import Json, claim_data, output_option, show
 from demandops.cli.name_completion import names_of
-from demandops.cli.output import busy, progress
+from demandops.cli.output import progress
 from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.decision import decide
 from demandops.demand.demand_request import Decommission
@@ -100,10 +100,7 @@ def _book(goal: Json, by: Person, state_repo: str, signing_key: Path | None) -> 
     with started_generator(state_repo, signing_key) as generator:
         warned_if_unnamed(by)
         try:
-            ticket = generator.submit(goal)
-            with busy("booking"):
-                await_answer(ticket.future)
-            receipt = ticket.future.result()
+            receipt = booked(generator, goal)
         except Refused as error:
             if not _is_unclaimed_node(error, goal, generator.snapshot):
                 raise

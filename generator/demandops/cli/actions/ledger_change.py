@@ -10,11 +10,11 @@ from pathlib import Path
 from typing import Any
 
 from demandops.cli.json_output import Json
-from demandops.cli.output import console, errors, progress
+from demandops.cli.output import busy, console, errors, progress
 from demandops.cli.views.diff import release_lines
 from demandops.decision import Decision
 from demandops.errors import Fault
-from demandops.service import Generator
+from demandops.service import Generator, Receipt
 
 _LOOK_UP_S = 0.5
 
@@ -25,6 +25,14 @@ def await_answer(future: Future[Any]) -> None:
     # begins, or a signal that another library handles.
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)
+
+
+def booked(generator: Generator, goal: Json) -> Receipt:
+    """Submit a goal, and return its receipt when it is published."""
+    ticket = generator.submit(goal)
+    with busy("booking"):
+        await_answer(ticket.future)
+    return ticket.future.result()
 
 
 @contextmanager

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from demandops.cli.actions.ledger_change import (
-    await_answer,
+    booked,
     claim_text,
     print_refusal,
     started_generator,
@@ -22,7 +22,7 @@ from demandops.cli.actions.person_change import (
     yes_option,
 )
 from demandops.cli.json_output import Json, claim_data, faults_of, output_option, show
-from demandops.cli.output import busy, progress
+from demandops.cli.output import progress
 from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.cli.views.diff import release_lines
 from demandops.config.config import CONFIG_ROOTS
@@ -128,10 +128,7 @@ def _roll_back(state_repo: str, goal: Json, signing_key: Path | None, base: str)
     """
     try:
         with started_generator(state_repo, signing_key) as generator:
-            ticket = generator.submit(goal)
-            with busy("booking"):
-                await_answer(ticket.future)
-            receipt = ticket.future.result()
+            receipt = booked(generator, goal)
     except InvalidInput as error:
         return {"outcome": "refused", **_consequences(None), "faults": faults_of(error)}
     result: Json = {"outcome": receipt.outcome, "commit": receipt.commit}

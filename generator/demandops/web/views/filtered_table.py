@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
 # How many rows a page of a list has at most.
 PAGE = 100
@@ -29,6 +29,7 @@ class Part:
 
 
 Text: TypeAlias = "str | int | Part"
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,10 +106,7 @@ class Table:
     matching: int
     sort: str
     page: int
-
-    @property
-    def pages(self) -> int:
-        return max(1, -(-self.matching // PAGE))
+    pages: int
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
@@ -157,7 +155,7 @@ def table(
 ) -> Table:
     """Return a page of the rows that match the filter.
 
-    An unknown ``sort`` means the first column. A page number out of range means the nearest page.
+    An unknown ``sort`` means the first column.
     """
     every = list(rows)
     matching = [row for row in every if wanted.matches(row)]
@@ -165,7 +163,15 @@ def table(
     if key not in {column.key for column in columns}:
         sort = key = columns[0].key
     matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
-    last = max(1, -(-len(matching) // PAGE))
-    page = min(max(page, 1), last)
-    shown = tuple(matching[(page - 1) * PAGE : page * PAGE])
-    return Table(tuple(columns), shown, len(every), len(matching), sort, page)
+    shown, page, pages = page_of(matching, page, PAGE)
+    return Table(tuple(columns), tuple(shown), len(every), len(matching), sort, page, pages)
+
+
+def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item], int, int]:
+    """Return the items of a page, the number of the page, and the number of pages.
+
+    A number out of range means the nearest page.
+    """
+    pages = max(1, -(-len(items) // size))
+    page = min(max(page, 1), pages)
+    return items[(page - 1) * size : page * size], page, pages

@@ -38,26 +38,26 @@ class ListKind:
     row: Callable[..., Row]
 
 
-def release_part(name: str) -> Part:
+def _release_part(name: str) -> Part:
     return Part(name, Link("release", {"name": name}))
 
 
-def demand_part(id: str) -> Part:
+def _demand_part(id: str) -> Part:
     return Part(id, Link("demand", {"id": id}))
 
 
-def health_cell(word: str) -> Cell:
+def _health_cell(word: str) -> Cell:
     """Return the cell for a health word; its sort key puts the worst health first."""
     return cell(word, tone=WORDS[word], order=RANKS[word])
 
 
-def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
-    """Return each value as a text, linked to the rows that have the value in field ``key``."""
-    return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
+def _linked(view: str, key: str, values: Iterable[str]) -> Cell:
+    """Return a cell in which each value is linked to the rows that have it in field ``key``."""
+    return cell(*(Part(value, Link(view, {"q": exactly(key, value)})) for value in values))
 
 
 def _requesters(requesters: Iterable[str]) -> Cell:
-    return cell(*_filtered("demands", "requester", requesters))
+    return _linked("demands", "requester", requesters)
 
 
 def _services(now: Situation) -> Iterator[tuple[str, Values]]:
@@ -71,14 +71,14 @@ def _services(now: Situation) -> Iterator[tuple[str, Values]]:
 def _service(world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
     return Row(
         {
-            "release": cell(release_part(release.name)),
+            "release": cell(_release_part(release.name)),
             "service": cell(release.key.service),
-            "node": cell(*_filtered("services", "node", [release.node.id])),
+            "node": _linked("services", "node", [release.node.id]),
             "cluster": cell(release.node.cluster),
-            "application": cell(*_filtered("services", "application", release.applications)),
+            "application": _linked("services", "application", release.applications),
             "version": cell(release.version.name or release.chart.version),
             "requester": _requesters(release.requesters),
-            "health": health_cell(word),
+            "health": _health_cell(word),
         },
         {"demand": [*dict.fromkeys(claim.demand for claim in claims)], "type": [release.node.type]},
     )
@@ -103,12 +103,12 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
         {
             "connection": cell(held.id),
             "by": cell(held.type.word if held.type else ""),
-            "from": cell(*_filtered("connections", "from", [held.source])),
-            "to": cell(*_filtered("connections", "to", [held.target])),
+            "from": _linked("connections", "from", [held.source]),
+            "to": _linked("connections", "to", [held.target]),
             "topic": cell(*(route.source for route in connection_topics(claims))),
             "requester": _requesters(requesters_of(claims)),
-            "release": cell(*map(release_part, clients)),
-            "health": health_cell(word),
+            "release": cell(*map(_release_part, clients)),
+            "health": _health_cell(word),
         },
         {"demand": [claim.demand for claim in claims], "node": [held.source, held.target]},
     )
@@ -130,18 +130,18 @@ def _demand(
         held = demand_list.waiting_demand(holds)
     else:
         held = demand_list.held_demand(holds, world)
-    health = health_cell(word)
+    health = _health_cell(word)
     if held.state == "suspended":
         health = cell("suspended", tone="bad", order=0.0)
     elif held.state == "waiting":
         health = cell("waits for room", tone="busy", order=RANKS["waiting"])
     return Row(
         {
-            "demand": cell(demand_part(held.name)),
+            "demand": cell(_demand_part(held.name)),
             "request": cell(*held.requests),
             "requester": _requesters(held.requesters),
-            "application": cell(*_filtered("services", "application", held.applications)),
-            "connection": cell(*_filtered("connections", "connection", held.connections)),
+            "application": _linked("services", "application", held.applications),
+            "connection": _linked("connections", "connection", held.connections),
             "since": Cell(time=held.since),
             "lease": Cell(time=held.lease.until if held.lease else None),
             "health": health,
@@ -164,7 +164,7 @@ def _lease(world: World, claim: Claim) -> Row:
             "ends": Cell(time=lease.until),
             "subject": cell(claim.subject.id),
             "kind": cell(claim.subject.kind.value[:-1]),
-            "demand": cell(demand_part(claim.demand)),
+            "demand": cell(_demand_part(claim.demand)),
             "requester": _requesters(claim.requesters),
             "term": cell(duration_text(lease.seconds), order=float(lease.seconds)),
             "slack": cell(duration_text(lease.slack), order=float(lease.slack)),
