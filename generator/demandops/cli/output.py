@@ -46,7 +46,7 @@ def console(stderr: bool = False) -> Console:
     return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
-# The sign of each kind of change. It is printed before the changed release or entry.
+# What is printed before the name of a changed release or entry.
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
 
 

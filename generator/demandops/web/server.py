@@ -13,7 +13,7 @@ from demandops.web.site import Site
 
 log = logging.getLogger("demandops")
 
-# How many connections may be open, most of them streams of events.
+# How many connections may be open; at most half of them are streams of events (`Site`).
 _AT_ONCE = 200
 _LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]", "::1")
 

@@ -64,7 +64,7 @@ _LOOK_S = 0.1
 _HEARTBEAT_S = 15.0
 # How long a browser waits before it opens a stream again that has ended.
 _RETRY_MS = 1_000
-_MOST_LISTENERS = 100
+_MOST_LISTENERS = 100  # half of the connections that the server accepts, so that others get in
 # The parameters with which a view reads commits, which may take seconds.
 _SLOW = {"at", "id", "name"}
 # How many views may be rendered at the same time; slow ones may not delay the others.

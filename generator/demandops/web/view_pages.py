@@ -28,7 +28,6 @@ from demandops.web.views.lists import LISTS, rows_of
 # The parameters that a link to another view keeps: the chosen commit or time, and the filter.
 _KEPT = ("at", "q")
 
-# The path and the title of each view in the navigation bar.
 NAVIGATION = (
     ("", "Not ready"),
     ("map", "Map"),
@@ -166,7 +165,6 @@ def _rates(asked: ViewRequest) -> tuple[str, Data]:
     return "rates.html.j2", data | {"width": rates.WIDTH, "height": rates.HEIGHT}
 
 
-# A map from the address of each view to the function that returns its template and data.
 VIEWS: Mapping[str, View] = {
     "/": _not_ready,
     "/map": _map,

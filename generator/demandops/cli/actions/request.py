@@ -180,7 +180,7 @@ def _book(
                 await_answer(answer)
                 report(done, len(documents))
     except KeyboardInterrupt:
-        if not answers:
+        if not answers:  # nothing was sent, so there is nothing to report
             raise
     if len(answers) < len(documents):
         answers.append(_Answer())  # it may be in the journal already

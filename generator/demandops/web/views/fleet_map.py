@@ -61,7 +61,7 @@ class Picture:
     # Nodes and lines that are drawn one by one, with details.
     nodes: tuple[NodeCard, ...]
     lines: tuple[Line, ...]
-    # The others, one shape for each color, so that a page of 10,000 nodes stays small and fast.
+    # The others, one shape for each color, so that a map of thousands of nodes stays small.
     many_nodes: tuple[Mass, ...]
     many_lines: tuple[Mass, ...]
     total: int

@@ -48,7 +48,7 @@ class Plot:
     table: tuple[tuple[datetime, str], ...]
 
 
-# A measured value, and the time at which it was measured.
+# When a value was measured, and the value.
 Sample = tuple[datetime, float]
 
 _BOOKED = {"join", "put"}
