@@ -180,7 +180,7 @@ def _book(
                 await_answer(answer)
                 report(done, len(documents))
     except KeyboardInterrupt:
-        if not answers:  # nothing was sent, so there is nothing to report
+        if not answers:
             raise
     if len(answers) < len(documents):
         answers.append(_Answer())  # it may be in the journal already
@@ -224,10 +224,9 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
             answer.set_result(parse_waiting_text(text))
 
     def finish(future: Future[Receipt]) -> None:
-        error = future.exception()
-        if answer.done():
+        if answer.done():  # the proposal was the answer
             return
-        if error is not None:
+        if (error := future.exception()) is not None:
             answer.set_exception(error)
         else:
             answer.set_result(future.result())
