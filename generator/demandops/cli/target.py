@@ -42,7 +42,7 @@ _NO_STATE_REPO = (
 )
 
 
-def _chosen(around: Path | None) -> Context | None:
+def _chosen_context(around: Path | None) -> Context | None:
     """Return the context that applies, and remember it for :func:`_from_context`."""
     from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
 
@@ -63,7 +63,7 @@ def _chosen(around: Path | None) -> Context | None:
     return context
 
 
-def _around() -> Path | None:
+def _checkout() -> Path | None:
     """Return the checkout around the current folder; None outside one, or with ``--context``."""
     named = _NAME in click.get_current_context().meta
     return None if named else checkout_around(Path.cwd())
@@ -71,14 +71,14 @@ def _around() -> Path | None:
 
 def readable_repo() -> str | None:
     """Return the default state repo of a command that only reads; None if there is none."""
-    around = _around()
-    context = _chosen(around)
+    around = _checkout()
+    context = _chosen_context(around)
     return str(around) if around else context.state_repo if context else None
 
 
 def _writable() -> str | None:
-    around = _around()
-    context = _chosen(around)
+    around = _checkout()
+    context = _chosen_context(around)
     if around is None:
         return context.state_repo if context else None
     # a generator never writes to a checkout; a dry run needs no place to write to
@@ -141,7 +141,7 @@ def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Comm
             _NAME in ctx.meta
             or not (is_url(value or "") or path.is_absolute() or path.expanduser().exists())
         ):
-            if _NAME not in ctx.meta and _around() is None:
+            if _NAME not in ctx.meta and _checkout() is None:
                 raise click.UsageError(
                     f"{_VARIABLE} is {quoted(value or '')}, a relative folder that does not exist "
                     f"in {Path.cwd()}; set it to an absolute path, or give --state-repo",

@@ -108,7 +108,8 @@ def _demand(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _release(asked: ViewRequest) -> tuple[str, Data]:
-    release = release_view.explained(asked.situation, asked.follower.reader(), asked.get("name"))
+    now, reader = asked.situation, asked.follower.reader()
+    release = release_view.explained_release(now, reader, asked.get("name"))
     return "release.html.j2", {"release": release}
 
 

@@ -106,7 +106,7 @@ def request(
     if output == "json":
         print_json(rows)
     else:
-        _print(rows, documents, dry_run)
+        _print_rows(rows, documents, dry_run)
     unanswered = sum(_is_unanswered(row) for row in rows) if not dry_run else 0
     if unanswered:
         errors.print(f"{len(rows) - unanswered} of {len(rows)} requests have an answer")
@@ -272,7 +272,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
     return rows
 
 
-def _print(rows: list[Json], documents: list[Document], dry_run: bool) -> None:
+def _print_rows(rows: list[Json], documents: list[Document], dry_run: bool) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"

@@ -105,7 +105,7 @@ def application(  # noqa: PLR0913 - as many as options
       demandops new application tracking --input camera=sensor_msgs/msg/Image
     """
     given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
-    existing, config = _read(directory)
+    existing, config = _read_configuration(directory)
     # before the questions, so that nobody answers them in vain
     new_application.refuse_name(name, config)
     missing = [option for option, values in given.items() if not values]
@@ -195,7 +195,7 @@ def override(  # noqa: PLR0913 - as many as options
     does = {effect: value for effect, value in options.items() if value is not None}
     if len(does) != 1:
         raise click.UsageError("give exactly one effect: --hold, --deny, --keep or --replicas")
-    existing, config = _read(directory)
+    existing, config = _read_configuration(directory)
     if name in config.overrides:
         raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
     path = f"overrides/{name}.yaml"
@@ -243,7 +243,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
     folder = data_folder("templates") / "scaffold" / "image"
     texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
     then = ["keep .github/workflows/image.yml or .gitlab-ci.yml, whichever you need"]
-    _write(directory, new_image.files(name, repository, url, texts), output, then)
+    _write_files(directory, new_image.files(name, repository, url, texts), output, then)
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
@@ -326,7 +326,7 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
 }
 
 
-def _read(directory: Path) -> tuple[Files, Config]:
+def _read_configuration(directory: Path) -> tuple[Files, Config]:
     """Return the files that people edit in a checkout, and the configuration in them."""
     with busy("reading the state repo"):
         files, faults = edited_checkout.files_of(directory)
@@ -345,10 +345,10 @@ def _lay_down(
     with busy("rendering an example of each application"):
         try_configuration(State(load({**existing, **new_files}), Ledger(), EVALUATE))
     hints = [f"to check the files: demandops check {directory}", *then]
-    _write(directory, new_files, output, hints)
+    _write_files(directory, new_files, output, hints)
 
 
-def _write(directory: Path, files: Files, output: str, then: list[str]) -> None:
+def _write_files(directory: Path, files: Files, output: str, then: list[str]) -> None:
     if there := [path for path in files if (directory / path).exists()]:
         raise StateRepoError(f"{directory / there[0]} exists; move it away (nothing was changed)")
     for path, text in files.items():

@@ -44,7 +44,7 @@ _COLORS = {
 }
 
 
-def _kind(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
+def _kind_named(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
     if value is None:
         raise click.UsageError(f"Missing argument 'KIND': one of {', '.join(KINDS)}", ctx)
     for name in (value, f"{value}s"):
@@ -75,7 +75,7 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
 @click.argument(
     "kind",
     required=False,
-    callback=_kind,
+    callback=_kind_named,
     shell_complete=lambda ctx, param, text: [name for name in KINDS if name.startswith(text)],
     metavar="KIND",
 )
@@ -124,11 +124,11 @@ def get(
         can = ", ".join(f"--{each}" for each in FILTERS if each in shown.filters)
         raise click.UsageError(f"{kind} have no --{name}; they can be filtered by {can}")
     with reader.opened(state_repo) as repo:
-        source = _read(repo, at)
+        source = _read_source(repo, at)
         items = shown.items(source)
         _refuse_unknown(shown, items, source.snapshot.state, names, wanted)
         items = _matching(shown, items, names, wanted)
-        _print(kind, source, items, output, watch)
+        _print_list(kind, source, items, output, watch)
         while watch:
             REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
             try:
@@ -138,13 +138,13 @@ def get(
                 is_same = True
             if is_same and kind != "proposals":  # a proposal is a branch, and no commit on main
                 continue
-            source = _read(repo, None)
+            source = _read_source(repo, None)
             before, items = items, _matching(shown, shown.items(source), names, wanted)
             if items != before:
-                _print(kind, source, items, output, watch)
+                _print_list(kind, source, items, output, watch)
 
 
-def _read(repo: Reader, at: str | None) -> Source:
+def _read_source(repo: Reader, at: str | None) -> Source:
     with progress("reading the ledger") as report:
         snapshot = repo.snapshot(at, report)
     warn_of(repo.problems() if at is None else ())
@@ -191,7 +191,7 @@ def _refuse_unknown(
         raise InvalidInput(faults)
 
 
-def _print(kind: str, source: Source, items: list[Json], output: str, watch: bool) -> None:
+def _print_list(kind: str, source: Source, items: list[Json], output: str, watch: bool) -> None:
     commit, shown = str(source.snapshot.commit), KINDS[kind]
     data = {"kind": kind, "commit": commit, "items": items}
     plain = json.loads(json.dumps(data))

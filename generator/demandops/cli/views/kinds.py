@@ -72,7 +72,7 @@ def _demands(source: Source) -> list[Json]:
     return [
         {
             **asdict(demand),
-            "state": _now(demand.state, demand.lease, source.now),
+            "state": _state_now(demand.state, demand.lease, source.now),
             "since": time_data(demand.since),
             "lease": lease_data(demand.lease),
         }
@@ -80,7 +80,7 @@ def _demands(source: Source) -> list[Json]:
     ]
 
 
-def _now(state: str, lease: Lease | None, now: datetime) -> str:
+def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
 
 
@@ -128,7 +128,7 @@ def _claims(source: Source) -> list[Json]:
     return [
         {
             "name": (data := claim_data(claim))["file"],
-            "state": _now(demand_list.state_of(claim, world), claim.lease, source.now),
+            "state": _state_now(demand_list.state_of(claim, world), claim.lease, source.now),
             "nodes": (nodes := demand_list.nodes_of(claim)),
             "domains": demand_list.domains_of(nodes, world.config),
             **data,

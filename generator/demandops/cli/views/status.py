@@ -167,7 +167,7 @@ class Status:
         for domain in {*domains, *(target.domain for target in targets)}:
             watched = health_reader(domain).objects_to_watch(domain)
             wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
-        caches = _read(clusters, wanted, patience_s)
+        caches = _read_clusters(clusters, wanted, patience_s)
         ledger = without_suspended(snapshot.state).ledger
         rows = [
             release_data(release)
@@ -242,7 +242,7 @@ class Status:
         return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
 
 
-def _read(
+def _read_clusters(
     clusters: Mapping[str, clusters_file.ClusterAccess],
     wanted: Mapping[str, Iterable[ObjectSelector]],
     patience_s: int,

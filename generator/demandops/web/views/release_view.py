@@ -72,7 +72,7 @@ class Explained:
         return sorted({who for claim in self.claims for who in claim.requesters})
 
 
-def explained(now: Situation, reader: Reader, name: str) -> Explained:
+def explained_release(now: Situation, reader: Reader, name: str) -> Explained:
     """Return why a release runs, and the release's history.
 
     A StateRepoError says that the situation's commit has no such release, and no earlier one had.
