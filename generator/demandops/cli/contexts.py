@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, StringConstraints, model_validator
 
 from demandops import strict_yaml
-from demandops.config.base_model import CamelModel, DnsLabel, FileModel, parse, parse_file
+from demandops.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
 from demandops.errors import InvalidInput, suggestion
 from demandops.field_lines import located_in
 from demandops.settings import API_VERSION
@@ -46,25 +46,17 @@ class ContextsFile(FileModel):
         return self
 
 
-EMPTY = ContextsFile(apiVersion=API_VERSION, kind="Contexts")
-
-
 def path() -> Path:
-    """Return the path of the file with the contexts."""
     root = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
     return Path(root) / "demandops" / "contexts.yaml"
 
 
 def read() -> ContextsFile:
-    """Return the contexts in the file; without a file there are none.
-
-    Raises:
-        InvalidInput: if the file is not valid; the error lists all faults.
-    """
+    """Return the contexts in the file; without a file there are none."""
     try:
         text = path().read_text(encoding="utf-8")
     except FileNotFoundError:
-        return EMPTY
+        return ContextsFile(apiVersion=API_VERSION, kind="Contexts")
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInput.at(
             "", f"cannot be read: {error}; replace the file", file=str(path())
@@ -73,16 +65,12 @@ def read() -> ContextsFile:
         return parse_file(ContextsFile, text, str(path()))
 
 
-def parsed(data: dict[str, Any]) -> ContextsFile:
-    """Return parsed YAML data as contexts; raise InvalidInput if the data are not valid."""
-    return parse(ContextsFile, data, str(path()))
-
-
 def write(content: ContextsFile) -> None:
     """Write the contexts to the file, which only its owner may read."""
     file = path()
     file.parent.mkdir(parents=True, exist_ok=True)
     data = content.model_dump(by_alias=True, exclude_none=True)
+    # written beside the file and then renamed, so that no other command reads half a file
     new = file.with_name(f".{file.name}.new")
     new.write_text(strict_yaml.dump(data), encoding="utf-8")
     new.chmod(0o600)
@@ -90,14 +78,9 @@ def write(content: ContextsFile) -> None:
 
 
 def named(name: str, field: str = "") -> Context:
-    """Return the context of this name.
-
-    Raises:
-        InvalidInput: there is no such context, or the file is not valid. The error names ``field``
-            as the place where the user wrote the name.
-    """
-    known = read().contexts
-    if name not in known:
-        message = f"there is no context '{name}'{suggestion(name, known)}"
+    """Return the context of this name; a fault names ``field`` as the place of the name."""
+    contexts = read().contexts
+    if name not in contexts:
+        message = f"there is no context '{name}'{suggestion(name, contexts)}"
         raise InvalidInput.at(field, message, file=str(path()))
-    return known[name]
+    return contexts[name]

@@ -67,24 +67,20 @@ output_option = output_formats("text", "json")
 
 
 def show(output: str, data: object, text: Iterable[str | Table]) -> None:
-    """Print ``data`` as JSON if ``output`` is ``json``; otherwise print ``text``.
-
-    ``text`` consists of lines and tables. Lines are not wrapped.
-    """
+    """Print ``data`` as JSON if ``output`` is ``json``; otherwise print the lines and tables."""
     if output == "json":
         print_json(data)
         return
-    print_lines([line for each in text for line in _lines_of(each)])
-
-
-def _lines_of(each: str | Table) -> list[str]:
-    if isinstance(each, str):
-        return lines(each).split("\n")
-    return each.lines(terminal_width(), painted)
+    printed: list[str] = []
+    for each in text:
+        if isinstance(each, Table):
+            printed += each.lines(terminal_width(), painted)
+        else:
+            printed += lines(each).split("\n")
+    print_lines(printed)
 
 
 def print_json(data: object) -> None:
-    """Print ``data`` as JSON, with escapes for characters that are not visible."""
     click.echo(json_escaped(json.dumps(data, indent=2, ensure_ascii=False)))
 
 
@@ -95,7 +91,6 @@ def faults_of(error: DemandOpsError) -> list[Json]:
 
 
 def time_data(moment: datetime | None) -> str | None:
-    """Return a time as text for JSON, in UTC; None without a time."""
     return format_time(moment) if moment else None
 
 
@@ -105,12 +100,10 @@ def time_text(time: str) -> str:
 
 
 def subject_data(subject: Subject) -> Json:
-    """Return a subject as JSON data."""
     return {"kind": subject.kind.value[:-1], "id": subject.id}
 
 
 def lease_data(lease: Lease | None) -> Json | None:
-    """Return a lease as JSON data; ``until`` is None if the lease has not started."""
     if lease is None:
         return None
     return {
@@ -121,7 +114,6 @@ def lease_data(lease: Lease | None) -> Json | None:
 
 
 def claim_data(claim: Claim) -> Json:
-    """Return a claim as JSON data."""
     app = claim.application if claim.is_on_application else None
     return {
         "subject": subject_data(claim.subject),
@@ -138,7 +130,6 @@ def claim_data(claim: Claim) -> Json:
 
 
 def place_data(release: Release) -> Json:
-    """Return a release's description, cluster, access domain, namespace and node as JSON data."""
     return {
         "what": release.description,
         "cluster": release.node.cluster,
@@ -149,12 +140,10 @@ def place_data(release: Release) -> Json:
 
 
 def release_data(release: Release) -> Json:
-    """Return a release as JSON data."""
     return {"name": release.name, **place_data(release), "file": path_of(release)}
 
 
 def version_data(release: Release, ledger: Ledger) -> Json:
-    """Return the version of a release and the versions that its demands name, as JSON data."""
     if not isinstance(release, ServiceRelease):
         return {"version": None, "application_version": None, "versions_asked": {}}
     return {
@@ -186,7 +175,6 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
 
 
 def commit_data(entry: LogEntry) -> Json:
-    """Return a commit as JSON data: its author, the parts of its message and most trailers."""
     return {
         "commit": entry.commit,
         "time": time_data(entry.time),

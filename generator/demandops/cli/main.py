@@ -19,6 +19,8 @@ from demandops.errors import DemandOpsError, InvalidInput, Unsound
 from demandops.quoting import OneLineFormatter
 from demandops.staterepo.git import slow_git
 
+# The package of each command's module, and the short help, which `--help` shows without importing
+# the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
 COMMANDS = {
     "approve": ("actions", "Approve a proposed demand: merge its branch in your own name."),
     "bookkeeping": ("views", "Show who requests which service and connection."),
@@ -54,26 +56,18 @@ COMMANDS = {
     "web": ("views", "Show the state repo on a web page."),
     "why": ("views", "Explain why something runs or ran."),
 }
-"""Maps a command's name to the package of the command's module, and to the short help.
-
-A package without a dot is below ``demandops.cli``, except ``demandops_ros``.
-"""
 
 
+# These commands run until they are stopped. They log or fill the screen, so they do not show the
+# progress of git operations.
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-"""The commands that always run until they are stopped.
-
-They log or fill the screen, so they do not show the progress of git operations.
-"""
 
 
+# Errors about a file: its path is wrong, or permissions are missing.
 _OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
-"""Errors about a file: its path is wrong, or permissions are missing."""
 
 
 class ExitCode(IntEnum):
-    """The exit codes of all commands."""
-
     DONE = 0
     USER_ERROR = 1
     WRONG_USAGE = 2
@@ -82,11 +76,7 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import and return a command.
-
-    Raises:
-        click.ClickException: a Python package that the command needs, or git, is not installed.
-    """
+    """Import and return a command; a ClickException says if git or a Python package is missing."""
     room = COMMANDS[name][0]
     ros = room.split(".")[0] == "demandops_ros"
     word = name.replace("-", "_")
@@ -116,10 +106,10 @@ class _LazyGroup(click.Group):
     def resolve_command(
         self, ctx: click.Context, args: list[str]
     ) -> tuple[str | None, click.Command | None, list[str]]:
-        name, command, rest = super().resolve_command(ctx, args)
+        name, command, arguments = super().resolve_command(ctx, args)
         if name and name not in _LONG_RUNNING:
             slow_git.listen(show_slow)
-        return name, load(name) if name else command, rest
+        return name, load(name) if name else command, arguments
 
 
 @click.group(
@@ -142,12 +132,10 @@ def cli(verbose: bool) -> None:
 
 
 def main(args: list[str] | None = None) -> None:
-    """Run the command line and exit with its code."""
     sys.exit(run(args))
 
 
 def run(args: list[str] | None = None) -> int:
-    """Run the command line and return its exit code."""
     try:
         code = cli.main(args=args, prog_name="demandops", standalone_mode=False)
         return code if isinstance(code, int) else ExitCode.DONE
@@ -155,9 +143,8 @@ def run(args: list[str] | None = None) -> int:
         error.show()
         return ExitCode.WRONG_USAGE
     except click.Abort:
-        errors.print(
-            "\ninterrupted" if sys.stderr.isatty() else "interrupted"
-        )  # the terminal has shown ^C
+        # a terminal has shown ^C in this line
+        errors.print("\ninterrupted" if sys.stderr.isatty() else "interrupted")
         return ExitCode.INTERRUPTED
     except click.ClickException as error:
         errors.print(f"error: {error.format_message()}")
@@ -169,7 +156,7 @@ def run(args: list[str] | None = None) -> int:
         for each in error.faults if isinstance(error, InvalidInput) else [error]:
             errors.print(f"error: {each}")
         return ExitCode.USER_ERROR
-    except BrokenPipeError:  # `demandops log | head`
+    except BrokenPipeError:  # `demandops log | head`; Python would report it again at the exit
         sys.stderr.close()
         return ExitCode.DONE
     except Exception as error:

@@ -21,29 +21,27 @@ def names_of(*kinds: str) -> Complete:
 
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         try:
-            return sorted(name for name in _names(ctx, kinds) if name.startswith(incomplete))
+            with ctx.scope(cleanup=False):
+                address = ctx.params.get("state_repo") or readable_repo()
+            if not address:
+                return []
+            # offline, because a shell waits for the names while a person types
+            with reader.opened_offline(address) as repo:
+                names = {name for kind in kinds for name in _names(repo, kind)} if repo else set()
+            return sorted(name for name in names if name.startswith(incomplete))
         except Exception:  # an error must not disturb a person who is typing
             return []
 
     return complete
 
 
-def _names(ctx: click.Context, kinds: tuple[str, ...]) -> set[str]:
-    with ctx.scope(cleanup=False):
-        address = ctx.params.get("state_repo") or readable_repo()
-    if not address:
-        return set()
-    with reader.opened_offline(address) as repo:
-        return {name for kind in kinds for name in _of(repo, kind)} if repo else set()
-
-
-def _of(repo: Reader, kind: str) -> Iterator[str]:
+def _names(repo: Reader, kind: str) -> Iterator[str]:
     if kind == "proposals":
-        yield from (one.branch for one in pending_proposals(repo.repository))
+        yield from (proposal.branch for proposal in pending_proposals(repo.repository))
         return
     world = repo.last_valid_snapshot(repo.commit()).state
     if kind == "releases":
-        yield from (one.name for one in release_causes.releases(world))
+        yield from (release.name for release in release_causes.releases(world))
     elif kind in ("requesters", "demands"):
         yield from world.ledger.indexed_names(kind[:-1])
     elif kind in ("applications", "connections"):

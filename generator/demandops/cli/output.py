@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from demandops.quoting import lines
+from demandops import quoting
 from demandops.runtime import REAL
 
 if TYPE_CHECKING:
@@ -30,37 +30,33 @@ Progress = Callable[[int, int], None]
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a console for stdout or stderr.
-
-    If the stream is not a terminal, the console is very wide and prints no colors.
-    """
+    """Return a console for stdout or stderr; elsewhere than on a terminal, without colors."""
     from rich.console import Console  # noqa: PLC0415
 
     class QuotingConsole(Console):
         """A console that escapes control characters, in lines and in tables."""
 
         def render_str(self, text: str, **how: Any) -> Text:  # noqa: ANN401 - as rich has it
-            return super().render_str(lines(text), **how)
+            return super().render_str(quoting.lines(text), **how)
 
+    # elsewhere than on a terminal, a program may read the lines, so they are not wrapped
     stream = sys.stderr if stderr else sys.stdout
     width = None if stream.isatty() else _WIDE
+    # rich would take [bold] and :smile: in the texts of people for its own markup
     return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
 
+# What is printed before the name of a changed release or entry.
 SIGNS = {"start": "+", "change": "~", "stop": "-", "added": "+", "changed": "~", "removed": "-"}
-"""The sign of each kind of change. It is printed before the changed release or entry."""
 
 
 def terminal_width() -> int | None:
-    """Return the width of the terminal, or None if the output goes elsewhere."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def painted(text: str, style: str) -> str:
-    """Return text in a style, which is ``bold``, ``dim`` or a color.
-
-    Return the text unchanged if stdout does not show colors.
-    """
+    """Return text in a style (``bold``, ``dim`` or a color), or unchanged without colors."""
+    # NO_COLOR is a convention of many programs: https://no-color.org
     colors = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     if not colors or not style or os.environ.get("TERM") == "dumb":
         return text
@@ -69,16 +65,12 @@ def painted(text: str, style: str) -> str:
     return click.style(text, fg=style)
 
 
-def print_lines(found: list[str]) -> None:
-    """Print lines; use a pager if the terminal has too few rows for them.
-
-    The pager is ``$PAGER``, by default ``less``. With ``PAGER=cat`` or an empty ``PAGER``, there is
-    none.
-    """
-    text = "".join(f"{line}\n" for line in found)
-    high = len(found) >= shutil.get_terminal_size().lines
+def print_lines(lines: list[str]) -> None:
+    """Print lines; use a pager if the terminal has too few rows for them."""
+    text = "".join(f"{line}\n" for line in lines)
+    is_long = len(lines) >= shutil.get_terminal_size().lines
     pager = os.environ.get("PAGER")
-    if not high or pager in ("", "cat") or not (sys.stdin.isatty() and sys.stdout.isatty()):
+    if not is_long or pager in ("", "cat") or not (sys.stdin.isatty() and sys.stdout.isatty()):
         click.echo(text, nl=False)
         return
     os.environ.setdefault("LESS", "FRX")  # as in git: show colors, and leave the text on screen
@@ -86,29 +78,24 @@ def print_lines(found: list[str]) -> None:
 
 
 class _Errors:
-    """Prints plain lines on stderr, never wrapped."""
-
     def print(self, text: str) -> None:
-        click.echo(lines(text), err=True)
+        click.echo(quoting.lines(text), err=True)
 
 
 errors = _Errors()
 
 
 def warn_of(problems: Iterable[object]) -> None:
-    """Warn about invalid files. The last valid version of each is in effect, if there is one."""
     for problem in problems:
         errors.print(f"warning: {problem}; the file's last valid version, if any, is in effect")
 
 
 def warn_of_not_rendered(paths: Collection[str]) -> None:
-    """Warn about generated files that a generator has yet to write or remove."""
     if paths:
         files = "1 generated file" if len(paths) == 1 else f"{len(paths)} generated files"
-        listed = ", ".join(sorted(paths)[:_MOST_LISTED]) + (
-            ", …" if len(paths) > _MOST_LISTED else ""
-        )
-        errors.print(f"warning: a generator has yet to write or remove {files}: {listed}")
+        listed = ", ".join(sorted(paths)[:_MOST_LISTED])
+        more = ", …" if len(paths) > _MOST_LISTED else ""
+        errors.print(f"warning: a generator has yet to write or remove {files}: {listed}{more}")
 
 
 at_option = click.option(
@@ -120,7 +107,6 @@ at_option = click.option(
 
 
 def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
-    """Return the value of a duration option as a number of seconds."""
     from demandops.config.durations import seconds_of  # noqa: PLC0415 - --help must be fast
 
     try:
@@ -142,12 +128,9 @@ def version_lines(data: Mapping[str, Any]) -> list[str]:
 
 
 def show_slow(text: str) -> None:
-    """Show on a terminal which slow operation is in progress.
-
-    The text replaces the last shown text; an empty text clears it.
-    """
+    """Show on a terminal which slow operation is in progress; an empty text clears it."""
     if sys.stderr.isatty():
-        sys.stderr.write(f"\r\x1b[2K{lines(text)}")
+        sys.stderr.write(f"\r\x1b[2K{quoting.lines(text)}")
         sys.stderr.flush()
 
 
@@ -157,10 +140,10 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 
     Yield a function that replaces the title.
     """
-    shown_title = [title]
 
     def say(text: str) -> None:
-        shown_title[0] = text
+        nonlocal title
+        title = text
 
     if not sys.stderr.isatty():
         yield say
@@ -172,7 +155,7 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
         while not ended.wait(1):
             seconds += 1
             shown.set()
-            show_slow(f"{shown_title[0]}, {seconds} s")
+            show_slow(f"{title}, {seconds} s")
 
     thread = REAL.start_thread("busy", tick)
     try:
@@ -186,11 +169,7 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield a function that updates a progress bar.
-
-    The function takes the number of parts that are done and the number of all parts. The bar
-    appears only on a terminal, and only if the work takes long.
-    """
+    """Yield a function that updates a progress bar on a terminal if the work takes long."""
     start = REAL.monotonic()
     bar: Bar | None = None
     task: Any = None

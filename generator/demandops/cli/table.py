@@ -15,14 +15,12 @@ from rich.cells import cell_len
 from demandops.quoting import one_line
 
 _GAP = "  "
+# The smallest width, in characters, to which a column is narrowed by wrapping its text.
+# If the terminal has no room for this width, columns are left out.
 _COMFORT = 12
-"""The smallest width, in characters, to which a column is narrowed by wrapping its text.
 
-If the terminal has no room for this width, columns are left out.
-"""
-
+# The text of a cell, or its lines.
 Cell = str | Sequence[str]
-"""The text of a cell, or its lines."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,8 +28,8 @@ class Column:
     """A column: its title, and how soon a narrow table leaves it out.
 
     Columns get room in the order of ``rank``, from low to high. A column that does not fit is left
-    out, even if a narrower one of a higher rank fits. A column of rank 0 is never left out.
-    ``wraps`` is true if the cells contain text that may wrap between words.
+    out, even if a narrower one of a higher rank fits. A column of rank 0 is never left out. If
+    ``wraps``, its text may wrap between words.
     """
 
     title: str
@@ -47,47 +45,58 @@ class Table:
     rows: Sequence[Sequence[Cell]]
     title: str = ""
     empty: str = "(nothing)"
+    # The colors of cells, by the text of the cell, for a terminal that shows colors.
     styles: dict[str, str] = field(default_factory=dict)
-    """The colors of cells, by the text of the cell, for a terminal that shows colors."""
+    # Whether to keep every column and wrap nothing, however wide the table gets.
     whole: bool = False
-    """Whether to keep every column and wrap nothing, however wide the table gets."""
 
     def lines(self, width: int | None, style: Callable[[str, str], str] | None = None) -> list[str]:
         """Return the table as lines.
 
-        Args:
-            width: the width of the terminal; None makes one line for each row, however long.
-            style: returns a text in a style (``bold``, ``dim`` or a color); None for plain text.
+        ``width`` is the width of the terminal; None makes one line for each row, however long.
+        ``style`` returns a text in a style (``bold``, ``dim`` or a color); None is plain text.
         """
         width = None if self.whole else width
         paint = style or (lambda text, _: text)
         title = [paint(self.title, "bold")] if self.title else []
         if not self.rows:
             return [*title, self.empty]
-        rows = [[_cell(cell, width) for cell in row] for row in self.rows]
+        # the lines of each cell; without a width, one line, so that awk and grep see whole rows
+        rows = [
+            [
+                [one_line(line) for line in ([cell] if isinstance(cell, str) else cell)]
+                for cell in row
+            ]
+            for row in self.rows
+        ]
+        if width is None:
+            rows = [[[", ".join(filter(None, cell))] for cell in row] for row in rows]
         shown = range(len(self.columns)) if width is None else self._fitting(rows, width)
-        widths = self._widths(rows, shown, width)
+        widths = natural = [self._natural(rows, at) for at in shown]
+        if width is not None:
+            widths = [self._least(rows, at) for at in shown]
+            room = width - sum(widths) - len(_GAP) * (len(widths) - 1)
+            for place, wanted in enumerate(natural):
+                more = min(max(room, 0), wanted - widths[place])
+                widths[place] += more
+                room -= more
         head = [[self.columns[at].title.upper()] for at in shown]
-        found = [paint(line, "bold") for line in _laid_out(head, widths)]
+        lines = [paint(line, "bold") for line in _laid_out(head, widths)]
         for row in rows:
             cells = [_wrapped(row[at], widths[place]) for place, at in enumerate(shown)]
-            found += _laid_out(cells, widths, lambda text: paint(text, self.styles.get(text, "")))
-        left = [
+            lines += _laid_out(cells, widths, lambda text: paint(text, self.styles.get(text, "")))
+        left_out = [
             column.title.upper()
             for at, column in enumerate(self.columns)
             if at not in shown and any(any(row[at]) for row in rows)
         ]
-        if left:
-            note = f"more columns in a wider terminal: {', '.join(left)}"
-            found += [paint(line, "dim") for line in _wrapped([note], width or 0)]
-        return [*title, *found]
+        if left_out:
+            note = f"more columns in a wider terminal: {', '.join(left_out)}"
+            lines += [paint(line, "dim") for line in _wrapped([note], width or 0)]
+        return [*title, *lines]
 
     def _fitting(self, rows: list[list[list[str]]], width: int) -> list[int]:
-        """Return the indexes of the columns to show, in ascending order.
-
-        Columns of rank 0 are always shown. The others get the remaining room by rank; empty columns
-        get none.
-        """
+        """Return the indexes of the columns to show, in ascending order."""
         used = [at for at in range(len(self.columns)) if any(any(row[at]) for row in rows)]
         shown = [at for at, column in enumerate(self.columns) if column.rank == 0]
         room = width - sum(self._least(rows, at) + len(_GAP) for at in shown) + len(_GAP)
@@ -103,55 +112,32 @@ class Table:
         return max([cell_len(self.columns[at].title), *lengths])
 
     def _least(self, rows: list[list[list[str]]], at: int) -> int:
-        """Return the smallest width that the column with index ``at`` may get.
-
-        This width cuts no word. A column that wraps gets at least ``_COMFORT``, unless its
-        text is shorter.
-        """
+        """Return the smallest width of the column with index ``at`` that cuts no word."""
         natural = self._natural(rows, at)
         if not self.columns[at].wraps:
             return natural
+        # a column that wraps gets `_COMFORT`, unless its text is shorter
         words = [cell_len(word) for row in rows for line in row[at] for word in line.split()]
         return max([cell_len(self.columns[at].title), min(natural, _COMFORT), *words])
-
-    def _widths(
-        self, rows: list[list[list[str]]], shown: Iterable[int], width: int | None
-    ) -> list[int]:
-        natural = [self._natural(rows, at) for at in shown]
-        if width is None:
-            return natural
-        widths = [self._least(rows, at) for at in shown]
-        room = width - sum(widths) - len(_GAP) * (len(widths) - 1)
-        for place, wanted in enumerate(natural):
-            more = min(max(room, 0), wanted - widths[place])
-            widths[place] += more
-            room -= more
-        return widths
-
-
-def _cell(cell: Cell, width: int | None) -> list[str]:
-    """Return the lines of a cell; if ``width`` is None, join them to one line with commas."""
-    lines = [one_line(line) for line in ([cell] if isinstance(cell, str) else cell)]
-    return lines if width is not None else [", ".join(filter(None, lines))]
 
 
 def _wrapped(lines: Iterable[str], width: int) -> list[str]:
     """Return lines wrapped between words; a word that is too long stays whole."""
-    found: list[str] = []
+    wrapped: list[str] = []
     for line in lines:
         if cell_len(line) <= width:
-            found.append(line)
+            wrapped.append(line)
             continue
-        rest = ""
+        last = ""
         for word in line.split():
-            joined = f"{rest} {word}" if rest else word
-            if rest and cell_len(joined) > width:
-                found.append(rest)
-                rest = word
+            joined = f"{last} {word}" if last else word
+            if last and cell_len(joined) > width:
+                wrapped.append(last)
+                last = word
             else:
-                rest = joined
-        found.append(rest)
-    return found
+                last = joined
+        wrapped.append(last)
+    return wrapped
 
 
 def _laid_out(

@@ -42,53 +42,46 @@ _NO_STATE_REPO = (
 )
 
 
-def _chosen(around: Path | None) -> Context | None:
-    """Return the context that applies, and remember it for :func:`_from_context`.
-
-    This is the context that ``--context`` names. Without that option, it is the first context of
-    the checkout ``around`` or, outside a checkout, the current context. Return None if there is
-    none.
-    """
+def _chosen_context(around: Path | None) -> Context | None:
+    """Return the context that applies, and remember it for :func:`_from_context`."""
     from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
 
+    # clusters and signing key of a context apply only to its own state repo
     ctx = click.get_current_context()
     name = ctx.meta.get(_NAME)
     content = contexts.read()
-    found: Context | None
+    context: Context | None
     if name is not None:
-        found = contexts.named(name, "--context")
+        context = contexts.named(name, "--context")
     elif around is not None:
         places = {str(around), origin_of(around)}
-        same = (one for one in content.contexts.values() if one.state_repo in places)
-        found = next(same, None)
+        same = (each for each in content.contexts.values() if each.state_repo in places)
+        context = next(same, None)
     else:
-        found = content.contexts[content.current] if content.current else None
-    ctx.meta[_CONTEXT] = found
-    return found
+        context = content.contexts[content.current] if content.current else None
+    ctx.meta[_CONTEXT] = context
+    return context
 
 
-def _around() -> Path | None:
+def _checkout() -> Path | None:
     """Return the checkout around the current folder; None outside one, or with ``--context``."""
     named = _NAME in click.get_current_context().meta
     return None if named else checkout_around(Path.cwd())
 
 
 def readable_repo() -> str | None:
-    """Return the default state repo of a command that only reads; None if there is no default.
-
-    Raises:
-        InvalidInput: the file with the contexts is not valid, or lacks the one of ``--context``.
-    """
-    around = _around()
-    context = _chosen(around)
+    """Return the default state repo of a command that only reads; None if there is none."""
+    around = _checkout()
+    context = _chosen_context(around)
     return str(around) if around else context.state_repo if context else None
 
 
 def _writable() -> str | None:
-    around = _around()
-    context = _chosen(around)
+    around = _checkout()
+    context = _chosen_context(around)
     if around is None:
         return context.state_repo if context else None
+    # a generator never writes to a checkout; a dry run needs no place to write to
     origin = origin_of(around)
     if origin is None and click.get_current_context().params.get("dry_run"):
         return str(around)
@@ -101,20 +94,14 @@ def _writable() -> str | None:
 
 
 def hint_to_pull() -> list[str]:
-    """Return a list with a hint to pull if the command works on the remote of a checkout.
-
-    Otherwise return an empty list. A command that has pushed a commit to main prints the hint: the
-    commit is not yet in the checkout, and commands that only read use the checkout.
-    """
+    """Return a hint to pull if the command works on the remote of a checkout, as a list."""
+    # the new commit is not in the checkout yet, and commands that only read use the checkout
     behind = click.get_current_context().meta.get(_BEHIND)
     return ["to see the new commit in this checkout: git pull"] if behind else []
 
 
 def _from_context(field: str) -> Callable[[], str | None]:
-    """Return a function that returns the default of an option.
-
-    The default is the value of ``field`` in the context that applies to the state repo.
-    """
+    """Return a function that returns ``field`` of the context that applies."""
 
     def default() -> str | None:
         context = click.get_current_context().meta.get(_CONTEXT)
@@ -123,43 +110,12 @@ def _from_context(field: str) -> Callable[[], str | None]:
     return default
 
 
-def _required(default: Callable[[], str | None]) -> Callable[..., str]:
-    """Return a callback for ``--state-repo`` that returns the address of the state repo.
-
-    This is the given address or, without one, the result of ``default``. The module's docstring
-    says when an address from the environment is ignored. The callback raises UsageError if there is
-    no address, or if the module's docstring calls the one from the environment an error.
-    """
-
-    def check(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
-        from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT
-        if from_environment and (_NAME in ctx.meta or _is_elsewhere(value or "")):
-            if _NAME not in ctx.meta and _around() is None:
-                raise click.UsageError(
-                    f"{_VARIABLE} is {quoted(value or '')}, a relative folder that does not exist "
-                    f"in {Path.cwd()}; set it to an absolute path, or give --state-repo",
-                    ctx,
-                )
-            value = default()
-        if value is None:
-            raise click.UsageError(_NO_STATE_REPO, ctx)
-        return value
-
-    return check
-
-
-def _is_elsewhere(address: str) -> bool:
-    """Return whether an address is a relative path that does not exist in the current folder."""
-    path = Path(address)
-    return not (is_url(address) or path.is_absolute() or path.expanduser().exists())
-
-
-def _note(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
+def _remember_name(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
     if value is not None:
         ctx.meta[_NAME] = value
 
 
-def _names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+def context_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     from demandops.cli import contexts  # noqa: PLC0415
 
     return [name for name in contexts.read().contexts if name.startswith(incomplete)]
@@ -170,34 +126,51 @@ _context_option = click.option(
     metavar="NAME",
     expose_value=False,
     is_eager=True,
-    callback=_note,
-    shell_complete=_names,
+    callback=_remember_name,
+    shell_complete=context_names,
     help="The context to use, instead of the current one (docs/commands.md).",
 )
 
 
 def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Command], Command]:
+    def address(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
+        from_environment = ctx.get_parameter_source("state_repo") is ParameterSource.ENVIRONMENT
+        path = Path(value or "")
+        # A relative path in the environment may fit another folder than the current one.
+        if from_environment and (
+            _NAME in ctx.meta
+            or not (is_url(value or "") or path.is_absolute() or path.expanduser().exists())
+        ):
+            if _NAME not in ctx.meta and _checkout() is None:
+                raise click.UsageError(
+                    f"{_VARIABLE} is {quoted(value or '')}, a relative folder that does not exist "
+                    f"in {Path.cwd()}; set it to an absolute path, or give --state-repo",
+                    ctx,
+                )
+            value = default()
+        if value is None:
+            raise click.UsageError(_NO_STATE_REPO, ctx)
+        return value
+
     option = click.option(
         "--state-repo",
         envvar=_VARIABLE,
         metavar="URL_OR_DIR",
         default=default,
         is_eager=True,  # the defaults of other options depend on it
-        callback=_required(default),
+        callback=address,
         help=f"The state repo: a bare repository's folder, or a URL that git can clone. Default: "
         f"{where}, otherwise the state repo of the context [env: {_VARIABLE}].",
     )
     return lambda command: option(_context_option(command))
 
 
+# The option `--state-repo` of a command that only reads; it may name a checkout.
 state_repo_option = _state_repo(readable_repo, "the checkout that you are in")
-"""The option ``--state-repo`` of a command that only reads; it may name a checkout."""
 
+# The option `--state-repo` of a command that writes.
+# If the checkout has no remote, the default with `--dry-run` is the checkout itself.
 writable_repo_option = _state_repo(_writable, "the remote of the checkout that you are in")
-"""The option ``--state-repo`` of a command that writes.
-
-If the checkout has no remote, the default with ``--dry-run`` is the checkout itself.
-"""
 
 dry_run_option = click.option(
     "--dry-run",

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -32,8 +32,6 @@ _VERSION = "0.1.0"
 
 @dataclass(frozen=True, slots=True)
 class ServicePlan:
-    """A service: its name, and the launch file that it runs."""
-
     name: str
     package: str
     launch_file: str
@@ -41,30 +39,21 @@ class ServicePlan:
 
 @dataclass(frozen=True, slots=True)
 class ApplicationPlan:
-    """The description of an application to write.
-
-    ``inputs`` maps the name of each input to its message type. ``node`` is the node of the example
-    demand.
-    """
+    """The application to write; ``node`` is the node of the example demand."""
 
     name: str
     description: str
-    inputs: Mapping[str, str]
+    inputs: Mapping[str, str]  # the message type of each input
     services: tuple[ServicePlan, ...]
     image: Image
     node: str
 
 
 def refuse_name(name: str, config: Config) -> None:
-    """Refuse a name that is not valid, or that an application, a chart or an image has already.
-
-    Raises:
-        InvalidInput: if the name is refused.
-    """
+    """Refuse a name that is not valid, or that an application, a chart or an image has already."""
     if not _NAME.fullmatch(name):
         raise InvalidInput.at(
-            "NAME",
-            f"{quoted(name)} cannot be used here; write {PATTERN_WORDS[_NAME.pattern]}",
+            "NAME", f"{quoted(name)} cannot be used here; write {PATTERN_WORDS[_NAME.pattern]}"
         )
     if name in config.appdefs or name in config.charts or name in config.images:
         raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
@@ -73,39 +62,29 @@ def refuse_name(name: str, config: Config) -> None:
 def files(plan: ApplicationPlan, config: Config, library: Mapping[str, str]) -> dict[str, str]:
     """Return the files of a new application, as a map from path to text.
 
-    Args:
-        plan: the application to write.
-        config: the configuration to which the application is added.
-        library: the files of the library chart, as a map from path to text. The result also
-            contains these files if the state repo lacks the library chart.
-
-    Raises:
-        InvalidInput: if :func:`refuse_name` refuses the application's name.
+    ``library`` has the files of the library chart. They are part of the result if the state repo
+    lacks the library chart.
     """
     refuse_name(plan.name, config)
-    known = config.files if f"{LIBRARY_FOLDER}/Chart.yaml" in config.files else library
+    has_library = f"{LIBRARY_FOLDER}/Chart.yaml" in config.files
     root = f"appdefs/{plan.name}"
-    found = {f"{root}/appdef.yaml": _appdef(plan, _prefixes(plan, config))}
+    files = {f"{root}/appdef.yaml": _appdef(plan, config)}
     for service, inputs in _chain(plan):
-        found[f"{root}/values/{service.name}.yaml.j2"] = _values_template(plan, service, inputs)
-    found |= _chart(plan, f"{root}/charts/{plan.name}", known)
-    found[f"{root}/README.md"] = _readme(plan)
-    found[f"{root}/demand.yaml"] = _demand(plan, config)
+        files[f"{root}/values/{service.name}.yaml.j2"] = _values_template(plan, service, inputs)
+    files |= _chart(plan, f"{root}/charts/{plan.name}", config.files if has_library else library)
+    files[f"{root}/README.md"] = _readme(plan)
+    files[f"{root}/demand.yaml"] = _demand(plan, config)
     for kind, content in (
         ("charts", {"folder": f"{root}/charts/{plan.name}", "version": _VERSION}),
         ("images", plan.image.model_dump(exclude_none=True)),
     ):
         path = f"registry/{kind}/{plan.name}.yaml"
-        found[path] = document(path, kind, kind.title(), {kind: {plan.name: content}})
-    return found | (dict(library) if known is library else {})
+        files[path] = document(path, kind, kind.title(), {kind: {plan.name: content}})
+    return files if has_library else files | dict(library)
 
 
 def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
-    """Yield each service with a map from the name of each of its inputs to the input's source.
-
-    The first service reads the application's inputs. Every other service reads the output of the
-    previous service.
-    """
+    """Yield each service with its inputs, as a map from the input's name to its source."""
     inputs = {role: role for role in plan.inputs}
     for service in plan.services:
         yield service, inputs
@@ -116,28 +95,19 @@ def _role(name: str) -> str:
     return name.replace("-", "_")
 
 
-def _prefixes(plan: ApplicationPlan, config: Config) -> dict[str, str]:
-    """Return an unused prefix of release names for each service."""
+def _appdef(plan: ApplicationPlan, config: Config) -> str:
+    # Names of releases begin with the prefix of their service, so each service needs its own.
     taken = {kind.word for kind in CONNECTION_TYPES}
-    taken |= {one.prefix for found in config.services.values() for one in found.values()}
-    taken |= {one.prefix for one in config.definitions.values()}
-    found: dict[str, str] = {}
-    for service in plan.services:
-        found[service.name] = _free(re.sub("[^a-z0-9]", "", service.name)[:8], taken)
-        taken.add(found[service.name])
-    return found
-
-
-def _free(wanted: str, taken: Collection[str]) -> str:
-    names = [wanted, *(f"{wanted}{number}" for number in range(2, 100))]
-    return next(one for one in names if one not in taken)
-
-
-def _appdef(plan: ApplicationPlan, prefixes: Mapping[str, str]) -> str:
+    taken |= {service.prefix for each in config.services.values() for service in each.values()}
+    taken |= {definition.prefix for definition in config.definitions.values()}
     services: dict[str, Any] = {}
     for service, inputs in _chain(plan):
+        letters = re.sub("[^a-z0-9]", "", service.name)[:8]
+        prefixes = (letters, *(f"{letters}{number}" for number in range(2, 100)))
+        prefix = next(each for each in prefixes if each not in taken)
+        taken.add(prefix)
         services[service.name] = {
-            "prefix": prefixes[service.name],
+            "prefix": prefix,
             "inputs": inputs,
             "outputs": {_RESULT: f"/{{instance}}_{_role(service.name)}"},
             "chart": plan.name,
@@ -206,7 +176,27 @@ def _chart(plan: ApplicationPlan, folder: str, library: Mapping[str, str]) -> di
     shared = library[f"{LIBRARY_FOLDER}/values.yaml"]
     schema = json.loads(library[f"{LIBRARY_FOLDER}/values.schema.json"])
     title = f"Values of the chart {plan.name}"
-    values = _chart_values(plan)
+    first = plan.services[0]
+    values = f"""\
+# Values of this chart, besides those of {LIBRARY_FOLDER}: probes, resources, rights and more.
+# The templates in ../../values/ write the values of each release.
+
+image:
+  # -- Name of the image, with its registry, without tag or digest.
+  repository: {plan.image.repository}
+
+launch:
+  # -- Package of the launch file.
+  package: {first.package}
+  # -- Name of the launch file.
+  file: {first.launch_file}
+  # -- Arguments of the launch file: name → value.
+  arguments: {{}}
+
+# -- Labels of all objects, but not of the pods.
+commonLabels:
+  app.kubernetes.io/part-of: {plan.name}
+"""
     composed = chart_schema.composed(title, {"launch": _LAUNCH}, values, schema, shared)
     version = re.search(r"(?m)^version: (\S+)$", library[f"{LIBRARY_FOLDER}/Chart.yaml"])
     return {
@@ -238,34 +228,10 @@ dependencies:
     }
 
 
-def _chart_values(plan: ApplicationPlan) -> str:
-    first = plan.services[0]
-    return f"""\
-# Values of this chart, besides those of {LIBRARY_FOLDER}: probes, resources, rights and more.
-# The templates in ../../values/ write the values of each release.
-
-image:
-  # -- Name of the image, with its registry, without tag or digest.
-  repository: {plan.image.repository}
-
-launch:
-  # -- Package of the launch file.
-  package: {first.package}
-  # -- Name of the launch file.
-  file: {first.launch_file}
-  # -- Arguments of the launch file: name → value.
-  arguments: {{}}
-
-# -- Labels of all objects, but not of the pods.
-commonLabels:
-  app.kubernetes.io/part-of: {plan.name}
-"""
-
-
 def _readme(plan: ApplicationPlan) -> str:
     rows = "".join(
         f"| `{service.name}` | `ros2 launch {service.package} {service.launch_file}` "
-        f"| {', '.join(f'`{one}`' for one in inputs.values())} |\n"
+        f"| {', '.join(f'`{source}`' for source in inputs.values())} |\n"
         for service, inputs in _chain(plan)
     )
     return f"""\
@@ -285,23 +251,6 @@ change the launch file and the template.
 """
 
 
-def _requester(plan: ApplicationPlan, config: Config) -> str:
-    """Return a requester for the example demand.
-
-    If a rule of the node's access domain allows the application, the requester matches that rule.
-    If none does, the requester matches the first rule, and a person must extend the rules
-    (:func:`closed_domain`).
-    """
-    domain = config.domain_of.get(plan.node)
-    rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
-    if not rules:
-        return _REQUESTER
-    pattern = rules[0].requesters[0]
-    node = next((id for id in sorted(config.nodes) if matches(id, (pattern,))), "")
-    everybody = pattern.strip("*") == ""
-    return _REQUESTER if everybody else node or pattern.replace("?", "1").replace("*", "")
-
-
 def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
     domain = config.domain_of.get(plan.node)
     return tuple(
@@ -312,20 +261,26 @@ def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
 
 
 def closed_domain(plan: ApplicationPlan, config: Config) -> AccessDomain | None:
-    """Return the access domain whose rules refuse the example demand.
-
-    Return None if the rules allow the demand, or if there are no rules.
-    """
+    """Return the access domain whose rules refuse the example demand; None if none does."""
     domain = config.domain_of.get(plan.node)
     return domain if domain and domain.rules and not _rules_for(plan, config) else None
 
 
 def _demand(plan: ApplicationPlan, config: Config) -> str:
-    node = config.nodes.get(plan.node)
+    node, domain = config.nodes.get(plan.node), config.domain_of.get(plan.node)
     topics = node.topics if node else {}
+    # The requester matches a rule that allows the application. If there is none, it matches the
+    # first rule, and a person must widen the rules (`closed_domain`).
+    rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
+    requester = _REQUESTER
+    if rules:
+        pattern = rules[0].requesters[0]
+        matching = next((id for id in sorted(config.nodes) if matches(id, (pattern,))), "")
+        if pattern.strip("*"):
+            requester = matching or pattern.replace("?", "1").replace("*", "")
     fields = {
         "demand": f"{plan.name}-example",
-        "requesters": [_requester(plan, config)],
+        "requesters": [requester],
         "applications": [
             {
                 "id": f"{plan.node}/{plan.name}",

@@ -19,23 +19,18 @@ _PATHS = {
     "gitlab-ci.yml": ".gitlab-ci.yml",
     "propose-image": "ci/propose-image",
 }
+# The templates put these values into YAML and shell scripts as they are, so no character of them
+# may need quotes.
 _NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
 _REPOSITORY = re.compile(r"(?P<host>[a-z0-9.-]+(:[0-9]+)?)(/[a-z0-9._-]+)+")
 _URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A-Za-z0-9._~/-]+")
 
 
 def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str]) -> dict[str, str]:
-    """Return a map from path to text: the container file and the pipelines.
+    """Return the container file and the pipelines, as a map from path to text.
 
-    Args:
-        name: the image's name in the registry of the state repo.
-        repository: the image's repository, with its host.
-        state_repo: the URL of the state repo, without a password.
-        texts: the files in ``templates/scaffold/image``, as a map from name to text.
-
-    Raises:
-        InvalidInput: if ``name``, ``repository`` or ``state_repo`` has characters that the files
-            cannot contain.
+    ``name`` is the image's name in the registry of the state repo, ``repository`` has a host, and
+    ``texts`` has the files in ``templates/scaffold/image`` by name.
     """
     url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
     if not _NAME.fullmatch(name):
@@ -55,6 +50,6 @@ def files(name: str, repository: str, state_repo: str, texts: Mapping[str, str])
         raise InvalidInput.at("--state-repo", message)
     given = {"NAME": name, "REPOSITORY": repository, "HOST": image["host"], "STATE_REPO": url}
     return {
-        _PATHS[file]: re.sub("@([A-Z_]+)@", lambda found: given[found[1]], text)
+        _PATHS[file]: re.sub("@([A-Z_]+)@", lambda match: given[match[1]], text)
         for file, text in texts.items()
     }

@@ -12,14 +12,9 @@ from demandops.settings import API_VERSION, modeline
 def document(path: str, schema: str, kind: str, fields: Mapping[str, Any], note: str = "") -> str:
     """Return the text of a file for people to edit.
 
-    Args:
-        path: the path of the file in the state repo.
-        schema: the name of the JSON Schema with which editors check the file.
-        kind: the value of the field ``kind``.
-        fields: the other fields.
-        note: lines of a comment at the start of the file.
+    ``schema`` names the JSON Schema with which editors check the file; ``note`` becomes a comment
+    at its start.
     """
-    head = {"apiVersion": API_VERSION, "kind": kind}
-    text = strict_yaml.dump({**head, **fields})
+    text = strict_yaml.dump({"apiVersion": API_VERSION, "kind": kind, **fields})
     comment = "".join(f"# {line}\n" for line in note.splitlines())
     return modeline(path, schema) + comment + text

@@ -17,8 +17,8 @@ from demandops.staterepo.git.repository import StateRepository
 from demandops.web.situation import HealthChange
 from demandops.web.views.health_word import word_of
 
+# How many changes of health are kept. They are in memory only, because the page writes nothing.
 _KEPT = 2_000
-"""How many changes of health are kept; older ones are dropped."""
 
 
 class ClusterWatch:
@@ -28,10 +28,7 @@ class ClusterWatch:
     """
 
     def __init__(
-        self,
-        clusters: Mapping[str, ClusterAccess],
-        on_change: Callable[[], None],
-        runtime: Runtime,
+        self, clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None], runtime: Runtime
     ) -> None:
         self._runtime = runtime
         self._caches = {
@@ -46,41 +43,52 @@ class ClusterWatch:
 
     @property
     def clusters(self) -> frozenset[str]:
-        """The names of the clusters that are watched."""
         return frozenset(self._caches)
 
     @property
     def changes(self) -> tuple[HealthChange, ...]:
-        """The newest changes of health since the start, at most 2,000, oldest first.
-
-        The first health that a cluster reports of a release is no change.
-        """
+        """The newest changes of health since the start, oldest first."""
+        # any thread may read this; to iterate would fail if the follower appended meanwhile
         return tuple(self._changes.copy())
 
     def statuses(
         self, targets: Iterable[Target], commit: str, repository: StateRepository
     ) -> dict[str, ReleaseStatus]:
-        """Return the status of each release, by the release's name.
-
-        The access domains of ``targets`` are watched from now on.
-        """
-        wanted = list(targets)
-        self._watch(target.domain for target in wanted)
-        found = statuses(wanted, commit, self._caches, repository, repository.changed_paths)
-        by_name = {target.name: one for target, one in zip(wanted, found, strict=True)}
-        self._note(by_name)
-        return by_name
+        """Return the status of each release, by the name of the release."""
+        # Health is judged by the file that the cluster has applied. Judged by the newest commit,
+        # everything would be `waiting` for seconds after each commit.
+        targets = list(targets)
+        self._watch(target.domain for target in targets)
+        reported = statuses(targets, commit, self._caches, repository, repository.changed_paths)
+        status_of = {target.name: each for target, each in zip(targets, reported, strict=True)}
+        at = self._runtime.monotonic()
+        for name, status in status_of.items():
+            before, after = self._states.get(name, ""), word_of(status)
+            if before == after:
+                continue
+            self._states[name] = after
+            lasted = None
+            if after == "healthy":
+                began = self._unhealthy_from.pop(name, None)
+                lasted = None if began is None else at - began
+            elif after != "unknown":
+                self._unhealthy_from.setdefault(name, at)
+            if before:  # the first health that a cluster reports of a release is no change
+                reason = status.health.reason
+                change = HealthChange(self._runtime.now(), name, before, after, reason, lasted)
+                self._changes.append(change)
+        for name in self._states.keys() - status_of.keys():
+            del self._states[name]
+            self._unhealthy_from.pop(name, None)
+        return status_of
 
     def old_bootstraps(
         self, domains: Collection[ClusterDomain], read: Callable[[str], str | None]
     ) -> tuple[OldBootstrap, ...]:
         """Return the watched clusters that lack the current version of their bootstrap file.
 
-        Access domains that cannot be read are left out.
-
-        Args:
-            domains: the access domains on each cluster.
-            read: returns the text of a file of the state repo, or None if the file is missing.
+        ``read`` returns the text of a file of the state repo. Access domains that cannot be read
+        are left out.
         """
         self._watch(domains)
         return tuple(old_bootstraps(domains, self._caches, read))
@@ -105,28 +113,6 @@ class ClusterWatch:
                 self._domains.add(domain)
                 self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
 
-    def _note(self, statuses: Mapping[str, ReleaseStatus]) -> None:
-        at = self._runtime.monotonic()
-        for name, status in statuses.items():
-            before, after = self._states.get(name, ""), word_of(status)
-            if before == after:
-                continue
-            self._states[name] = after
-            lasted = None
-            if after == "healthy":
-                began = self._unhealthy_from.pop(name, None)
-                lasted = None if began is None else at - began
-            elif after != "unknown":
-                self._unhealthy_from.setdefault(name, at)
-            if before:
-                reason = status.health.reason
-                change = HealthChange(self._runtime.now(), name, before, after, reason, lasted)
-                self._changes.append(change)
-        for name in self._states.keys() - statuses.keys():
-            del self._states[name]
-            self._unhealthy_from.pop(name, None)
-
     def close(self) -> None:
-        """Stop watching."""
         for cache in self._caches.values():
             cache.close()

@@ -15,10 +15,7 @@ from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from itertools import islice
 
-from demandops.cluster.bootstrap_status import OldBootstrap
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.orphans import Orphan
-from demandops.cluster.release_status import ReleaseStatus
 from demandops.errors import DemandOpsError
 from demandops.quoting import one_line
 from demandops.runtime import REAL, Runtime
@@ -33,22 +30,19 @@ from demandops.web.situation import Commit, CommitState, HealthChange, Situation
 
 log = logging.getLogger("demandops")
 
+# How many of the newest commits the time line and the rates show.
 MOST_COMMITS = 5_000
-"""How many of the newest commits the time line and the rates show."""
 
+# The pause in seconds between checks of a local repository, which cost little.
 _LOOK_S = 0.2
-"""The pause in seconds between checks of a local repository, which cost little."""
+# After a new situation, the follower pauses this many times as long as the computation took, but
+# at most one second.
 _PAUSE_FACTOR = 4
-"""After a new situation, the follower pauses this many times as long as the computation took.
-
-The pause keeps the load of the processor low. It lasts at most one second.
-"""
+# How many earlier states are kept for visitors who look back; each holds a whole ledger.
 _MOST_COMMIT_STATES = 8
 
 
 class Follower:
-    """Provides the newest situation of a state repo, and situations at earlier commits."""
-
     def __init__(
         self,
         reader: Reader,
@@ -67,39 +61,32 @@ class Follower:
                 :meth:`wake` or a change on a cluster.
             progress: called while the ledger is loaded.
             runtime: provides the time and the threads.
-
-        Raises:
-            StateRepoError, InvalidInput: if the state cannot be read.
         """
         self._reader, self._runtime = reader, runtime
+        # without an interval, the follower waits until `wake`
         self._interval = _LOOK_S if reader.repository.always_current else interval or None
         self._wake, self.closed = runtime.event(), runtime.event()
         self._watch = ClusterWatch(clusters, self._wake.set, runtime)
         self._commit_states: dict[str, CommitState] = {}
         self._loading = runtime.lock()
+        # Browsers fetch the page again when this number changes.
         self.version = 0
-        """How often the situation has changed since the start."""
+        # The newest commits, at most `MOST_COMMITS`, newest first.
         self.history: tuple[Commit, ...] = ()
-        """The newest commits, at most ``MOST_COMMITS``, newest first."""
-        self._newest = self._situation_at(self._first_commit_state(progress))
+        snapshot = reader.last_valid_snapshot(reader.commit(), progress)
+        self._newest = self._situation_at(_commit_state(reader, snapshot))
         self._thread = runtime.keep_running("page", self._run)
 
     @property
     def newest(self) -> Situation:
-        """The newest situation, with the current time."""
         return replace(self._newest, now=self._runtime.now())
 
     @property
     def health_changes(self) -> tuple[HealthChange, ...]:
-        """The newest changes of health since the follower started, oldest first."""
         return self._watch.changes
 
     def reader(self) -> Reader:
-        """Return a reader of the state repo for the calling thread.
-
-        Raises:
-            StateRepoError: if the state repo cannot be read.
-        """
+        """Return a reader of the state repo for the calling thread."""
         return self._reader.for_another_thread()
 
     def reading(self) -> AbstractContextManager[None]:
@@ -108,13 +95,9 @@ class Follower:
         return reading(repository.address, repository.objects)
 
     def at(self, revision: str) -> Situation:
-        """Return the situation at a revision, which is a commit or a time.
+        """Return the situation at a commit or time; the newest if ``revision`` is empty.
 
-        If ``revision`` is empty, return the newest situation. The situation at an earlier commit
-        has neither health nor proposals.
-
-        Raises:
-            InvalidInput, StateRepoError: if there is no such commit, or its state cannot be read.
+        The situation at an earlier commit has neither health nor proposals.
         """
         newest = self.newest
         if not revision:
@@ -127,30 +110,26 @@ class Follower:
             commit_state = self._commit_states.pop(commit, None) or _commit_state(
                 reader, reader.last_valid_snapshot(commit)
             )
+            # added again at the end, so that the state that was not used for longest is dropped
             self._commit_states[commit] = commit_state
             if len(self._commit_states) > _MOST_COMMIT_STATES:
                 del self._commit_states[next(iter(self._commit_states))]
         return Situation(commit_state, newest.now, is_newest=False)
 
     def last_change(self, commit_state: CommitState, path: str) -> LogEntry | None:
-        """Return the newest commit that changed a file or folder.
+        """Return the newest commit that changed a file or folder, up to that of ``commit_state``.
 
-        Only the commit of ``commit_state`` and its ancestors count. Return None if none of them
-        changed it, or if ``path`` is empty.
-
-        Raises:
-            StateRepoError: if the state repo cannot be read.
+        Return None if none changed it, or if ``path`` is empty.
         """
         if path not in commit_state.last_changes:
-            found = self.reader().log(commit_state.commit, path) if path else iter(())
-            commit_state.last_changes[path] = next(found, None)
+            changes = self.reader().log(commit_state.commit, path) if path else iter(())
+            commit_state.last_changes[path] = next(changes, None)
         return commit_state.last_changes[path]
 
     def not_rendered(self, commit_state: CommitState) -> frozenset[str]:
-        """Return the paths of the generated files that are out of date at a commit.
+        """Return the generated files that a generator must still write or remove after a commit.
 
-        A generator must still write or remove these files after that commit. The set is also
-        empty if the state of the commit cannot be read or rendered.
+        Return none if the state of the commit cannot be read or rendered.
         """
         if commit_state.not_rendered is None:
             try:
@@ -160,82 +139,71 @@ class Follower:
         return commit_state.not_rendered
 
     def wake(self) -> None:
-        """Have the follower check for a new commit now; any thread may call this method."""
         self._wake.set()
 
     def close(self) -> None:
-        """Stop the thread, stop watching the clusters, and close the reader."""
         self.closed.set()
         self._wake.set()
         self._thread.join()
         self._watch.close()
         self._reader.close()
 
-    def _first_commit_state(self, progress: Progress) -> CommitState:
-        snapshot = self._reader.last_valid_snapshot(self._reader.commit(), progress)
-        return _commit_state(self._reader, snapshot)
-
     def _run(self) -> None:
         while not self.closed.is_set():
             self._wake.wait(self._interval)
             self._wake.clear()
-            began, version = self._runtime.monotonic(), self.version
-            self._look()
-            if self.version != version:
+            began, before = self._runtime.monotonic(), self._newest
+            try:
+                commit, commit_state = self._reader.refresh(), before.commit_state
+                with self.reading():
+                    if commit != commit_state.commit:
+                        snapshot = self._reader.snapshot_after(commit_state.snapshot)
+                        commit_state = _commit_state(self._reader, snapshot)
+                        # so that only the releases that new claims affect are planned
+                        commit_state.take_over(before.commit_state)
+                    now = self._situation_at(commit_state)
+            except DemandOpsError as error:
+                now = replace(before, unread=one_line(str(error).replace("\n", "; ")))
+            except Exception as error:  # the page must show that it does not follow any more
+                if not before.unread:
+                    log.exception("the page cannot follow the state repo")
+                now = replace(before, unread=f"a fault of the program: {one_line(repr(error))}")
+            if replace(now, now=before.now) != before:
+                self._newest = now
+                self.version += 1
+                # The pause keeps the load of the processor low when commits come all the time.
                 self.closed.wait(min(1.0, _PAUSE_FACTOR * (self._runtime.monotonic() - began)))
-
-    def _look(self) -> None:
-        known = self._newest
-        try:
-            commit, commit_state = self._reader.refresh(), known.commit_state
-            with self.reading():
-                if commit != commit_state.commit:
-                    snapshot = self._reader.snapshot_after(commit_state.snapshot)
-                    commit_state = _commit_state(self._reader, snapshot)
-                    commit_state.take_over(known.commit_state)
-                found = self._situation_at(commit_state)
-        except DemandOpsError as error:
-            found = replace(known, unread=one_line(str(error).replace("\n", "; ")))
-        except Exception as error:  # the page must show that it does not follow any more
-            if not known.unread:
-                log.exception("the page cannot follow the state repo")
-            found = replace(known, unread=f"a fault of the program: {one_line(repr(error))}")
-        if replace(found, now=known.now) != known:
-            self._newest = found
-            self.version += 1
 
     def _situation_at(self, commit_state: CommitState) -> Situation:
         self._read_history(commit_state.commit)
-        statuses: Mapping[str, ReleaseStatus] = {}
-        old: tuple[OldBootstrap, ...] = ()
-        left: tuple[Orphan, ...] = ()
-        if self._watch.clusters:
-            wanted = [target for _, target in commit_state.targets]
-            repository = self._reader.repository
-            statuses = self._watch.statuses(wanted, commit_state.commit, repository)
-            domains = rollout_targets.domains_of_state(commit_state.state)
-            old = self._watch.old_bootstraps(domains, self._reader.file_reader(commit_state.commit))
-            left = self._watch.orphans(domains, wanted, commit_state.commit, repository)
-        return Situation(
+        watch, repository, commit = self._watch, self._reader.repository, commit_state.commit
+        situation = Situation(
             commit_state,
             self._runtime.now(),
-            statuses=statuses,
-            watched=self._watch.clusters,
-            proposals=tuple(pending_proposals(self._reader.repository)),
-            old_bootstraps=old,
-            orphans=left,
+            watched=watch.clusters,
+            proposals=tuple(pending_proposals(repository)),
+        )
+        if not watch.clusters:
+            return situation
+        targets = [target for _, target in commit_state.targets]
+        domains = rollout_targets.domains_of_state(commit_state.state)
+        return replace(
+            situation,
+            statuses=watch.statuses(targets, commit, repository),
+            old_bootstraps=watch.old_bootstraps(domains, self._reader.file_reader(commit)),
+            orphans=watch.orphans(domains, targets, commit, repository),
         )
 
     def _read_history(self, tip: str) -> None:
-        known = self.history[0].entry.commit if self.history else ""
-        if tip == known:
+        last = self.history[0].entry.commit if self.history else ""
+        if tip == last:
             return
         new = None
-        if known and self._reader.repository.includes(tip, known):
+        if last and self._reader.repository.includes(tip, last):
             with suppress(DemandOpsError):
-                new = list(islice(self._reader.log(f"{known}..{tip}"), MOST_COMMITS))
+                new = list(islice(self._reader.log(f"{last}..{tip}"), MOST_COMMITS))
         before = self.history
-        if new is None:  # the first time, or ``tip`` does not follow the known commit
+        if new is None:  # the first time, or somebody has rewritten the history
             new, before = list(islice(self._reader.log(tip), MOST_COMMITS)), ()
         added = tuple(Commit(entry, self._reader.changed_roots(entry.commit)) for entry in new)
         self.history = (added + before)[:MOST_COMMITS]

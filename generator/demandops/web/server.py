@@ -13,24 +13,19 @@ from demandops.web.site import Site
 
 log = logging.getLogger("demandops")
 
+# How many connections may be open; at most half of them are streams of events (`Site`).
 _AT_ONCE = 200
 _LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 
 class WebServer:
-    """A running web server."""
-
     def __init__(self, address: str, option: str, follower: Follower) -> None:
         """Start the server.
 
         Args:
             address: ``host:port``; port 0 picks a free port.
             option: the option that gave the address, for messages.
-            follower: provides what the page shows; closed by :meth:`close`, or if the server cannot
-                listen.
-
-        Raises:
-            InvalidInput: if the server cannot listen on the address.
+            follower: closed by :meth:`close`, or if the server cannot listen.
         """
         self._follower = follower
         try:
@@ -46,12 +41,13 @@ class WebServer:
                 "(docs/page.md)",
                 self.url,
             )
+        # Other names would allow DNS rebinding, see `Site`. A server that others reach may have any
+        # name, for example that of a reverse proxy.
         hosts = _LOCAL_HOSTS if is_local else ("*",)
         site = Site(follower, hosts, settings.documentation())
         self._server = HttpServer(listening, site.application, "web", _AT_ONCE)
 
     def close(self) -> None:
-        """Stop the server and its follower."""
         self._follower.closed.set()  # ends the open streams of events
         self._server.close()
         self._follower.close()

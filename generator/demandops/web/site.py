@@ -34,7 +34,7 @@ from demandops.config.durations import relative
 from demandops.errors import DemandOpsError
 from demandops.quoting import escaped, lines
 from demandops.web.follower import Follower
-from demandops.web.view_pages import NAVIGATION, VIEWS, Data, View, ViewRequest
+from demandops.web.view_pages import NAVIGATION, VIEWS, View, ViewRequest
 from demandops.web.views import filtered_table
 
 log = logging.getLogger("demandops")
@@ -51,35 +51,31 @@ _HEADERS = {
     "Cross-Origin-Resource-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+# HTTP headers that allow the inline scripts and styles of the documentation.
+# This is safe, because the documentation contains no data of a state repo.
 _DOCS_HEADERS = _HEADERS | {
     "Content-Security-Policy": (
         "default-src 'self'; script-src 'self' 'unsafe-inline'; style-src 'self' 'unsafe-inline'; "
         "img-src 'self' data:; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
     )
 }
-"""HTTP headers that allow the inline scripts and styles of the documentation.
-
-This is safe, because the documentation contains no data of a state repo.
-"""
 _LOOK_S = 0.1
+# Something is sent at least this often, so that no proxy takes a quiet stream for a dead one.
 _HEARTBEAT_S = 15.0
+# How long a browser waits before it opens a stream again that has ended.
 _RETRY_MS = 1_000
-_MOST_LISTENERS = 100
+_MOST_LISTENERS = 100  # half of the connections that the server accepts, so that others get in
+# The parameters with which a view reads commits, which may take seconds.
 _SLOW = {"at", "id", "name"}
-"""The parameters with which a view reads commits, which may take seconds."""
+# How many views may be rendered at the same time; slow ones may not delay the others.
 _AT_ONCE, _SLOW_AT_ONCE = 20, 4
-"""How many views may be rendered at the same time; slow ones may not delay the others."""
+# How many requests may wait for a place; further ones are refused at once.
 _MOST_WAITING = 20
 
 
 class Site:
-    """The ASGI application of the page."""
-
     def __init__(
-        self,
-        follower: Follower,
-        hosts: tuple[str, ...] = ("*",),
-        documentation: Path | None = None,
+        self, follower: Follower, hosts: tuple[str, ...] = ("*",), documentation: Path | None = None
     ) -> None:
         """Make the site.
 
@@ -98,15 +94,16 @@ class Site:
             loader=FileSystemLoader(_HERE / "pages"),
             autoescape=True,
             undefined=StrictUndefined,
-            finalize=_visible,
+            # text with escapes for invisible characters; markup has been escaped already
+            finalize=lambda value: value if isinstance(value, Markup) else lines(str(value)),
             trim_blocks=True,
             lstrip_blocks=True,
         )
         self._templates.filters |= {
-            "when": _when,
+            "when": lambda at: escaped(f"{at.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S UTC}"),
             "clock": _clock,
             "ago": relative,
-            "iso": _iso,
+            "iso": lambda at: f"{at.astimezone(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
             "sh": shlex.quote,
         }
         self.application = Starlette(
@@ -123,6 +120,7 @@ class Site:
             ],
             exception_handlers={404: self._nothing_here},
         )
+        # Starlette would redirect to an address with the Host header, which the client chooses.
         self.application.router.redirect_slashes = False
 
     def _shows(self, view: View) -> Callable[[Request], Any]:
@@ -144,35 +142,31 @@ class Site:
             with self._follower.reading():
                 asked = ViewRequest(self._follower, request)
                 template, data = view(asked)
-                return self._page(asked, template, {**data, "version": version})
+                common = {
+                    "navigation": NAVIGATION,
+                    "here": asked,
+                    "now": asked.situation.now,
+                    "situation": asked.situation,
+                    "commit_state": asked.situation.commit_state,
+                    "exactly": filtered_table.exactly,
+                    "program": __version__,
+                    "has_docs": self._has_docs,
+                    "version": version,
+                }
+                return HTMLResponse(self._templates.get_template(template).render(common | data))
         except DemandOpsError as error:
-            return self._message(request, "Nothing to show", str(error), 404)
+            return self._message("Nothing to show", str(error), 404)
         except Exception:  # the visitor must learn where to look
             log.exception("view %s of the page does not work", request.url.path)
             text = "a fault of the program; see its log"
-            return self._message(request, "This view does not work", text, 500)
+            return self._message("This view does not work", text, 500)
 
-    def _page(self, asked: ViewRequest, template: str, data: Data, status: int = 200) -> Response:
-        common = {
-            "navigation": NAVIGATION,
-            "here": asked,
-            "now": asked.situation.now,
-            "situation": asked.situation,
-            "commit_state": asked.situation.commit_state,
-            "exactly": filtered_table.exactly,
-            "program": __version__,
-            "has_docs": self._has_docs,
-        }
-        text = self._templates.get_template(template).render(common | data)
-        return HTMLResponse(text, status)
-
-    def _message(self, request: Request, title: str, text: str, status: int) -> Response:
+    def _message(self, title: str, text: str, status: int) -> Response:
         page = self._templates.get_template("message.html.j2")
-        shown = {"title": title, "text": text, "path": request.url.path}
-        return HTMLResponse(page.render(shown), status)
+        return HTMLResponse(page.render(title=title, text=text), status)
 
     async def _nothing_here(self, request: Request, error: Exception) -> Response:
-        return self._message(request, "Nothing here", "there is no such view or file", 404)
+        return self._message("Nothing here", "there is no such view or file", 404)
 
     async def _health(self, request: Request) -> Response:
         unread = self._follower.newest.unread
@@ -234,15 +228,13 @@ _REFUSAL = PlainTextResponse("another site asked for this; open the page itself\
 
 
 def _is_foreign(headers: Headers) -> bool:
-    """Return whether another site made the browser send a request.
-
-    A link to the page may be on any site: the browser shows the page in a tab of its own, where no
-    other site can read it. It may not be opened before somebody follows the link.
-    """
+    """Return whether another site made the browser send a request."""
     site = headers.get("sec-fetch-site")
-    if site is None:  # an old browser, a program, or a page without TLS on another machine
+    if site is None:  # an old browser, a program, or another machine's page without TLS
         origin = headers.get("origin")
         return origin is not None and origin.partition("://")[2] != headers.get("host")
+    # A link to the page may be on any site: the browser shows the page in a tab of its own, where
+    # no other site can read it. `sec-purpose` says that nobody has followed the link yet.
     is_link = (
         headers.get("sec-fetch-mode") == "navigate"
         and headers.get("sec-fetch-dest") == "document"
@@ -251,23 +243,7 @@ def _is_foreign(headers: Headers) -> bool:
     return site not in ("same-origin", "none") and not is_link
 
 
-# ---- filters of the templates ----
-
-
-def _visible(value: object) -> object:
-    """Return markup unchanged, and other values as text with escapes for invisible characters."""
-    return value if isinstance(value, Markup) else lines(str(value))
-
-
-def _iso(at: datetime) -> str:
-    return at.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
-
-
-def _when(at: datetime) -> str:
-    return escaped(at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC"))
-
-
 def _clock(at: datetime, now: datetime) -> str:
-    """Return a time as text in UTC: with seconds on the day of ``now``, else with the date."""
+    """Return a time in UTC: with seconds on the day of ``now``, else with the date."""
     at, today = at.astimezone(timezone.utc), now.astimezone(timezone.utc).date()
     return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")

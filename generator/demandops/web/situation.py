@@ -23,7 +23,6 @@ from demandops.decision import State
 from demandops.demand.claim import Claim
 from demandops.errors import Fault
 from demandops.ledger.claim_changes import changes_on
-from demandops.ledger.ledger import Ledger
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import without_suspended
 from demandops.plan.planner import denied_release, plan
@@ -67,42 +66,35 @@ class ReusableRows:
 
 
 class CommitState:
-    """The state at one commit: what runs, and for whom.
+    """The state at one commit, with everything that the page derives from it.
 
-    Most attributes are computed at their first use, and then kept. :meth:`take_over` takes the
-    unchanged releases and rows from an earlier commit state, so that for a new commit only the
-    changed ones must be computed.
+    Most attributes are computed at their first use, and then kept.
     """
 
     def __init__(
         self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
     ) -> None:
         self.snapshot, self.entry, self.problems = snapshot, entry, problems
+        # The rows of each list that was shown, by the list's name.
         self.rows: dict[str, ReusableRows] = {}
-        """The rows of each list that was shown, by the list's name."""
         self._entries: list[Entry] | None = None
         self._planned: dict[ReleaseKey, Planned | None] | None = None
+        # The newest commit that changed a path; None if none did. Paths are looked up when asked
+        # for, because each look-up walks through the history.
         self.last_changes: dict[str, LogEntry | None] = {}
-        """The newest commit, up to this one, that changed each path that was looked up.
-
-        The value is None if no commit changed the path.
-        """
+        # The files that a generator must still write or remove; None until they are looked up.
         self.not_rendered: frozenset[str] | None = None
-        """The files that a generator must still write or remove; None until they are looked up."""
 
     @property
     def commit(self) -> str:
-        """The commit's id."""
         return str(self.snapshot.commit)
 
     @property
     def state(self) -> State:
-        """Configuration and ledger in effect."""
         return self.snapshot.state
 
     @property
     def config(self) -> Config:
-        """The configuration in effect."""
         return self.state.config
 
     @cached_property
@@ -114,57 +106,66 @@ class CommitState:
         """Take the releases and rows of an earlier commit state; plan anew what may differ.
 
         Call this before any other method, because computed attributes are kept.
-
-        Do nothing if the configuration or the overrides differ, because then everything may differ.
         """
         old, new = before.state, self.state
+        # another configuration, or another override, may change every release
         if (old.config, old.overrides) != (new.config, new.overrides):
             return
-        subjects = _changed_subjects(old.ledger, new.ledger)
+        # ledgers share the collection of an unchanged subject's claims, so comparing ids is enough
+        subject_before = {id(claims): subject for subject, claims in old.ledger.claims.items()}
+        subject_now = {id(claims): subject for subject, claims in new.ledger.claims.items()}
+        differing = subject_before.keys() ^ subject_now.keys()
+        subjects = [*dict.fromkeys(subject_before.get(id) or subject_now[id] for id in differing)]
         changes = changes_on(old.ledger, new.ledger, subjects)
-        keys = {
-            *affected_keys(old, new, changes),
-            *_services_with_other_replicas(old.ledger, new.ledger),
+        keys: set[ReleaseKey] = {*affected_keys(old, new, changes)}
+        kept_before, kept_now = old.ledger.kept.steps, new.ledger.kept.steps
+        keys |= {
+            ServiceKey.of(instance)
+            for instance in {*kept_before, *kept_now}
+            if kept_before.get(instance) != kept_now.get(instance)
         }
-        for one, other in ((change.before, change.after) for change in changes):
+        for was, now in ((change.before, change.after) for change in changes):
             # the page shows requesters, but `affected_keys` omits a release whose file stays the
             # same although its requesters changed
-            if one and other and (one.requesters, one.partial) != (other.requesters, other.partial):
-                keys.update(keys_of_claims(self.active, [other]))
-        known = before.planned | dict(self._with_other_claims(before, subjects))
+            if was and now and (was.requesters, was.partial) != (now.requesters, now.partial):
+                keys.update(keys_of_claims(self.active, [now]))
+        planned = before.planned | dict(self._with_other_claims(before, subjects))
         for key in keys:
-            known.pop(key, None)
-            planned = self._plan(key)
-            if planned or denied_release(new, key):
-                known[key] = planned
-        self._planned = known
+            planned.pop(key, None)
+            release = self._plan(key)
+            if release or denied_release(new, key):
+                planned[key] = release
+        self._planned = planned
         self.rows = {name: replace(rows, statuses=None) for name, rows in before.rows.items()}
 
     def _with_other_claims(
         self, before: CommitState, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield each planned release of ``before`` whose claims on ``subjects`` have changed.
-
-        Each yielded release has the claims that need it now.
-        """
+        """Yield the releases of ``before`` whose claims on ``subjects`` have changed."""
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
         for subject in subjects:
             was, now = (each.active.ledger.claims_on(subject) for each in (before, self))
             gone |= {id(claim) for claim in was} - {id(claim) for claim in now}
-            known = {id(claim) for claim in was}
-            fresh[subject.kind][subject.id] = [one for one in now if id(one) not in known]
-        for key, one in before.planned.items():
-            if one is None:
+            before_ids = {id(claim) for claim in was}
+            fresh[subject.kind][subject.id] = [
+                claim for claim in now if id(claim) not in before_ids
+            ]
+        for key, planned in before.planned.items():
+            if planned is None:
                 continue
-            kind, ids = _subjects_of(one.release)
+            release = planned.release
+            if isinstance(release, ServiceRelease):
+                kind, ids = SubjectKind.APPLICATION, release.applications
+            else:
+                kind, ids = SubjectKind.CONNECTION, release.connections
             if fresh[kind].keys().isdisjoint(ids):
                 continue
-            kept = [claim for claim in one.claims if id(claim) not in gone]
+            kept = [claim for claim in planned.claims if id(claim) not in gone]
             added = [claim for id in ids for claim in fresh[kind].get(id, ())]
-            needing = [claim for claim in added if release_causes.needs(claim, one.release)]
-            if needing or len(kept) < len(one.claims):
-                yield key, replace(one, claims=release_causes.by_booking([*kept, *needing]))
+            needing = [claim for claim in added if release_causes.needs(claim, release)]
+            if needing or len(kept) < len(planned.claims):
+                yield key, replace(planned, claims=release_causes.by_booking([*kept, *needing]))
 
     def _plan(self, key: ReleaseKey) -> Planned | None:
         release = plan(self.state, key)
@@ -178,7 +179,7 @@ class CommitState:
         """The planned releases by key.
 
         The value is None if an override denies the release, if overrides suspend all claims that
-        need the release, or if the client of a connection carries no topic.
+        need it, or if the client of a connection carries no topic.
         """
         if self._planned is None:
             self._planned = {key: self._plan(key) for key in all_keys(self.state)}
@@ -186,87 +187,53 @@ class CommitState:
 
     @cached_property
     def _sorted(self) -> list[Planned]:
-        found = filter(None, self.planned.values())
-        return sorted(found, key=lambda one: (one.target.domain.cluster, one.target.name))
+        running = filter(None, self.planned.values())
+        return sorted(running, key=lambda each: (each.target.domain.cluster, each.target.name))
 
     @cached_property
     def targets(self) -> list[tuple[Release, Target]]:
-        """Every planned release and its target, sorted by cluster and name."""
-        return [(one.release, one.target) for one in self._sorted]
+        return [(planned.release, planned.target) for planned in self._sorted]
 
     @cached_property
     def denied(self) -> list[tuple[Release, Override]]:
         """The releases that claims need but an override denies, each with this override."""
-        keys = (key for key, one in self.planned.items() if one is None)
-        return [found for key in keys if (found := denied_release(self.state, key))]
+        keys = (key for key, planned in self.planned.items() if planned is None)
+        return [denied for key in keys if (denied := denied_release(self.state, key))]
 
     @cached_property
     def releases(self) -> dict[str, Release]:
-        """All planned releases by name."""
         return {release.name: release for release, _ in self.targets}
 
     def override_entries(self, now: datetime) -> list[Entry]:
-        """Return each override with its state and the releases and claims that it affects.
-
-        Only the first call computes the result, so its ``now`` decides which overrides have
-        expired.
-        """
+        """Return each override with its state and the releases and claims that it affects."""
+        # only the first call computes the report, so its `now` decides which overrides have expired
         if self._entries is None:
             self._entries = override_report(self.state, now)
         return self._entries
 
     @cached_property
     def claims_of_releases(self) -> dict[str, list[Claim]]:
-        """A map from each release's name to the claims that need the release."""
-        return {one.target.name: one.claims for one in self._sorted}
+        return {planned.target.name: planned.claims for planned in self._sorted}
 
     @cached_property
     def releases_of_demands(self) -> dict[str, list[str]]:
-        """A map from a demand's id to the names of the releases that the demand needs.
-
-        Demands that need no release are left out.
-        """
-        found: dict[str, list[str]] = {}
+        """The names of the releases that each demand needs, for demands that need any."""
+        releases: dict[str, list[str]] = {}
         for name, claims in self.claims_of_releases.items():
             for demand in dict.fromkeys(claim.demand for claim in claims):
-                found.setdefault(demand, []).append(name)
-        return found
+                releases.setdefault(demand, []).append(name)
+        return releases
 
     @cached_property
     def claims_of_demands(self) -> dict[str, list[Claim]]:
-        """A map from each demand's id to the demand's claims, sorted by subject."""
-        found: dict[str, list[Claim]] = {}
+        """The claims of each demand, sorted by subject."""
+        claims_of: dict[str, list[Claim]] = {}
         for claim in self.state.ledger:
-            found.setdefault(claim.demand, []).append(claim)
-        for claims in found.values():
+            claims_of.setdefault(claim.demand, []).append(claim)
+        for claims in claims_of.values():
             if len(claims) > 1:
-                claims.sort(key=lambda one: str(one.subject))
-        return found
-
-
-def _subjects_of(release: Release) -> tuple[SubjectKind, tuple[str, ...]]:
-    if isinstance(release, ServiceRelease):
-        return SubjectKind.APPLICATION, release.applications
-    return SubjectKind.CONNECTION, release.connections
-
-
-def _changed_subjects(old: Ledger, new: Ledger) -> list[Subject]:
-    """Return the subjects whose claims differ between two ledgers.
-
-    Ledgers share the collection of an unchanged subject's claims, so only ``id()`` is compared.
-    """
-    before = {id(claims): subject for subject, claims in old.claims.items()}
-    after = {id(claims): subject for subject, claims in new.claims.items()}
-    differing = before.keys() ^ after.keys()
-    return [*dict.fromkeys(before.get(each) or after[each] for each in differing)]
-
-
-def _services_with_other_replicas(old: Ledger, new: Ledger) -> Iterator[ServiceKey]:
-    """Yield the services whose kept replicas differ between two ledgers."""
-    before, after = old.kept.steps, new.kept.steps
-    for instance in {*before, *after}:
-        if before.get(instance) != after.get(instance):
-            yield ServiceKey.of(instance)
+                claims.sort(key=lambda claim: str(claim.subject))
+        return claims_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,7 +263,6 @@ class Situation:
 
     @property
     def unwatched(self) -> list[str]:
-        """The clusters with releases that the page does not watch, sorted."""
         used = {target.domain.cluster for _, target in self.commit_state.targets}
         return sorted(used - self.watched)
 
@@ -305,10 +271,9 @@ class Situation:
 class HealthChange:
     """A change of a release's health.
 
-    ``before`` and ``after`` are words for a health (:mod:`~demandops.web.views.health_word`).
-    ``lasted_s`` says for how many seconds a release that became healthy was not healthy, counted
-    from when the page first saw it so. It is None if the release did not become healthy, or if the
-    page never saw it so.
+    ``before`` and ``after`` are words of ``views.health_word``. ``lasted_s`` says for how many
+    seconds a release that became healthy was not healthy, counted from when the page first saw it
+    so. It is None if the release did not become healthy, or if the page never saw it so.
     """
 
     time: datetime

@@ -10,7 +10,6 @@ from urllib.parse import urlencode
 
 from starlette.requests import Request
 
-from demandops.config.override import format_time
 from demandops.render.changes.override_state import override_state
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.situation import Situation
@@ -26,8 +25,8 @@ from demandops.web.views import (
 from demandops.web.views.filtered_table import Filter, Link, Row
 from demandops.web.views.lists import LISTS, rows_of
 
+# The parameters that a link to another view keeps: the chosen commit or time, and the filter.
 _KEPT = ("at", "q")
-"""The parameters that a link to another view keeps: the chosen commit or time, and the filter."""
 
 NAVIGATION = (
     ("", "Not ready"),
@@ -37,9 +36,9 @@ NAVIGATION = (
     ("overrides", "Overrides"),
     ("rates", "Rates"),
 )
-"""The path and the title of each view in the navigation bar."""
 
 _MOST_CAUSES = 100
+_EVENTS_ON_A_PAGE = 50
 
 Data = dict[str, Any]
 View = Callable[["ViewRequest"], tuple[str, Data]]
@@ -60,7 +59,8 @@ class ViewRequest:
         return self.params.get(name, "").strip()[:500]
 
     def page(self) -> int:
-        """Return the number of the requested page of a list; 1 if the request gives no number."""
+        """Return the number of the requested page; 1 if the request gives no number."""
+        # `isdigit` accepts "²", of which `int` makes no number
         text = self.get("page")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
 
@@ -76,10 +76,7 @@ class ViewRequest:
         return f"/{self.path if path is None else path}{query}"
 
     def link(self, link: Link) -> str:
-        """Return the address of a link, with the chosen commit or time.
-
-        The address never has the current filter; it has the link's own filter, if there is one.
-        """
+        """Return the address of a link, with its own filter instead of the current one."""
         return self.to(link.path, **{"q": "", **link.params})
 
 
@@ -94,50 +91,46 @@ def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _map(asked: ViewRequest) -> tuple[str, Data]:
-    shown = fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))
-    return "map.html.j2", {"map": shown}
+    picture = fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))
+    return "map.html.j2", {"map": picture}
 
 
 def _list(asked: ViewRequest) -> tuple[str, Data]:
     kind = LISTS[asked.path]
-    found = rows_of(asked.situation, kind.name)
-    shown = filtered_table.table(kind.columns, found, asked.filter, asked.get("sort"), asked.page())
-    return "list.html.j2", {"kind": kind, "table": shown}
+    rows = rows_of(asked.situation, kind.name)
+    table = filtered_table.table(kind.columns, rows, asked.filter, asked.get("sort"), asked.page())
+    return "list.html.j2", {"kind": kind, "table": table}
 
 
 def _demand(asked: ViewRequest) -> tuple[str, Data]:
-    held = demand_view.explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))
-    return "demand.html.j2", {"demand": held}
+    demand = demand_view.explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))
+    return "demand.html.j2", {"demand": demand}
 
 
 def _release(asked: ViewRequest) -> tuple[str, Data]:
-    found = release_view.explained(asked.situation, asked.follower.reader(), asked.get("name"))
-    return "release.html.j2", {"release": found}
-
-
-_EVENTS = 50
+    now, reader = asked.situation, asked.follower.reader()
+    release = release_view.explained_release(now, reader, asked.get("name"))
+    return "release.html.j2", {"release": release}
 
 
 def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     now, lane = asked.situation, asked.get("lane")
-    every = time_line.events(asked.follower.history, asked.follower.health_changes)
-    found = time_line.matching(every, asked.filter, lane if lane in time_line.LANES else "")
+    events = time_line.events(asked.follower.history, asked.follower.health_changes)
+    events = time_line.matching(events, asked.filter, lane if lane in time_line.LANES else "")
     chosen = None if now.is_newest else (now.commit_state.entry.time, now.commit_state.commit)
     changed: list[str] = []
     if asked.get("at"):
-        reader, commit = asked.follower.reader(), now.commit_state.commit
-        changed = reader.files_changed_by(commit)
-    last = max(1, -(-len(found) // _EVENTS))
-    page = min(max(asked.page(), 1), last)
+        changed = asked.follower.reader().files_changed_by(now.commit_state.commit)
+    shown, page, pages = filtered_table.page_of(events, asked.page(), _EVENTS_ON_A_PAGE)
     return "timeline.html.j2", {
-        "strip": time_line.strip(found, now.now, asked.get("span"), chosen),
+        "strip": time_line.strip(events, now.now, asked.get("span"), chosen),
         "lanes": time_line.LANES,
         "lane": lane,
         "spans": time_line.SPANS,
-        "events": found[(page - 1) * _EVENTS : page * _EVENTS],
-        "total": len(found),
+        "events": shown,
+        "total": len(events),
         "page": page,
-        "pages": last,
+        "pages": pages,
         "changed": changed,
         "is_cut": len(asked.follower.history) >= MOST_COMMITS,
     }
@@ -146,8 +139,8 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
 def _overrides(asked: ViewRequest) -> tuple[str, Data]:
     now, entries = asked.situation, []
     pending = asked.follower.not_rendered(now.commit_state)
-    for found in now.commit_state.override_entries(now.now):
-        entry = replace(found, state=override_state(found, now.commit_state.state, pending))
+    for entry in now.commit_state.override_entries(now.now):
+        state = override_state(entry, now.commit_state.state, pending)
         texts = {
             "owner": [entry.override.owner],
             "reason": [entry.override.reason],
@@ -156,20 +149,17 @@ def _overrides(asked: ViewRequest) -> tuple[str, Data]:
             "requester": [who for claim in entry.claims for who in claim.requesters],
         }
         if asked.filter.matches(Row({"override": filtered_table.cell(entry.override.name)}, texts)):
-            entries.append(entry)
-    return "overrides.html.j2", {
-        "entries": entries,
-        "format_time": format_time,
-    }
+            entries.append(replace(entry, state=state))
+    return "overrides.html.j2", {"entries": entries}
 
 
 def _rates(asked: ViewRequest) -> tuple[str, Data]:
     span = asked.get("span") if asked.get("span") in time_line.SPANS else "1d"
     health = asked.follower.health_changes
     commits = [
-        one
-        for one in asked.follower.history
-        if asked.filter.matches(time_line.of_commit(one).row())
+        commit
+        for commit in asked.follower.history
+        if asked.filter.matches(time_line.of_commit(commit).row())
     ]
     plots = rates.plots(commits, health, asked.situation.now, span)
     data = {"plots": plots, "span": span, "spans": time_line.SPANS}
@@ -186,4 +176,3 @@ VIEWS: Mapping[str, View] = {
     "/overrides": _overrides,
     "/rates": _rates,
 }
-"""A map from the address of each view to the function that returns its template and data."""

@@ -37,34 +37,29 @@ commit_option = click.option(
 
 
 def proposal_named(repo: Reader, name: str) -> PendingProposal:
-    """Return the proposal that ``name`` identifies.
+    """Return the proposal with this branch, or with a demand of this id.
 
-    ``name`` is the branch of the proposal, or the id of one of its demands. If no proposal has
-    this branch or demand, ``name`` may be a part of a branch's name.
-
-    Raises:
-        InvalidInput: if no proposal or several proposals fit.
-        RemoteAway: if the state repo cannot be reached.
+    If there is none, ``name`` may be a part of a branch's name.
     """
     pending = list(pending_proposals(repo.repository))
     # requesters choose ids of demands, so such an id may be the branch of another proposal
-    found = (
-        [one for one in pending if name == one.branch]
-        or [one for one in pending if name in one.demands]
-        or [one for one in pending if name in one.branch]
+    fitting = (
+        [proposal for proposal in pending if name == proposal.branch]
+        or [proposal for proposal in pending if name in proposal.demands]
+        or [proposal for proposal in pending if name in proposal.branch]
     )
-    if len(found) == 1:
-        return found[0]
-    known = [one.branch for one in pending]
-    if found:
-        message = f"several proposals fit '{name}': {', '.join(one.branch for one in found)}"
+    if len(fitting) == 1:
+        return fitting[0]
+    if fitting:
+        branches = ", ".join(proposal.branch for proposal in fitting)
+        message = f"several proposals fit '{name}': {branches}"
     else:
-        message = f"no proposal fits '{name}'{suggestion(name, known) or '; nothing is proposed'}"
+        close = suggestion(name, [proposal.branch for proposal in pending])
+        message = f"no proposal fits '{name}'{close or '; nothing is proposed'}"
     raise InvalidInput.at("", message)
 
 
 def print_proposal(proposal: PendingProposal, output: str) -> None:
-    """Print which proposal it is on stderr, unless output is JSON."""
     if output == "text":
         for line in (
             f"{proposal.branch} at commit {proposal.commit}",
@@ -74,18 +69,6 @@ def print_proposal(proposal: PendingProposal, output: str) -> None:
             *(f"  changed: it replaces {old}" for old in proposal.replaces),
         ):
             errors.print(one_line(line))
-
-
-def _print_consequence(repo: Reader, commit: str) -> None:
-    base = repo.base_of(commit)
-    entries, found = differences(repo, base, commit)
-    by_hand = repo.edited_files(base, repo.last_valid_snapshot(commit))
-    for line in (
-        *entry_lines(entries),
-        *release_lines(found.releases, "release "),
-        *(f"~ file {path}" for path in by_hand),
-    ):
-        errors.print(f"  {one_line(line)}")
 
 
 @click.command()
@@ -129,11 +112,20 @@ def approve(
             proposal.require(commit)
         print_proposal(proposal, output)
         if output == "text":
-            _print_consequence(repo, proposal.commit)
+            base = repo.base_of(proposal.commit)
+            entries, preview = differences(repo, base, proposal.commit)
+            # anybody can commit under the generator's name, so what is more than demands is shown
+            by_hand = repo.edited_files(base, repo.last_valid_snapshot(proposal.commit))
+            for line in (
+                *entry_lines(entries),
+                *release_lines(preview.releases, "release "),
+                *(f"~ file {path}" for path in by_hand),
+            ):
+                errors.print(f"  {one_line(line)}")
         confirm("Approve it?", yes, output)
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
         why = " ".join((reason or "").split())
         details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, why)
-        made = person_commit.merge(repo.repository, proposal, details)
-    data = {"outcome": "approved", "branch": proposal.branch, "commit": made.commit}
-    show(output, data, [f"approved: {proposal.branch} is merged in {made.commit}"])
+        merged = person_commit.merge(repo.repository, proposal, details)
+    data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
+    show(output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"])

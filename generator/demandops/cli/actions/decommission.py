@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 import click
 
 from demandops.cli.actions.ledger_change import (
-    await_answer,
+    booked,
     claim_text,
     print_consequences,
     started_generator,
@@ -21,9 +20,9 @@ from demandops.cli.actions.person_change import (
     warned_if_unnamed,
     yes_option,
 )
-from demandops.cli.json_output import claim_data, output_option, show
+from demandops.cli.json_output import Json, claim_data, output_option, show
 from demandops.cli.name_completion import names_of
-from demandops.cli.output import busy, progress
+from demandops.cli.output import progress
 from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.decision import decide
 from demandops.demand.demand_request import Decommission
@@ -87,37 +86,29 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
         name, kinds=chosen, by=str(by), reason=" ".join((reason or "").split())
     ).goal()
     if dry_run or is_asked(yes, output):
-        row = _dry_run(goal, state_repo, output) or _row(goal, "unchanged", None, ())
+        row = _dry_run(goal, state_repo, output)
         show(output, row, _lines(row, True))
         if dry_run or row["outcome"] == "unchanged":
             return
         confirm("Continue?", yes, output)
-    row = _book(goal, by, state_repo, signing_key) or _row(goal, "unchanged", None, ())
+    row = _book(goal, by, state_repo, signing_key)
     show(output, row, _lines(row, False))
 
 
-def _book(
-    goal: dict[str, Any], by: Person, state_repo: str, signing_key: Path | None
-) -> dict[str, Any] | None:
-    """Book the decommissioning; return the command's result as JSON data.
-
-    Return None if the inventory has the node but no claim concerns the node. This is no error.
-    """
+def _book(goal: Json, by: Person, state_repo: str, signing_key: Path | None) -> Json:
+    # through the journal, like a demand, so it may run beside other generators
     with started_generator(state_repo, signing_key) as generator:
         warned_if_unnamed(by)
         try:
-            ticket = generator.submit(goal)
-            with busy("booking"):
-                await_answer(ticket.future)
-            receipt = ticket.future.result()
+            receipt = booked(generator, goal)
         except Refused as error:
             if not _is_unclaimed_node(error, goal, generator.snapshot):
                 raise
-            return None
+            return _row(goal, "unchanged", None, ())
     return _row(goal, receipt.outcome, receipt.commit, receipt.changes)
 
 
-def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, Any] | None:
+def _dry_run(goal: Json, state_repo: str, output: str) -> Json:
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         snapshot = repo.snapshot(progress=report)
         try:
@@ -125,20 +116,19 @@ def _dry_run(goal: dict[str, Any], state_repo: str, output: str) -> dict[str, An
         except Refused as error:
             if not _is_unclaimed_node(error, goal, snapshot):
                 raise
-            return None
+            return _row(goal, "unchanged", None, ())
     if output == "text":
         print_consequences(decision)
     return _row(goal, decision.outcome, None, decision.changes.claims)
 
 
-def _is_unclaimed_node(error: Refused, goal: dict[str, Any], snapshot: Snapshot) -> bool:
+def _is_unclaimed_node(error: Refused, goal: Json, snapshot: Snapshot) -> bool:
+    # a node that holds nothing is no error; any other name that holds nothing may be misspelled
     codes = {each.code for each in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 
 
-def _row(
-    goal: dict[str, Any], outcome: str, commit: str | None, changes: Iterable[ClaimChange]
-) -> dict[str, Any]:
+def _row(goal: Json, outcome: str, commit: str | None, changes: Iterable[ClaimChange]) -> Json:
     claims = [
         claim_data(change.before)
         | {"left": list(change.after.requesters) if change.after else None}
@@ -148,7 +138,7 @@ def _row(
     return {"name": goal["name"], "outcome": outcome, "commit": commit, "claims": claims}
 
 
-def _lines(row: dict[str, Any], dry_run: bool) -> Iterator[str]:
+def _lines(row: Json, dry_run: bool) -> Iterator[str]:
     if row["outcome"] == "unchanged":
         yield f"'{row['name']}' holds nothing"
         return

@@ -9,34 +9,35 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from demandops.cli.output import console, errors, progress
+from demandops.cli.json_output import Json
+from demandops.cli.output import busy, console, errors, progress
 from demandops.cli.views.diff import release_lines
 from demandops.decision import Decision
 from demandops.errors import Fault
-from demandops.service import Generator
+from demandops.service import Generator, Receipt
 
 _LOOK_UP_S = 0.5
 
 
 def await_answer(future: Future[Any]) -> None:
-    """Wait until a demand has an answer; Ctrl-C and SIGTERM interrupt the wait.
-
-    The function polls the future, because a wait without a timeout could miss a signal that arrives
-    just before the wait begins, or a signal that another library handles.
-    """
+    """Wait until a demand has an answer; Ctrl-C and SIGTERM interrupt the wait."""
+    # Polled, because a wait without a timeout could miss a signal that arrives just before the wait
+    # begins, or a signal that another library handles.
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)
 
 
+def booked(generator: Generator, goal: Json) -> Receipt:
+    """Submit a goal, and return its receipt when it is published."""
+    ticket = generator.submit(goal)
+    with busy("booking"):
+        await_answer(ticket.future)
+    return ticket.future.result()
+
+
 @contextmanager
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
-    """Yield a started :class:`Generator`, and close it at the end of the block.
-
-    Within the block, SIGTERM acts like Ctrl-C, if this is the main thread.
-
-    Raises:
-        StateRepoError, InvalidInput: if the state repo or the key cannot be used.
-    """
+    # within the block, SIGTERM acts like Ctrl-C
     before = signal.getsignal(signal.SIGTERM)
     with suppress(ValueError):  # only the main thread may set a handler
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -44,7 +45,7 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
         with progress("reading the ledger") as report:
             generator = Generator(
                 state_repo,
-                requester_limit=None,
+                requester_limit=None,  # the command is its only client
                 start_offline=False,
                 signing_key=signing_key,
                 progress=report,
@@ -64,7 +65,6 @@ def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Gen
 
 
 def print_consequences(decision: Decision) -> None:
-    """Print the releases that a decision changes, and the files that it writes or removes."""
     out = console()
     for line in release_lines(decision.releases):
         out.print(f"  {line}", soft_wrap=True)
@@ -72,13 +72,11 @@ def print_consequences(decision: Decision) -> None:
         out.print(f"  {'remove' if text is None else 'write '} {path}", soft_wrap=True)
 
 
-def print_refusal(title: str, faults: Iterable[dict[str, Any]]) -> None:
-    """Print the title and the faults on stderr. Each fault has the form of the JSON output."""
+def print_refusal(title: str, faults: Iterable[Json]) -> None:
     errors.print(title)
     for each in faults:
         errors.print(f"  {Fault(**each)}")
 
 
-def claim_text(claim: dict[str, Any]) -> str:
-    """Return the subject of a claim as text. ``claim`` has the form of the JSON output."""
+def claim_text(claim: Json) -> str:
     return f"{claim['subject']['kind']} '{claim['subject']['id']}'"

@@ -116,8 +116,14 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
       demandops override create more --service tracker --replicas 2 -m Load
       demandops override create late --node edge --keep -m Tests --expires 2d
     """
+    values = None
+    if values_file is not None:
+        file, content = read_input(values_file)
+        values = strict_yaml.load(content, file)
+        if not isinstance(values, dict):
+            raise InvalidInput.at("", "must be a mapping of Helm values", file=file)
     effects: dict[str, Any] = {
-        "values": _values(values_file),
+        "values": values,
         "version": version,
         "replicas": replicas,
         "node": target,
@@ -157,28 +163,21 @@ def new_override(
 ) -> str:
     """Return the text of a new override's file.
 
-    Args:
-        repo: the open state repo.
-        name: the name of the override.
-        options: the options of the command, which give the reason.
-        selected: the values of the options that select releases and claims.
-        more: the effects and the other fields of the override; None leaves a field out. Without
-            an owner, the person's name in git is the owner.
-
-    Raises:
-        click.UsageError: there is no reason, or nothing is selected.
+    ``selected`` has the values of the options that select releases and claims. ``more`` has the
+    effects and the other fields; None leaves a field out. Without an owner, the person's name in
+    git is the owner.
     """
     if not options.reason:
         raise click.UsageError("give the reason: -m TEXT")
     chosen = selector(selected)
     if not chosen:
         raise click.UsageError("select what the override applies to, for example --node edge")
-    fields = {
-        "reason": options.reason,
-        **more,
-        "owner": more.get("owner") or _owner(repo),
-        "select": [chosen],
-    }
+    owner = more.get("owner")
+    if not owner:
+        # a name in git may have characters that an owner may not have
+        person = repo.operator()
+        owner = person.email if id_problem(person.name) else person.name
+    fields = {"reason": options.reason, **more, "owner": owner, "select": [chosen]}
     given = {key: value for key, value in fields.items() if value is not None}
     return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
 
@@ -187,11 +186,6 @@ def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
     """Show the effect of a new override, ask for confirmation, and commit the override.
 
     With ``options.propose``, commit it to a branch. With ``options.dry_run``, only show the effect.
-
-    Raises:
-        InvalidInput: the override exists, or is not valid.
-        click.ClickException: the person did not confirm.
-        StateRepoError: the commit could not be published.
     """
     if repo.file_reader()(edit.path) is not None:
         message = "exists already; end it first, or choose another name"
@@ -202,21 +196,13 @@ def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Show the effect of ending an override, ask for confirmation, and commit the removal.
-
-    With ``options.propose``, commit it to a branch. With ``options.dry_run``, only show the effect.
-
-    Raises:
-        InvalidInput: there is no such override, or no version of its file was valid.
-        click.ClickException: the person did not confirm.
-        StateRepoError: the commit could not be published.
-    """
-    known = repo.last_valid_snapshot(repo.commit()).state.config.overrides
-    if edit.name not in known and repo.file_reader()(edit.path) is not None:
+    """Like :func:`create_override`, but remove an override."""
+    overrides = repo.last_valid_snapshot(repo.commit()).state.config.overrides
+    if edit.name not in overrides and repo.file_reader()(edit.path) is not None:
         message = "is not valid, so nothing is overridden; correct or remove the file with git"
         raise InvalidInput.at("", message, file=edit.path)
-    if edit.name not in known:
-        message = f"there is no override '{edit.name}'{suggestion(edit.name, known)}"
+    if edit.name not in overrides:
+        message = f"there is no override '{edit.name}'{suggestion(edit.name, overrides)}"
         raise InvalidInput.at("", message)
     _carry_out(repo, edit, consequence(repo, edit), options)
 
@@ -226,24 +212,15 @@ def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> 
         errors.print(f"{edit.summary} ({edit.path})")
         for line in consequence_lines(edit, entry):
             errors.print(line)
+    published = None
     if not options.dry_run:
         confirm("Continue?", options.yes, options.output)
-    made = None if options.dry_run else carry_out(repo, edit, options.propose)
-    print_edit(edit, entry, made, options.output)
-
-
-def _values(file: str | None) -> dict[str, Any] | None:
-    if file is None:
-        return None
-    name, text = read_input(file)
-    data = strict_yaml.load(text, name)
-    if not isinstance(data, dict):
-        raise InvalidInput.at("", "must be a mapping of Helm values", file=name)
-    return data
+        published = carry_out(repo, edit, options.propose)
+    print_edit(edit, entry, published, options.output)
 
 
 def ends_at(text: str | None) -> str | None:
-    """Return the end of an override as the file has it, or None if ``text`` is None.
+    """Return the end of an override as the file has it.
 
     ``text`` is a time, or a duration from now; for any other text, raise BadParameter.
     """
@@ -260,9 +237,3 @@ def ends_at(text: str | None) -> str | None:
         raise click.BadParameter(
             f"{error}, or a duration like 2h", param_hint="--expires"
         ) from None
-
-
-def _owner(repo: Reader) -> str:
-    """Return the person's name in git, or the e-mail address if the name is not a valid id."""
-    person = repo.operator()
-    return person.email if id_problem(person.name) else person.name

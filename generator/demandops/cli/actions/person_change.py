@@ -23,15 +23,9 @@ from demandops.cli.json_output import (
 )
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors, progress
-from demandops.cli.target import (
-    dry_run_option,
-    hint_to_pull,
-    signing_option,
-    writable_repo_option,
-)
+from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
 from demandops.config.base_model import parse_file
 from demandops.config.override import Override, OverrideFile
-from demandops.config.repo_settings import Proposals
 from demandops.forge import ForgeError, forge_for
 from demandops.ledger.world import World
 from demandops.plan.views.override_report import Entry, override_report
@@ -68,18 +62,13 @@ def is_asked(yes: bool, output: str) -> bool:
 
 
 def confirm(question: str, yes: bool, output: str) -> None:
-    """Ask the question, but only if :func:`is_asked` returns true.
-
-    Raises:
-        click.ClickException: the answer was no.
-        click.Abort: the person pressed Ctrl-C or Ctrl-D.
-    """
+    """Ask the question, if :func:`is_asked`; a ClickException says that the answer was no."""
     if is_asked(yes, output) and not click.confirm(question, err=True):
         raise click.ClickException("nothing was changed")
 
 
 def warned_if_unnamed(person: Person) -> Person:
-    """Return ``person`` unchanged; warn if git's configuration does not name the person."""
+    """Return ``person``; warn if git's configuration does not name the person."""
     if not person.is_known:
         errors.print(
             f"warning: git does not know who you are, so the commit's author is {person}; to "
@@ -93,14 +82,8 @@ def warned_if_unnamed(person: Person) -> Person:
 def writable(
     state_repo: str, signing_key: Path | None, *, dry_run: bool = False
 ) -> Iterator[Reader]:
-    """Yield an open state repo for a person's commits, which ``signing_key`` signs.
-
-    With ``dry_run``, the state repo may also be a checkout.
-
-    Raises:
-        StateRepoError: the state repo cannot be reached or read.
-        SigningFailed: the key cannot sign.
-    """
+    """Yield an open state repo for a person's commits, which ``signing_key`` signs."""
+    # a dry run writes nothing, so the state repo may also be a checkout
     with reader.opened(state_repo, only_read=dry_run) as repo:
         repo.repository.signer = Signer(signing_key) if signing_key else None
         yield repo
@@ -120,10 +103,7 @@ class EditOptions:
 
 
 def editing(command: Command) -> Command:
-    """Add the options of :class:`EditOptions` to a command; return the command.
-
-    The command gets the values of these options as one argument, ``options``.
-    """
+    """Add the options of :class:`EditOptions` to a command, which gets them as ``options``."""
 
     @wraps(command)
     def run(**given: Any) -> Any:  # noqa: ANN401
@@ -150,7 +130,7 @@ def editing(command: Command) -> Command:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A person's edit of one override: the file's text, and the commit's summary and reason.
+    """A person's edit of one override, and the summary and reason of its commit.
 
     ``text`` is the new text of the override's file; None removes the file.
     """
@@ -162,17 +142,13 @@ class Edit:
 
     @property
     def path(self) -> str:
-        """The file of the override."""
         return f"overrides/{self.name}.yaml"
 
 
 def consequence(repo: Reader, edit: Edit) -> Entry:
-    """Return the edited override, and the releases and claims that this override affects.
+    """Return the edited override, and the releases and claims that it affects.
 
-    A new override is treated as if it were already on main. An override to remove must exist.
-
-    Raises:
-        InvalidInput: the new file is not valid.
+    A new override is treated as if it were on main already. One to remove must exist.
     """
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(repo.commit(), report).state
@@ -186,15 +162,7 @@ def consequence(repo: Reader, edit: Edit) -> Entry:
 
 
 def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
-    """Publish the edit; return its commit, its branch, and the link of its merge request.
-
-    With ``propose``, the commit goes to a branch, otherwise to main. The link is empty if no merge
-    request was opened.
-
-    Raises:
-        InvalidInput: the edit makes the configuration not valid.
-        StateRepoError: the commit could not be published.
-    """
+    """Publish the edit on main, or with ``propose`` on a branch and as a merge request."""
     files = {edit.path: edit.text}
     details = CommitDetails(
         warned_if_unnamed(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason)
@@ -202,95 +170,65 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
     if not propose:
         return person_commit.commit_to_main(repo.repository, lambda _: files, details)
     branch = f"override/{edit.name}"
-    made = person_commit.commit_to_branch(
-        repo.repository, files, details, branch, _push_options(repo, edit)
-    )
-    return Published(made.commit, branch, made.link or _opened(repo, edit, branch))
-
-
-def _forge_settings(repo: Reader) -> Proposals:
-    return repo.last_valid_snapshot(repo.commit()).state.config.repo_settings.proposals
-
-
-def _push_options(repo: Reader, edit: Edit) -> list[str]:
-    if _forge_settings(repo).forge != "gitlab":
-        return []
-    return [
+    title, reason = harmless(one_line(edit.summary)), one_line(edit.reason)
+    proposals = repo.last_valid_snapshot(repo.commit()).state.config.repo_settings.proposals
+    push_options = [
         "merge_request.create",
         f"merge_request.target={MAIN_BRANCH}",
-        f"merge_request.title={harmless(one_line(edit.summary))}",
-        f"merge_request.description={one_line(edit.reason)}",
+        f"merge_request.title={title}",
+        f"merge_request.description={reason}",
         "merge_request.remove_source_branch",
     ]
-
-
-def _opened(repo: Reader, edit: Edit, branch: str) -> str:
-    """Open a pull request at GitHub or Gitea for a pushed branch; return its link.
-
-    Return an empty text if neither forge is configured, or if no pull request could be opened.
-    """
+    if proposals.forge != "gitlab":  # only GitLab opens a merge request for a push
+        push_options = []
+    pushed = person_commit.commit_to_branch(repo.repository, files, details, branch, push_options)
+    link = pushed.link
     try:
-        forge = forge_for(_forge_settings(repo), settings.forge_token_file())
-        if forge is None:
-            return ""
-        title = harmless(one_line(edit.summary))
-        return forge.open(branch, MAIN_BRANCH, title, one_line(edit.reason)).link
-    except ForgeError as error:
+        if not link and (forge := forge_for(proposals, settings.forge_token_file())):
+            link = forge.open(branch, MAIN_BRANCH, title, reason).link
+    except ForgeError as error:  # the branch is there, so a person can open the merge request
         errors.print(f"warning: no merge request was opened: {error}; open one for {branch}")
-        return ""
+    return Published(pushed.commit, branch, link)
 
 
-def print_edit(edit: Edit, entry: Entry, made: Published | None, output: str) -> None:
-    """Print the outcome of the edit. JSON also lists what the override applies to.
-
-    ``made`` is the published commit; None if nothing was published.
-    """
+def print_edit(edit: Edit, entry: Entry, published: Published | None, output: str) -> None:
+    """Print the outcome of the edit; without ``published``, what would change."""
+    outcome = "would-change"
+    if published:
+        outcome = "committed" if published.branch == MAIN_BRANCH else "proposed"
     data: Json = {
-        "outcome": _outcome(made),
-        "commit": made.commit if made else None,
-        "branch": made.branch if made else None,
-        "link": made.link or None if made else None,
+        "outcome": outcome,
+        "commit": published.commit if published else None,
+        "branch": published.branch if published else None,
+        "link": published.link or None if published else None,
         "text": edit.text,
         "override": override_data(entry.override),
         "state": entry.state,
         "releases": [release_data(each) for each in entry.releases],
         "claims": [claim_data(each) for each in entry.claims],
     }
-    show(output, data, _lines(edit, data))
-
-
-def _outcome(made: Published | None) -> str:
-    if made is None:
-        return "would-change"
-    return "committed" if made.branch == MAIN_BRANCH else "proposed"
-
-
-def _lines(edit: Edit, data: Json) -> Iterator[str]:
-    if data["outcome"] == "committed":
-        yield f"{edit.summary}: commit {data['commit']} on {MAIN_BRANCH}"
-        yield "a running generator carries out this commit, or else the next generator that starts"
-        yield from hint_to_pull()
-    elif data["outcome"] == "proposed":
-        yield f"{edit.summary}: merge {data['branch']} {data['link'] or ''}".rstrip()
+    if outcome == "committed":
+        lines = [
+            f"{edit.summary}: commit {data['commit']} on {MAIN_BRANCH}",
+            "a running generator carries out this commit, or else the next generator that starts",
+            *hint_to_pull(),
+        ]
+    elif outcome == "proposed":
+        lines = [f"{edit.summary}: merge {data['branch']} {data['link'] or ''}".rstrip()]
     else:
-        yield f"{edit.summary}: nothing was changed"
-        yield from (f"    {line}" for line in (edit.text or "").splitlines())
+        text = (edit.text or "").splitlines()
+        lines = [f"{edit.summary}: nothing was changed", *(f"    {line}" for line in text)]
+    show(output, data, lines)
 
 
 def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
-    """Return one line for each release and claim that the override affects.
-
-    If the edit removes the override, each line says that the release or claim is no longer
-    affected. If nothing is affected, one line says so.
-    """
     verb = "affects" if edit.text is not None else "no longer affects"
-    found = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
-    found += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
-    return found or ["  affects nothing now"]
+    lines = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
+    lines += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
+    return lines or ["  affects nothing now"]
 
 
 def warn_of_idle(entry: Entry) -> None:
-    """Warn about an override that has no effect now."""
     override = entry.override
     if entry.state == "matches nothing":
         errors.print(f"warning: {override.path} has no effect on anything that is demanded now")
@@ -316,5 +254,4 @@ def selecting(command: Command) -> Command:
 
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:
-    """Return an override's selector, made from the options that :func:`selecting` adds."""
     return {name: list(values) for name, values in given.items() if values}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from concurrent.futures import Future
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -17,14 +16,9 @@ from demandops.cli.actions.ledger_change import (
     print_refusal,
     started_generator,
 )
-from demandops.cli.json_output import faults_of, output_option, print_json
+from demandops.cli.json_output import Json, faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
-from demandops.cli.target import (
-    dry_run_option,
-    hint_to_pull,
-    signing_option,
-    writable_repo_option,
-)
+from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
 from demandops.decision import admit, decide, form_faults
 from demandops.demand.demand_goal import is_demand_goal
 from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, Withdrawn, fault
@@ -38,18 +32,14 @@ from demandops.staterepo import reader
 
 @dataclass(frozen=True, slots=True)
 class Document:
-    """A goal, and the file that it comes from."""
-
     file: str
     goal: Any
-    text: str
-    """The text of the file."""
-    number: int
-    """The index of the document in the file, from 0."""
+    text: str  # of the whole file
+    number: int  # of the document in the file, from 0
 
     @property
     def request_id(self) -> str:
-        """Return the id of the goal's request or demand; empty if the id is missing or no text."""
+        """The id of the goal's request or demand; empty if the id is missing or no text."""
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
@@ -98,9 +88,13 @@ def request(
       demandops request visit.yaml --release
       demandops request - --wait
     """
-    documents = [document for file in files for document in _documents(file)]
+    documents = []
+    for file in files:
+        name, text = read_input(file)
+        goals = enumerate(strict_yaml.load_all(text, name))
+        documents += [Document(name, goal, text, at) for at, goal in goals if goal is not None]
     if release:
-        documents = [replace(one, goal=_release_of(one.goal)) for one in documents]
+        documents = [replace(each, goal=_release_of(each.goal)) for each in documents]
     if not documents:
         raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     if any(form_faults(document.goal) for document in documents):
@@ -112,7 +106,7 @@ def request(
     if output == "json":
         print_json(rows)
     else:
-        _print(rows, documents, dry_run)
+        _print_rows(rows, documents, dry_run)
     unanswered = sum(_is_unanswered(row) for row in rows) if not dry_run else 0
     if unanswered:
         errors.print(f"{len(rows) - unanswered} of {len(rows)} requests have an answer")
@@ -121,26 +115,13 @@ def request(
         raise click.exceptions.Exit(1)
 
 
-def _is_unanswered(row: dict[str, Any]) -> bool:
-    """Return whether a request has no answer yet.
-
-    A request that waits for room on a node has an answer: the commit that records the wait.
-    """
+def _is_unanswered(row: Json) -> bool:
+    # a request that waits for room on a node has an answer: the commit that records the wait
     return row["outcome"] == "waiting" and row["commit"] is None
 
 
-def _documents(file: str) -> Iterable[Document]:
-    name, text = read_input(file)
-    goals = enumerate(strict_yaml.load_all(text, name))
-    return [Document(name, goal, text, number) for number, goal in goals if goal is not None]
-
-
 def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
-    """Return the goal that releases what ``goal`` demands.
-
-    If ``goal`` is not a mapping, return it unchanged, because the check of goals refuses it later.
-    """
-    if not isinstance(goal, dict):
+    if not isinstance(goal, dict):  # the check of goals refuses it later
         return goal
     if not is_demand_goal(goal):
         return {**goal, "shutdown": True}
@@ -148,7 +129,7 @@ def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
     return {name: goal[name] for name in names if name in goal} | {"operation": "release"}
 
 
-def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str, Any]:
+def _row(index: int, request_id: str, outcome: str, **more: object) -> Json:
     return {
         "index": index,
         "request": request_id,
@@ -161,7 +142,7 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> dict[str,
     } | more
 
 
-def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]]:
+def _unbooked(documents: list[Document], state_repo: str) -> list[Json]:
     """Return a refusal for each document, because at least one of them does not parse."""
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         state = repo.snapshot(progress=report).state
@@ -178,7 +159,7 @@ def _unbooked(documents: list[Document], state_repo: str) -> list[dict[str, Any]
     return rows
 
 
-def _refused(index: int, document: Document, error: DemandOpsError) -> dict[str, Any]:
+def _refused(index: int, document: Document, error: DemandOpsError) -> Json:
     lines = field_lines.lines(document.text, document.number)
     faults = [
         each | {"line": field_lines.nearest(each["field"], lines)} if not each["file"] else each
@@ -189,13 +170,10 @@ def _refused(index: int, document: Document, error: DemandOpsError) -> dict[str,
 
 def _book(
     documents: list[Document], state_repo: str, wait: bool, signing_key: Path | None
-) -> list[dict[str, Any]]:
+) -> list[Json]:
     answers: list[_Answer] = []
     try:
-        with (
-            started_generator(state_repo, signing_key) as generator,
-            progress("booking") as report,
-        ):
+        with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
             for document in documents:
                 answers.append(_submitted(generator, document, wait))
             for done, answer in enumerate(answers, start=1):
@@ -214,24 +192,19 @@ def _book(
     return [_answered(index, document, answer) for index, (document, answer) in pairs]
 
 
-def _answered(index: int, document: Document, answer: _Answer) -> dict[str, Any]:
-    """Return the outcome of a request as a row of the output.
-
-    Raises:
-        Unsound: if it is not known whether the request was booked.
-    """
+def _answered(index: int, document: Document, answer: _Answer) -> Json:
     try:
         result = answer.result(timeout=0)
     except (ShuttingDown, TimeoutError):  # the command was interrupted
         return _row(index, document.request_id, "waiting")
-    except Unsound:
+    except Unsound:  # it is not known whether the request was booked
         raise
     except DemandOpsError as error:
         return _refused(index, document, error)
     if not isinstance(result, Receipt):
         return _row(index, document.request_id, "proposed", proposal=result)
-    told = {name: getattr(result, name) for name in ("commit", "warnings", "not_held", "placed")}
-    return _row(index, result.request_id, result.outcome, **told)
+    more = {name: getattr(result, name) for name in ("commit", "warnings", "not_held", "placed")}
+    return _row(index, result.request_id, result.outcome, **more)
 
 
 def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
@@ -251,10 +224,9 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
             answer.set_result(parse_waiting_text(text))
 
     def finish(future: Future[Receipt]) -> None:
-        error = future.exception()
-        if answer.done():
+        if answer.done():  # the proposal was the answer
             return
-        if error is not None:
+        if (error := future.exception()) is not None:
             answer.set_exception(error)
         else:
             answer.set_result(future.result())
@@ -263,15 +235,12 @@ def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
     return answer
 
 
-def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[dict[str, Any]]:
-    """Return the outcome of each request as a row of the output, without booking.
-
-    Each request is decided as if the requests before it were booked.
-    """
+def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Json]:
     rows = []
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         repo.refuse_other_render_version()
         state = repo.snapshot(progress=report).state
+        # each request is decided as if the requests before it were booked
         committed, written = repo.file_reader(), dict[str, str | None]()
 
         def read(path: str) -> str | None:
@@ -291,7 +260,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
                 for rule in decision.approval:
                     console().print(f"  needs approval: {rule} requires it")
                 print_consequences(decision)
-            more: dict[str, Any] = {
+            more: Json = {
                 "warnings": decision.warnings,
                 "not_held": decision.changes.not_held,
                 "placed": decision.placed,
@@ -303,17 +272,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[di
     return rows
 
 
-def _unit_warnings(goal: Any) -> Iterable[str]:  # noqa: ANN401 - as it was read
-    """Yield a warning if the lease has no unit.
-
-    A lease without a unit counts as seconds, but its author may have meant minutes.
-    """
-    lease = goal.get("lease") if isinstance(goal, dict) else None
-    if isinstance(lease, int) and not isinstance(lease, bool):
-        yield f"lease: {lease} is {lease} seconds; write the unit, like {lease}s or {lease}m"
-
-
-def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool) -> None:
+def _print_rows(rows: list[Json], documents: list[Document], dry_run: bool) -> None:
     out = console()
     for row, document in zip(rows, documents, strict=True):
         title = f"{document.file}: request {row['index']} '{one_line(row['request'])}'"
@@ -328,7 +287,13 @@ def _print(rows: list[dict[str, Any]], documents: list[Document], dry_run: bool)
             out.print(f"{title} {told}", soft_wrap=True)
         for choice in row["placed"]:
             out.print(f"  {choice}", soft_wrap=True)
-        for warning in (*_unit_warnings(document.goal), *row["warnings"]):
+        warnings = [*row["warnings"]]
+        lease = document.goal.get("lease") if isinstance(document.goal, dict) else None
+        if isinstance(lease, int) and not isinstance(lease, bool):
+            # it counts as seconds, but its author may have meant minutes
+            told = f"lease: {lease} is {lease} seconds; write the unit, like {lease}s or {lease}m"
+            warnings.insert(0, told)
+        for warning in warnings:
             errors.print(f"  warning: {warning}")
         for item in row["not_held"]:
             errors.print(f"  listed, but not held by the requester: {item}")

@@ -40,8 +40,10 @@ def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) 
     summary = f"Resume {name or described(selected)}"
     edit = Edit(name or name_of(selected), None, summary, options.reason)
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
-        known = repo.last_valid_snapshot(repo.commit()).state.config.overrides.get(edit.name)
-        if known and not name and not selects(known, selected):
+        overrides = repo.last_valid_snapshot(repo.commit()).state.config.overrides
+        override = overrides.get(edit.name)
+        # a person may have changed what the file selects since it was suspended
+        if override and not name and not selects(override, selected):
             message = f"selects something else; to end it, run: demandops resume {edit.name}"
             raise InvalidInput.at("select", message, file=edit.path)
         end_override(repo, edit, options)

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import click
 
 from demandops.cli.actions.ledger_change import (
-    await_answer,
+    booked,
     claim_text,
     print_refusal,
     started_generator,
@@ -22,8 +21,8 @@ from demandops.cli.actions.person_change import (
     warned_if_unnamed,
     yes_option,
 )
-from demandops.cli.json_output import claim_data, faults_of, output_option, show
-from demandops.cli.output import busy, progress
+from demandops.cli.json_output import Json, claim_data, faults_of, output_option, show
+from demandops.cli.output import progress
 from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.cli.views.diff import release_lines
 from demandops.config.config import CONFIG_ROOTS
@@ -82,7 +81,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
         to, base = repo.commit(revision), repo.commit()
         who = repo.operator() if dry_run else warned_if_unnamed(repo.operator())
         goal = rollback_goal.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)
-        result: dict[str, Any] = {"to": to, "outcome": "refused", "commit": None}
+        result: Json = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
         result |= {**_consequences(None), "configuration_since": since, "faults": []}
         try:
@@ -101,7 +100,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
         raise click.exceptions.Exit(1)
 
 
-def _dry_run(repo: Reader, goal: dict[str, Any], base: str) -> dict[str, Any]:
+def _dry_run(repo: Reader, goal: Json, base: str) -> Json:
     """Return the outcome and consequences of a rollback on top of ``base``; book nothing."""
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
@@ -110,8 +109,8 @@ def _dry_run(repo: Reader, goal: dict[str, Any], base: str) -> dict[str, Any]:
     return {"outcome": decision.outcome, **_consequences(decision)}
 
 
-def _consequences(decision: Decision | None) -> dict[str, Any]:
-    claims: dict[str, list[dict[str, Any]]] = {word: [] for word in _SIGN}
+def _consequences(decision: Decision | None) -> Json:
+    claims: dict[str, list[Json]] = {word: [] for word in _SIGN}
     for change in decision.changes.claims if decision else ():
         word = "changed_back" if change.before else "restored"
         claim = change.after or change.before
@@ -121,34 +120,28 @@ def _consequences(decision: Decision | None) -> dict[str, Any]:
     return {**claims, "releases": [asdict(each) for each in releases]}
 
 
-def _roll_back(
-    state_repo: str, goal: dict[str, Any], signing_key: Path | None, base: str
-) -> dict[str, Any]:
+def _roll_back(state_repo: str, goal: Json, signing_key: Path | None, base: str) -> Json:
     """Roll back with a generator; return the outcome as JSON data.
 
-    The caller knows the consequences on top of the commit ``base``. If the rollback was decided on
-    another commit, the data has the consequences on top of that commit. If the rollback was refused
-    or had no effect, the data says that there are none.
+    The caller knows the consequences on top of the commit ``base``. The data has others if the
+    rollback was decided on another commit, was refused or had no effect.
     """
     try:
         with started_generator(state_repo, signing_key) as generator:
-            ticket = generator.submit(goal)
-            with busy("booking"):
-                await_answer(ticket.future)
-            receipt = ticket.future.result()
+            receipt = booked(generator, goal)
     except InvalidInput as error:
         return {"outcome": "refused", **_consequences(None), "faults": faults_of(error)}
-    result: dict[str, Any] = {"outcome": receipt.outcome, "commit": receipt.commit}
+    result: Json = {"outcome": receipt.outcome, "commit": receipt.commit}
     if receipt.outcome == "unchanged":
         return result | _consequences(None)
     with reader.opened(state_repo) as repo:
         decided_on = repo.commit(f"{receipt.commit}~1")
-        if decided_on != base:  # main has moved since
+        if decided_on != base:  # main has moved since the consequences were shown
             result |= _dry_run(repo, goal, decided_on)
     return result
 
 
-def _lines(result: dict[str, Any], dry_run: bool) -> Iterator[str]:
+def _lines(result: Json, dry_run: bool) -> Iterator[str]:
     to = result["to"][:10]
     if result["outcome"] == "unchanged":
         yield f"the ledger is the same as at {to}; there is nothing to roll back"

@@ -25,9 +25,9 @@ def name_of(selected: dict[str, tuple[str, ...]]) -> str:
 
 
 def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
-    """Return whether an override has this selection, and no other one with the same name."""
-    known = [one.model_dump(exclude_none=True) for one in override.select]
-    return [{kind: {*values} for kind, values in one.items()} for one in known] == [
+    """Return whether an override has this selection, and not another one with the same name."""
+    selectors = [each.model_dump(exclude_none=True) for each in override.select]
+    return [{kind: {*values} for kind, values in each.items()} for each in selectors] == [
         {kind: {*values} for kind, values in selector(selected).items()}
     ]
 
@@ -40,11 +40,7 @@ def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
     help="When the suspension ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
 )
 @editing
-def suspend(
-    expires: str | None,
-    options: EditOptions,
-    **selected: tuple[str, ...],
-) -> None:
+def suspend(expires: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Stop applications and connections; their claims stay booked.
 
     Nothing runs for these claims, and new demands that match the options are refused. To end the
@@ -61,9 +57,8 @@ def suspend(
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
         name = name_of(selected)
         text = new_override(repo, name, options, selected, effect)
-        create_override(
-            repo, Edit(name, text, f"Suspend {described(selected)}", options.reason), options
-        )
+        edit = Edit(name, text, f"Suspend {described(selected)}", options.reason)
+        create_override(repo, edit, options)
 
 
 def described(selected: dict[str, tuple[str, ...]]) -> str:

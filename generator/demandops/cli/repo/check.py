@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 import click
 
-from demandops.cli.json_output import output_formats, print_json
+from demandops.cli.json_output import Json, output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.repo import pull_request_comment
 from demandops.cli.views.diff import entry_lines, release_lines
@@ -17,7 +16,6 @@ from demandops.evaluator.process import processor_time
 from demandops.render.changes.merge_preview import FileChange, MergePreview
 from demandops.staterepo.pull_request import merge_check
 from demandops.staterepo.pull_request.merge_check import CheckResult
-from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
 
 _MOST_DIFF_LINES = 400
 _LONG_NEW_FILE = 30
@@ -65,82 +63,69 @@ def check(directory: Path, base: str | None, require_helm: bool, output: str) ->
     elif output == "markdown":
         click.echo(pull_request_comment.report(checked), nl=False)
     else:
-        _print(directory, checked)
+        for fault in checked.faults:
+            errors.print(f"error: {fault}")
+        for warning in checked.warnings:
+            errors.print(f"warning: {warning}")
+        out = console()
+        if not checked.faults:
+            out.print(f"{directory}: all files are valid and every release renders")
+            for line in pull_request_comment.chart_lines(checked.charts):
+                out.print(line, soft_wrap=True)
+        for line in _lines(checked):
+            out.print(line, soft_wrap=True)
     if checked.faults:
         raise click.exceptions.Exit(1)
 
 
-def _data(checked: CheckResult) -> dict[str, Any]:
-    found, entries = checked.preview, checked.bookkeeping
-    files = found.files if found else ()
-    diffs, left = _bounded(files, _MOST_DIFF_LINES_JSON)
+def _data(checked: CheckResult) -> Json:
+    merge, entries, charts = checked.preview, checked.bookkeeping, None
+    if checked.charts is not None:
+        charts = {
+            "rendered": list(checked.charts.rendered),
+            "releases": checked.charts.releases,
+            "examples": checked.charts.examples,
+            "not_rendered": dict(checked.charts.not_rendered),
+        }
+    files = merge.files if merge else ()
+    diffs, left_out = _bounded(files, _MOST_DIFF_LINES_JSON)
     changes = [
-        {"file": each.path, "change": each.change, "diff": diffs.get(each.path)} for each in files
+        {"file": file.path, "change": file.change, "diff": diffs.get(file.path)} for file in files
     ]
     return {
         "faults": [asdict(each) for each in checked.faults],
         "warnings": [asdict(each) for each in checked.warnings],
         "suggestions": [asdict(each) for each in checked.suggestions],
-        "charts": _charts(checked.charts),
+        "charts": charts,
         "base": checked.base,
         "base_valid": checked.base_valid,
-        "releases": [asdict(each) for each in found.releases] if found else None,
-        "files": changes if found else None,
-        "diff_lines_left_out": left,
+        "releases": [asdict(each) for each in merge.releases] if merge else None,
+        "files": changes if merge else None,
+        "diff_lines_left_out": left_out,
         "bookkeeping": None if entries is None else [asdict(each) for each in entries],
     }
 
 
-def _charts(charts: RenderedCharts | None) -> dict[str, Any] | None:
-    return (
-        None
-        if charts is None
-        else {
-            "rendered": list(charts.rendered),
-            "releases": charts.releases,
-            "examples": charts.examples,
-            "not_rendered": dict(charts.not_rendered),
-        }
-    )
-
-
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return the diffs that fit into ``most`` lines, by path, and the number of other lines.
-
-    A diff that does not fit is left out as a whole; a shorter diff after it may fit.
-    """
+    """Return the diffs that fit into ``most`` lines, by path, and the number of other lines."""
     shown: dict[str, str] = {}
-    left = 0
+    left_out = 0
     for file in files:
         lines = list(file.diff())
         if len(lines) <= most:
             shown[file.path] = "\n".join(lines) + "\n"
             most -= len(lines)
-        else:
-            left += len(lines)
-    return shown, left
-
-
-def _print(directory: Path, checked: CheckResult) -> None:
-    out = console()
-    for each in checked.faults:
-        errors.print(f"error: {each}")
-    for each in checked.warnings:
-        errors.print(f"warning: {each}")
-    if not checked.faults:
-        out.print(f"{directory}: all files are valid and every release renders")
-        for line in pull_request_comment.chart_lines(checked.charts):
-            out.print(line, soft_wrap=True)
-    for line in _lines(checked):
-        out.print(line, soft_wrap=True)
+        else:  # it is left out as a whole; a shorter one after it may fit
+            left_out += len(lines)
+    return shown, left_out
 
 
 def _lines(checked: CheckResult) -> Iterator[str]:
-    for each in checked.suggestions:
-        yield f"\ninstead of editing {each.instead_of}, write {each.file}:\n"
-        yield from each.text.splitlines()
-        if each.other_releases:
-            yield f"\n(this override also applies to {', '.join(each.other_releases)})"
+    for override in checked.suggestions:
+        yield f"\ninstead of editing {override.instead_of}, write {override.file}:\n"
+        yield from override.text.splitlines()
+        if override.other_releases:
+            yield f"\n(this override also applies to {', '.join(override.other_releases)})"
     if checked.newer:
         commits = "a commit" if checked.newer == 1 else f"{checked.newer} commits"
         yield (
@@ -167,30 +152,27 @@ def _lines(checked: CheckResult) -> Iterator[str]:
 
 
 def _file_lines(consequence: MergePreview) -> Iterator[str]:
-    """Yield lines that list the files that a merge changes, and then their diffs.
-
-    A long new file that belongs to no release is listed without a diff.
-    """
     others, files = {*consequence.other_files}, consequence.files
-    new = {
-        each.path: length
-        for each in files
-        if each.before is None
-        and each.path in others
-        and (length := len((each.after or "").splitlines())) > _LONG_NEW_FILE
-    }
     if not files:
         return
+    # a long new file that belongs to no release is listed without a diff
+    new = {
+        file.path: length
+        for file in files
+        if file.before is None
+        and file.path in others
+        and (length := len((file.after or "").splitlines())) > _LONG_NEW_FILE
+    }
     count = "1 file" if len(files) == 1 else f"{len(files)} files"
     yield f"\nthe generator will write or remove {count}:"
-    for each in files:
-        note = f" (new, {new[each.path]} lines)" if each.path in new else ""
-        yield f"  {'remove' if each.after is None else 'write '} {each.path}{note}"
-    written = tuple(each for each in files if each.after is not None and each.path not in new)
-    shown, left = _bounded(written, _MOST_DIFF_LINES)
+    for file in files:
+        note = f" (new, {new[file.path]} lines)" if file.path in new else ""
+        yield f"  {'remove' if file.after is None else 'write '} {file.path}{note}"
+    written = tuple(file for file in files if file.after is not None and file.path not in new)
+    shown, left_out = _bounded(written, _MOST_DIFF_LINES)
     for text in shown.values():
         yield ""
         yield from text.splitlines()
-    if left:
+    if left_out:
         most = f"{_MOST_DIFF_LINES_JSON:,}"
-        yield f"\n{left} more lines of differences are left out; --output json has up to {most}"
+        yield f"\n{left_out} more lines of differences are left out; --output json has up to {most}"

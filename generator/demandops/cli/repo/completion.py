@@ -27,8 +27,8 @@ def completion(shell: str) -> None:
       demandops completion fish > ~/.config/fish/completions/demandops.fish
     """
     root = click.get_current_context().find_root().command
-    made = get_completion_class(shell)
-    assert made is not None  # noqa: S101 - click has these three
-    maker = made(root, {}, "demandops", VARIABLE)
+    completion_class = get_completion_class(shell)
+    assert completion_class is not None  # noqa: S101 - click has these three
+    maker = completion_class(root, {}, "demandops", VARIABLE)
     code = maker.source_template % maker.source_vars()  # source() would start bash
     print_lines(code.rstrip("\n").split("\n"))

@@ -9,13 +9,10 @@ import click
 from demandops.cli import contexts
 from demandops.cli.json_output import output_option, show
 from demandops.cli.table import Column, Table
+from demandops.cli.target import context_names
+from demandops.config.base_model import parse
 
-
-def _names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    return [name for name in contexts.read().contexts if name.startswith(incomplete)]
-
-
-_name = click.argument("name", metavar="NAME", shell_complete=_names)
+_name = click.argument("name", metavar="NAME", shell_complete=context_names)
 
 
 @click.group()
@@ -48,11 +45,11 @@ def list_contexts(output: str) -> None:
         (
             "*" if name == content.current else "",
             name,
-            one.state_repo,
-            one.clusters or "",
-            one.signing_key or "",
+            context.state_repo,
+            context.clusters or "",
+            context.signing_key or "",
         )
-        for name, one in content.contexts.items()
+        for name, context in content.contexts.items()
     ]
     columns = (
         Column(""),
@@ -88,27 +85,19 @@ def set_context(
       demandops config set fleet --clusters clusters.yaml
     """
     content = contexts.read()
-    given = {
+    options = {
         "stateRepo": _absolute(state_repo),
         "clusters": _absolute(clusters),
         "signingKey": _absolute(signing_key),
     }
-    old = content.contexts.get(name)
     data = content.model_dump(by_alias=True, exclude_none=True)
-    kept = old.model_dump(by_alias=True) if old else {}
-    data["contexts"] = {
-        **data["contexts"],
-        name: {key: value for key, value in {**kept, **_given(given)}.items() if value is not None},
-    }
+    given = {field: value for field, value in options.items() if value is not None}
+    data["contexts"][name] = {**data["contexts"].get(name, {}), **given}
     if "stateRepo" not in data["contexts"][name]:
         raise click.UsageError(f"the context '{name}' is new, so give --state-repo")
     data.setdefault("current", name)
-    contexts.write(contexts.parsed(data))
+    contexts.write(parse(contexts.ContextsFile, data, str(contexts.path())))
     show("text", None, [f"context '{name}' set in {contexts.path()}"])
-
-
-def _given(options: dict[str, str | None]) -> dict[str, str]:
-    return {name: value for name, value in options.items() if value is not None}
 
 
 def _absolute(place: str | None) -> str | None:
@@ -145,7 +134,7 @@ def delete_context(name: str) -> None:
     """
     contexts.named(name)
     content = contexts.read()
-    left = {key: one for key, one in content.contexts.items() if key != name}
+    others = {key: context for key, context in content.contexts.items() if key != name}
     current = None if content.current == name else content.current
-    contexts.write(content.model_copy(update={"contexts": left, "current": current}))
+    contexts.write(content.model_copy(update={"contexts": others, "current": current}))
     show("text", None, [f"context '{name}' deleted"])

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
 
 import click
 
@@ -14,7 +12,7 @@ from demandops.cli.output import errors
 from demandops.cli.target import writable_repo_option
 from demandops.errors import fault
 from demandops.runtime import REAL
-from demandops.staterepo.write.slot import FoundJournal, find_journals
+from demandops.staterepo.write.slot import find_journals
 
 
 @click.command()
@@ -39,33 +37,30 @@ def journal(state_repo: str, set_aside: bool, output: str) -> None:
       demandops journal
       demandops journal --set-aside
     """
-    now = REAL.now()
-    found = list(find_journals(settings.data_home(state_repo), now, set_aside=set_aside))
-    show(output, [_row(each) for each in found], _lines(found))
-    damages = [each.damage for each in found if each.damage and not each.set_aside]
+    folder = settings.data_home(state_repo)
+    journals = list(find_journals(folder, REAL.now(), set_aside=set_aside))
+    rows, lines = [], []
+    for each in journals:
+        demands = [
+            {"operation_id": demand.operation, "received": demand.received, "goal": demand.goal}
+            for demand in each.demands
+        ]
+        rows.append(
+            {
+                "file": str(each.file),
+                "faults": [asdict(fault("", each.damage))] if each.damage else [],
+                "set_aside": str(each.set_aside) if each.set_aside else None,
+                "demands": demands,
+            }
+        )
+        lines += [f"{demand.operation}  received {demand.received}" for demand in each.demands]
+        if each.set_aside:
+            lines.append(f"the damaged journal {each.file} is now called {each.set_aside}")
+    number = sum(len(each.demands) for each in journals)
+    what = "demand is" if number == 1 else "demands are"
+    show(output, rows, [*lines, f"{number} {what} accepted and not published"])
+    damages = [each.damage for each in journals if each.damage and not each.set_aside]
     for damage in damages:
         errors.print(f"error: {damage}")
     if damages:
         raise click.exceptions.Exit(1)
-
-
-def _row(found: FoundJournal) -> dict[str, Any]:
-    return {
-        "file": str(found.file),
-        "faults": [asdict(fault("", found.damage))] if found.damage else [],
-        "set_aside": str(found.set_aside) if found.set_aside else None,
-        "demands": [
-            {"operation_id": each.operation, "received": each.received, "goal": each.goal}
-            for each in found.demands
-        ],
-    }
-
-
-def _lines(found: list[FoundJournal]) -> Iterator[str]:
-    for each in found:
-        for entry in each.demands:
-            yield f"{entry.operation}  received {entry.received}"
-        if each.set_aside:
-            yield f"the damaged journal {each.file} is now called {each.set_aside}"
-    number = sum(len(each.demands) for each in found)
-    yield f"{number} {'demand is' if number == 1 else 'demands are'} accepted and not published"

@@ -105,33 +105,45 @@ def application(  # noqa: PLR0913 - as many as options
       demandops new application tracking --input camera=sensor_msgs/msg/Image
     """
     given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
-
-    def made(config: Config) -> Files:
-        new_application.refuse_name(name, config)
-        values = _completed(given)
-        made_services = tuple(_service(one) for one in values["--service"])
-        plan = ApplicationPlan(
-            name,
-            description or f"Runs {', '.join(one.name for one in made_services)}",
-            dict(_input(one) for one in values["--input"]),
-            made_services,
-            _image(values["--image"][0]),
-            node or _example_node(config),
+    existing, config = _read_configuration(directory)
+    # before the questions, so that nobody answers them in vain
+    new_application.refuse_name(name, config)
+    missing = [option for option, values in given.items() if not values]
+    if missing and not sys.stdin.isatty():
+        options = ", ".join(f"'{option}'" for option in missing)
+        raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
+    values = {option: given[option] or _asked(*_QUESTIONS[option]) for option in given}
+    planned_services = tuple(map(_service, values["--service"]))
+    planned_inputs = dict(map(_input, values["--input"]))
+    planned_image = _image(values["--image"][0])
+    # a demand can name only nodes in an access domain
+    nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
+    if not (node or nodes):
+        raise StateRepoError(
+            "the inventory has no node in an access domain, so no demand can be made; add one "
+            "first, in inventory/nodes.yaml"
         )
-        if domain := new_application.closed_domain(plan, config):
-            then.insert(
-                0,
-                f"no rule of access domain '{domain.name}' allows demands for this application on "
-                f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
-                f"{config.file_of(DOMAINS_FILE, domain.name)}",
-            )
-        return new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
-
+    plan = ApplicationPlan(
+        name,
+        description or f"Runs {', '.join(service.name for service in planned_services)}",
+        planned_inputs,
+        planned_services,
+        planned_image,
+        node or nodes[0],
+    )
     then = [
         "when the files are on main, try the application: demandops request --dry-run "
-        f"{directory / 'appdefs' / name / 'demand.yaml'}",
+        f"{directory / 'appdefs' / name / 'demand.yaml'}"
     ]
-    _lay_down(directory, made, output, then)
+    if domain := new_application.closed_domain(plan, config):
+        then.insert(
+            0,
+            f"no rule of access domain '{domain.name}' allows demands for this application on "
+            f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
+            f"{config.file_of(DOMAINS_FILE, domain.name)}",
+        )
+    files = new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
+    _lay_down(directory, existing, files, output, then)
 
 
 @new.command()
@@ -178,26 +190,19 @@ def override(  # noqa: PLR0913 - as many as options
     select = {field: [*values] for field, values in given.items() if values}
     if not select:
         raise click.UsageError("say what the override selects: --service, --application or --node")
-    effects = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
-    does = {
-        effect: value
-        for effect, value in {**effects, "replicas": replicas}.items()
-        if value is not None
-    }
+    flags = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
+    options = {**flags, "replicas": replicas}
+    does = {effect: value for effect, value in options.items() if value is not None}
     if len(does) != 1:
         raise click.UsageError("give exactly one effect: --hold, --deny, --keep or --replicas")
-
-    def made(config: Config) -> Files:
-        if name in config.overrides:
-            raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
-        path = f"overrides/{name}.yaml"
-        fields = {"reason": reason, "owner": owner, "select": [select], **does}
-        note = (
-            "overrides/README.md lists all effects and selectors of overrides, and when they end."
-        )
-        return {path: document(path, "override", "Override", fields, note)}
-
-    _lay_down(directory, made, output)
+    existing, config = _read_configuration(directory)
+    if name in config.overrides:
+        raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
+    path = f"overrides/{name}.yaml"
+    fields = {"reason": reason, "owner": owner, "select": [select], **does}
+    note = "overrides/README.md lists all effects and selectors of overrides, and when they end."
+    text = document(path, "override", "Override", fields, note)
+    _lay_down(directory, existing, {path: text}, output, [])
 
 
 @new.command()
@@ -238,29 +243,14 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
     folder = data_folder("templates") / "scaffold" / "image"
     texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
     then = ["keep .github/workflows/image.yml or .gitlab-ci.yml, whichever you need"]
-    _write(directory, new_image.files(name, repository, url, texts), output, then)
-
-
-def _completed(given: Mapping[str, tuple[str, ...]]) -> dict[str, tuple[str, ...]]:
-    """Return a map from option to values; ask for the values that are missing.
-
-    Raises:
-        click.UsageError: if values are missing and there is no terminal to ask at.
-    """
-    missing = [option for option, values in given.items() if not values]
-    if missing and not sys.stdin.isatty():
-        options = ", ".join(f"'{option}'" for option in missing)
-        raise click.UsageError(f"Missing option{'s' * (len(missing) > 1)} {options}.")
-    return {option: values or _asked(*_QUESTIONS[option]) for option, values in given.items()}
+    _write_files(directory, new_image.files(name, repository, url, texts), output, then)
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
     """Ask the question until the answer is valid; return the words of the answer.
 
-    Args:
-        question: the text to show.
-        check: raises a click exception for a word that is not valid.
-        most: the highest number of words; None for any number.
+    ``check`` raises a click exception for a word that is not valid. ``most`` is the highest number
+    of words; None for any number.
     """
 
     def valid(answer: str) -> tuple[str, ...]:
@@ -275,50 +265,51 @@ def _asked(question: str, check: Callable[[str], object], most: int | None) -> t
             check(word)
         return words
 
-    found: tuple[str, ...] = click.prompt(
-        question, default="", show_default=False, value_proc=valid
-    )
-    return found
+    words: tuple[str, ...]
+    words = click.prompt(question, default="", show_default=False, value_proc=valid)
+    return words
 
 
 def _input(text: str) -> tuple[str, str]:
-    found = _INPUT.fullmatch(text)
-    if not found:
+    match = _INPUT.fullmatch(text)
+    if not match:
         raise click.BadParameter(
             f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
             param_hint="--input",
         )
-    if short := _SHORT_TYPE.fullmatch(found["type"]):
+    if short := _SHORT_TYPE.fullmatch(match["type"]):
         raise click.BadParameter(
             f"'{text}' has no message type of ROS 2; write "
-            f"{found['role']}={short['package']}/msg/{short['name']}",
+            f"{match['role']}={short['package']}/msg/{short['name']}",
             param_hint="--input",
         )
-    return found["role"], found["type"]
+    return match["role"], match["type"]
 
 
 def _service(text: str) -> ServicePlan:
-    found = _SERVICE.fullmatch(text)
-    if not found:
+    match = _SERVICE.fullmatch(text)
+    if not match:
         raise click.BadParameter(
             f"'{text}' is not NAME=PACKAGE/FILE; write it like "
             "detector=my_package/detector.launch.py",
             param_hint="--service",
         )
-    return ServicePlan(found["name"], found["package"], found["file"])
+    return ServicePlan(match["name"], match["package"], match["file"])
 
 
 def _image(text: str) -> Image:
-    found = _IMAGE.fullmatch(text)
-    if not found or not (found["tag"] or found["digest"]):
+    match = _IMAGE.fullmatch(text)
+    if not match or not (match["tag"] or match["digest"]):
         raise click.BadParameter(
             f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
         )
+    # not checked here, because `load` checks it with all the other new files
     return Image.model_construct(
-        repository=found["repository"], tag=found["tag"], digest=found["digest"]
+        repository=match["repository"], tag=match["tag"], digest=match["digest"]
     )
 
 
+# Maps an option to the arguments of `_asked` that ask for the option's values.
 _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
     "--input": (
         "Inputs, as role=type, such as camera=sensor_msgs/msg/Image; separate several by spaces",
@@ -333,64 +324,35 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
     ),
     "--image": ("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0", _image, 1),
 }
-"""Maps an option to the arguments of :func:`_asked` that ask for the option's values."""
 
 
-def _example_node(config: Config) -> str:
-    """Return the id of a node for the example demand: an edge server if there is one.
-
-    Only nodes in an access domain are considered.
-
-    Raises:
-        StateRepoError: if there is no such node.
-    """
-    nodes = sorted(config.domain_of, key=lambda id: (config.nodes[id].type != "edge", id))
-    if not nodes:
-        raise StateRepoError(
-            "the inventory has no node in an access domain, so no demand can be made; add one "
-            "first, in inventory/nodes.yaml"
-        )
-    return nodes[0]
-
-
-def _lay_down(
-    directory: Path, made: Callable[[Config], Files], output: str, then: list[str] | None = None
-) -> None:
-    """Write new files, but only if the whole configuration is valid with them.
-
-    Args:
-        directory: the checkout of the state repo.
-        made: returns the new files for the current configuration.
-        then: further hints to print after the names of the files.
-
-    Raises:
-        InvalidInput: a file is not valid, with or without the new files.
-        StateRepoError: the folder is not a checkout, a file exists, or a name is not a file name.
-    """
+def _read_configuration(directory: Path) -> tuple[Files, Config]:
+    """Return the files that people edit in a checkout, and the configuration in them."""
     with busy("reading the state repo"):
         files, faults = edited_checkout.files_of(directory)
         if faults:
             raise InvalidInput(faults)
-        known = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
-        config = load(known)
-    found = made(config)
-    if strange := [path for path in found if ".." in path.split("/") or "//" in path]:
+        people = {path: text for path, text in files.items() if path.split("/")[0] in CONFIG_ROOTS}
+        return people, load(people)
+
+
+def _lay_down(
+    directory: Path, existing: Files, new_files: Files, output: str, then: list[str]
+) -> None:
+    """Write new files, but only if the whole configuration is valid with them."""
+    if strange := [path for path in new_files if ".." in path.split("/") or "//" in path]:
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
     with busy("rendering an example of each application"):
-        try_configuration(State(load({**known, **found}), Ledger(), EVALUATE))
-    _write(
-        directory,
-        found,
-        output,
-        [f"to check the files: demandops check {directory}", *(then or [])],
-    )
+        try_configuration(State(load({**existing, **new_files}), Ledger(), EVALUATE))
+    hints = [f"to check the files: demandops check {directory}", *then]
+    _write_files(directory, new_files, output, hints)
 
 
-def _write(directory: Path, found: Files, output: str, then: list[str]) -> None:
-    if there := [path for path in found if (directory / path).exists()]:
+def _write_files(directory: Path, files: Files, output: str, then: list[str]) -> None:
+    if there := [path for path in files if (directory / path).exists()]:
         raise StateRepoError(f"{directory / there[0]} exists; move it away (nothing was changed)")
-    for path, text in found.items():
+    for path, text in files.items():
         (directory / path).parent.mkdir(parents=True, exist_ok=True)
         (directory / path).write_text(text, encoding="utf-8")
-    lines = [f"new: {directory / path}" for path in sorted(found)]
-    show(output, {"files": sorted(found)}, [*lines, *then])
+    lines = [f"new: {directory / path}" for path in sorted(files)]
+    show(output, {"files": sorted(files)}, [*lines, *then])

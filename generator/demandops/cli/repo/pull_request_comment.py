@@ -13,27 +13,40 @@ from collections.abc import Callable, Iterator
 
 from demandops.plan.views.bookkeeping import EntryChange
 from demandops.quoting import lines, one_line
-from demandops.render.changes.changeset import CHANGE_ORDER, ReleaseChange
+from demandops.render.changes.changeset import CHANGE_ORDER
 from demandops.staterepo.pull_request.merge_check import CheckResult
 from demandops.staterepo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
 
+# The first line of every report. A pipeline finds its earlier comment by this line.
 MARK = "<!-- demandops check -->"
-"""The first line of every report. A pipeline finds its earlier comment by this line."""
 
+# The default limit of a report in characters. GitHub allows 65,536, GitLab more.
 LONGEST = 60_000
-"""The default limit of a report in characters. GitHub allows 65,536, GitLab more."""
 
 _LONGEST_SPAN = 500
 _ROOM_FOR_NOTE = 200
 
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
-    """Return the result of a check as Markdown, with at most ``longest`` characters.
-
-    ``longest`` must leave room for :data:`MARK` and the note about omitted parts.
-    """
-    parts = [f"{MARK}\n", *_head(checked), *_faults(checked), *_suggestions(checked)]
-    return _bounded([*parts, *_consequence(checked)], longest)
+    """Return the result of a check as Markdown, with at most ``longest`` characters."""
+    parts = [f"{MARK}\n", *_head(checked), *_suggestions(checked), *_consequence(checked)]
+    room = longest - _ROOM_FOR_NOTE
+    taken, left_out = list[str](), 0
+    for part in parts:
+        if len(part) <= room:
+            taken.append(part)
+            room -= len(part)
+        else:
+            left_out += 1
+    if left_out:
+        many = f"{left_out} parts of this report are"
+        if left_out == 1:
+            many = "One part of this report is"
+        taken.append(
+            f"\n{many} left out because a comment has a limited length; "
+            "`demandops check --output json` has more.\n"
+        )
+    return "".join(taken)
 
 
 def chart_lines(
@@ -41,8 +54,7 @@ def chart_lines(
 ) -> Iterator[str]:
     """Yield lines that say which charts helm rendered, and why it did not render the others.
 
-    If helm is missing, yield only a line about that. If ``charts`` is None, yield nothing. A reason
-    may contain text that people wrote, so ``shown`` makes it safe to print.
+    A reason may contain text that people wrote, so ``shown`` makes it safe to print.
     """
     if charts is None:
         return
@@ -64,12 +76,12 @@ def code(text: str) -> str:
     if not text.strip():
         return "(empty)"
     marks = _longer_than_any(text, least=1)
+    # Markdown needs a space between a backtick of the text and those that enclose it
     edge = " " if text.startswith("`") or text.endswith("`") else ""
     return f"{marks}{edge}{text}{edge}{marks}"
 
 
 def fence(text: str, language: str) -> str:
-    """Return text as a fenced code block; ``language`` is the name for syntax highlighting."""
     text = lines(text)
     marks = _longer_than_any(text, least=3)
     return f"{marks}{language}\n{text.rstrip()}\n{marks}\n"
@@ -81,23 +93,20 @@ def _longer_than_any(text: str, least: int) -> str:
 
 
 def _head(checked: CheckResult) -> Iterator[str]:
-    found = len(checked.faults)
-    if found:
-        yield f"## DemandOps: {'1 error' if found == 1 else f'{found} errors'}\n"
+    count = len(checked.faults)
+    if count:
+        yield f"## DemandOps: {'1 error' if count == 1 else f'{count} errors'}\n"
     else:
         yield "## DemandOps: valid, and every release renders\n"
     yield from (f"\n{line}\n" for line in chart_lines(checked.charts, code))
     if checked.base:
         invalid = "; instead of its invalid files, their last valid versions were compared"
         yield f"\nCompared with {code(checked.base[:10])}{'' if checked.base_valid else invalid}.\n"
-
-
-def _faults(checked: CheckResult) -> Iterator[str]:
-    for kind, found in (("", checked.faults), ("warning: ", checked.warnings)):
-        for each in found:
-            places = [code(place) for place in (each.place, each.field) if place]
-            yield f"\n- {kind}{': '.join([*places, code(each.message)])}"
-        if found:
+    for kind, faults in (("", checked.faults), ("warning: ", checked.warnings)):
+        for fault in faults:
+            places = [code(place) for place in (fault.place, fault.field) if place]
+            yield f"\n- {kind}{': '.join([*places, code(fault.message)])}"
+        if faults:
             yield "\n"
 
 
@@ -127,7 +136,9 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
         yield f"\nReleases: {', '.join(counts)}.\n"
     else:
         yield "\nNo release starts, changes or stops.\n"
-    yield from map(_release, consequence.releases)
+    for release in consequence.releases:
+        details = "".join(f"\n  - {code(detail)}" for detail in release.details)
+        yield f"\n- {release.change}s {code(release.name)}: {code(release.what)}{details}"
     yield "\n"
     yield "\n### Bookkeeping\n"
     if checked.bookkeeping is None:
@@ -145,11 +156,6 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
     for file in consequence.files:
         if file.after is not None:
             yield _folded(_plain(file.path), fence("\n".join(file.diff()), "diff"))
-
-
-def _release(release: ReleaseChange) -> str:
-    details = [f"\n  - {code(detail)}" for detail in release.details]
-    return f"\n- {release.change}s {code(release.name)}: {code(release.what)}{''.join(details)}"
 
 
 def _entry(entry: EntryChange) -> str:
@@ -170,25 +176,3 @@ def _plain(path: str) -> str:
     """Return a path as HTML for a ``<summary>``, in which Markdown is not rendered."""
     safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", one_line(path))
     return f"<code>{safe if len(safe) <= _LONGEST_SPAN else '…'}</code>"
-
-
-def _bounded(parts: list[str], longest: int) -> str:
-    """Return the parts joined, in at most ``longest`` characters.
-
-    Parts that do not fit in the remaining room are left out, and a note says how many.
-    """
-    room = longest - _ROOM_FOR_NOTE
-    taken, left = list[str](), 0
-    for part in parts:
-        if len(part) <= room:
-            taken.append(part)
-            room -= len(part)
-        else:
-            left += 1
-    if left:
-        many = "One part of this report is" if left == 1 else f"{left} parts of this report are"
-        taken.append(
-            f"\n{many} left out because a comment has a limited length; "
-            "`demandops check --output json` has more.\n"
-        )
-    return "".join(taken)

@@ -81,7 +81,6 @@ def schema(name: str | None, folder: Path | None) -> None:
 
 
 def text(name: str) -> str:
-    """Return the JSON Schema of this name as indented JSON text."""
     model, file = SCHEMAS[name]
     generated: dict[str, Any] = model.model_json_schema(by_alias=True)
     describe(generated, model.__name__)

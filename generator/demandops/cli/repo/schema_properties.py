@@ -19,27 +19,19 @@ def describe(schema: dict[str, Any], root: str) -> None:
     """Add descriptions and examples to the properties of a schema and its definitions.
 
     They come from ``templates/schemas/properties.yaml``. Other properties stay as they are.
-
-    Args:
-        schema: the JSON Schema of a model; the function changes it.
-        root: the model's name.
+    ``root`` is the name of the model whose JSON Schema is changed.
     """
+    properties = _properties()
     for model, part in {root: schema, **schema.get("$defs", {})}.items():
         for name, field in part.get("properties", {}).items():
-            said = _said(root, model, name)
-            if said:
-                field["description"] = said[0]
-                field["examples"] = [said[1]] if len(said) > 1 else _fixed(field)
-
-
-def _said(root: str, model: str, name: str) -> list[Any]:
-    known = _properties()
-    above = known[_INHERITS].get(model, "")
-    for place in (known.get(f"{root}/{model}"), known.get(model), known.get(above), _COMMON):
-        if place and name in place:
-            found: list[Any] = place[name]
-            return found
-    return []
+            # for the model in this schema, else for the model, else for the one it inherits from
+            places = (f"{root}/{model}", model, properties[_INHERITS].get(model, ""))
+            models = (*(properties.get(place) or {} for place in places), _COMMON)
+            entry = next((each[name] for each in models if name in each), None)
+            if entry:
+                description, *example = entry
+                field["description"] = description
+                field["examples"] = example or _fixed(field)
 
 
 def _fixed(field: dict[str, Any]) -> list[Any]:

@@ -6,11 +6,10 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import click
 
-from demandops.cli.json_output import output_option, show
+from demandops.cli.json_output import Json, output_option, show
 from demandops.cli.output import Progress, busy
 from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
 from demandops.render.gitops.paths import bootstrap_path, domains_by_cluster
@@ -75,20 +74,30 @@ def upgrade(
     signer = Signer(signing_key) if signing_key and not dry_run else None
     if dry_run or asks:
         with _shown() as report:
-            made = upgrading.plan(state_repo, request, now, report)
-    if asks and not dry_run and made.switches:
+            result = upgrading.plan(state_repo, request, now, report)
+    if asks and not dry_run and result.switches:
         show(output, None, [_SWITCH])
         if not click.confirm("Are those before it done?"):
             raise click.ClickException("nothing was changed; do these steps first, or give --yes")
     if not dry_run:
         with _shown() as report:
-            made = upgrading.upgrade(state_repo, request, now, report, signer)
-    show(output, _data(made, dry_run), _lines(made, dry_run))
+            result = upgrading.upgrade(state_repo, request, now, report, signer)
+    old, new = result.old.repo_settings, result.new.repo_settings
+    outcome = "unchanged" if not result.files else "would-change" if dry_run else "upgraded"
+    data = {
+        "outcome": outcome,
+        "commit": result.commit,
+        "render_version": {"from": old.render_version, "to": new.render_version},
+        "gitops": {"from": old.gitops, "to": new.gitops},
+        "written": [path for path, text in result.files.items() if text is not None],
+        "removed": [path for path, text in result.files.items() if text is None],
+        "after": _steps_after(result),
+    }
+    show(output, data, _lines(result, dry_run))
 
 
 @contextmanager
 def _shown() -> Iterator[Progress]:
-    """Yield a function that shows the progress of reading the ledger, and then of rendering."""
     with busy("reading the state repo") as say:
 
         def report(done: int, total: int) -> None:
@@ -98,65 +107,45 @@ def _shown() -> Iterator[Progress]:
         yield report
 
 
-def _data(made: Upgrade, dry_run: bool) -> dict[str, Any]:
-    old, new = made.old.repo_settings, made.new.repo_settings
-    outcome = "unchanged" if not made.files else "would-change" if dry_run else "upgraded"
-    return {
-        "outcome": outcome,
-        "commit": made.commit,
-        "render_version": {"from": old.render_version, "to": new.render_version},
-        "gitops": {"from": old.gitops, "to": new.gitops},
-        "written": [path for path, text in made.files.items() if text is not None],
-        "removed": [path for path, text in made.files.items() if text is None],
-        "after": _steps_after(made),
-    }
-
-
-def _steps_after(made: Upgrade) -> list[dict[str, Any]]:
+def _steps_after(result: Upgrade) -> list[Json]:
     return [
         {
             "cluster": cluster,
             "what": "apply the cluster's bootstrap file again, because the file changed",
             "commands": [f"git show main:{path} | kubectl apply -f -"],
         }
-        for cluster in domains_by_cluster(made.new)
-        if (path := bootstrap_path(cluster)) in made.files
+        for cluster in domains_by_cluster(result.new)
+        if (path := bootstrap_path(cluster)) in result.files
     ]
 
 
-def _lines(made: Upgrade, dry_run: bool) -> Iterator[str]:
-    new = made.new.repo_settings
-    if not made.files:
+def _lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
+    old, new = result.old.repo_settings, result.new.repo_settings
+    if not result.files:
         yield (
-            f"nothing to do: at {made.commit}, everything is rendered for {new.gitops} with "
+            f"nothing to do: at {result.commit}, everything is rendered for {new.gitops} with "
             f"render version {new.render_version}"
         )
         return
-    yield from _summary(made, dry_run)
-    if made.switches:
-        yield f"\n{_SWITCH}"
-    if steps := _steps_after(made):
-        yield "\nafter the upgrade, on the clusters:"
-    for step in steps:
-        yield f"- {step['cluster']}: {step['what']}"
-        yield from (f"      {command}" for command in step["commands"])
-
-
-def _summary(made: Upgrade, dry_run: bool) -> Iterator[str]:
-    old, new = made.old.repo_settings, made.new.repo_settings
-    written = sum(text is not None for text in made.files.values())
+    written = sum(text is not None for text in result.files.values())
     done = f"would write {written} and remove" if dry_run else f"wrote {written} and removed"
-    yield f"{done} {len(made.files) - written} files"
+    yield f"{done} {len(result.files) - written} files"
     if old.render_version != new.render_version:
         yield f"render version {old.render_version} → {new.render_version}"
-    if made.switches:
+    if result.switches:
         yield f"gitops {old.gitops} → {new.gitops}"
         if getattr(old, new.gitops) is None:
             yield f"{new.gitops}.url {getattr(new, new.gitops).url}"
     if not dry_run:
-        yield f"in commit {made.commit}"
-        return
-    for path, text in list(made.files.items())[:_MOST_PATHS]:
+        yield f"in commit {result.commit}"
+    for path, text in list(result.files.items())[:_MOST_PATHS] if dry_run else ():
         yield f"  {'remove' if text is None else 'write '} {path}"
-    if len(made.files) > _MOST_PATHS:
-        yield f"  and {len(made.files) - _MOST_PATHS} more (--output json lists all)"
+    if dry_run and len(result.files) > _MOST_PATHS:
+        yield f"  and {len(result.files) - _MOST_PATHS} more (--output json lists all)"
+    if result.switches:
+        yield f"\n{_SWITCH}"
+    if steps := _steps_after(result):
+        yield "\nafter the upgrade, on the clusters:"
+    for step in steps:
+        yield f"- {step['cluster']}: {step['what']}"
+        yield from (f"      {command}" for command in step["commands"])

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import Any
 
 import click
 
-from demandops.cli.json_output import output_option, show
+from demandops.cli.json_output import Json, output_option, show
 from demandops.cli.output import progress
 from demandops.cli.target import state_repo_option
 from demandops.errors import fault
@@ -48,15 +47,14 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
         progress("rendering again") as report,
     ):
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
-    show(output, [_row(verdict) for verdict in verdicts], _lines(verdicts))
+    rows: list[Json] = []
+    for verdict in verdicts:
+        row = {name: None if value == "" else value for name, value in asdict(verdict).items()}
+        message = row.pop("fault")
+        rows.append(row | {"faults": [asdict(fault("", message))] if message else []})
+    show(output, rows, _lines(verdicts))
     if not all(verdict.holds for verdict in verdicts):
         raise click.exceptions.Exit(1)
-
-
-def _row(verdict: Verdict) -> dict[str, Any]:
-    row = {name: None if value == "" else value for name, value in asdict(verdict).items()}
-    message = row.pop("fault")
-    return row | {"faults": [asdict(fault("", message))] if message else []}
 
 
 def _lines(verdicts: list[Verdict]) -> Iterator[str]:

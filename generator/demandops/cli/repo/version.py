@@ -26,24 +26,20 @@ def version(output: str) -> None:
       demandops version
       demandops version -o json
     """
+    git = None
+    if shutil.which("git"):
+        told = subprocess.run(["git", "--version"], capture_output=True, text=True, check=False)
+        git = told.stdout.strip().removeprefix("git version ") or None
     data = {
         "version": __version__,
         "render_version": settings.RENDER_VERSION,
         "api_version": settings.API_VERSION,
         "ledger_api_version": settings.LEDGER_API_VERSION,
         "python": platform.python_version(),
-        "git": _git(),
+        "git": git,
     }
     names = {"version": "demandops"}
     lines = [
         f"{names.get(name, name.replace('_', ' ')):18} {value}" for name, value in data.items()
     ]
     show(output, data, lines)
-
-
-def _git() -> str | None:
-    """Return the version of git, or None if it is missing."""
-    if shutil.which("git") is None:
-        return None
-    told = subprocess.run(["git", "--version"], capture_output=True, text=True, check=False)
-    return told.stdout.strip().removeprefix("git version ") or None

@@ -57,8 +57,14 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         for id, entry in books.connections.items()
     ]
     suspended = [
-        (f"{one.kind} {one.id}", one.demand, ", ".join(one.requesters), one.override, one.reason)
-        for one in books.suspended
+        (
+            f"{claim.kind} {claim.id}",
+            claim.demand,
+            ", ".join(claim.requesters),
+            claim.override,
+            claim.reason,
+        )
+        for claim in books.suspended
     ]
     text: list[str | Table] = [
         Table(_SERVICES, services, "Services"),
@@ -77,8 +83,13 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         text += [Table(_CAPACITY, capacity, "Capacity"), ""]
     if books.waiting:
         waiting = [
-            (one.demand, "\n".join(one.requesters), time_text(one.since), str(one.priority))
-            for one in books.waiting
+            (
+                demand.demand,
+                "\n".join(demand.requesters),
+                time_text(demand.since),
+                str(demand.priority),
+            )
+            for demand in books.waiting
         ]
         text += [Table(_WAITING, waiting, "Waiting for room"), ""]
     show(output, as_data(books, commit), [*text, f"at {commit}"])

@@ -36,28 +36,23 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
       demandops diff 2h 0s
     """
     with reader.opened(state_repo) as repo:
-        entries, found = differences(repo, before, after)
+        entries, changes = differences(repo, before, after)
     data = {
         "bookkeeping": [asdict(each) for each in entries],
-        "releases": [asdict(each) for each in found.releases],
-        "other_files": list(found.other_files),
+        "releases": [asdict(each) for each in changes.releases],
+        "other_files": list(changes.other_files),
     }
-    files = [f"~ file {path}" for path in found.other_files]
-    lines = [*release_lines(found.releases, "release "), *files]
-    show(
-        output,
-        data,
-        [
-            *(list(entry_lines(entries)) or ["no difference in bookkeeping"]),
-            *(lines or ["no difference in releases"]),
-        ],
-    )
+    bookkeeping_lines = list(entry_lines(entries)) or ["no difference in bookkeeping"]
+    lines = [
+        *release_lines(changes.releases, "release "),
+        *(f"~ file {path}" for path in changes.other_files),
+    ]
+    show(output, data, [*bookkeeping_lines, *(lines or ["no difference in releases"])])
 
 
 def differences(
     repo: Reader, before: str, after: str
 ) -> tuple[tuple[EntryChange, ...], MergePreview]:
-    """Return what differs between two commits, in the bookkeeping and in what runs."""
     old, new = (loaded(repo, revision) for revision in (before, after))
     commits = str(old.commit), str(new.commit)
     differing = repo.changed_files(*commits, (CLUSTERS_ROOT,))
@@ -66,7 +61,8 @@ def differences(
         read_texts = {path: read(path) for path in differing}
         texts.append({path: text for path, text in read_texts.items() if text is not None})
     entries = bookkeeping_changes(bookkeeping(old.state), bookkeeping(new.state))
-    return entries, preview(planned_releases(old.state), planned_releases(new.state), *texts)
+    planned = planned_releases(old.state), planned_releases(new.state)
+    return entries, preview(*planned, *texts)
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
@@ -81,14 +77,13 @@ def loaded(repo: Reader, revision: str | None) -> Snapshot:
 
 
 def release_lines(releases: Iterable[ReleaseChange], word: str = "") -> Iterator[str]:
-    """Yield the lines for releases that differ, with ``word`` before the name of each release."""
+    """Yield the lines for releases that differ, with ``word`` before the name of each."""
     for release in releases:
         yield f"{SIGNS[release.change]} {word}{release.name} ({release.what})"
         yield from (f"    {detail}" for detail in release.details)
 
 
 def entry_lines(entries: Iterable[EntryChange]) -> Iterator[str]:
-    """Yield lines for entries of the bookkeeping that differ."""
     for entry in entries:
         who = "" if entry.change == "changed" else f" for {', '.join(entry.requesters)}"
         yield f"{SIGNS[entry.change]} {entry.kind} {entry.name}{who}"

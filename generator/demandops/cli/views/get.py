@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any
 
 import click
@@ -12,11 +13,10 @@ from demandops import strict_yaml
 from demandops.cli.json_output import Json, output_formats, print_json, show
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import at_option, errors, painted, progress, warn_of, warn_of_not_rendered
-from demandops.cli.table import Table
 from demandops.cli.target import state_repo_option
 from demandops.cli.views.kinds import KINDS, Kind, Source
 from demandops.config.policy import matches
-from demandops.errors import Fault, InvalidInput, fault, suggestion
+from demandops.errors import InvalidInput, fault, suggestion
 from demandops.ledger.world import World
 from demandops.quoting import json_escaped, quoted
 from demandops.runtime import REAL
@@ -27,7 +27,7 @@ from demandops.subject import SubjectKind
 
 FILTERS = ("node", "requester", "application", "domain")
 _POLL_S = 1.0
-_POLL_REMOTE_S = 10.0
+_POLL_REMOTE_S = 10.0  # each look is a fetch
 _COLORS = {
     "drained": "yellow",
     "expired": "yellow",
@@ -44,7 +44,7 @@ _COLORS = {
 }
 
 
-def _kind(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
+def _kind_named(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
     if value is None:
         raise click.UsageError(f"Missing argument 'KIND': one of {', '.join(KINDS)}", ctx)
     for name in (value, f"{value}s"):
@@ -53,14 +53,10 @@ def _kind(ctx: click.Context, param: click.Parameter, value: str | None) -> str:
     raise click.BadParameter(f"there is no kind '{value}'{suggestion(value, KINDS)}")
 
 
-def _kinds(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    return [name for name in KINDS if name.startswith(incomplete)]
-
-
 def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     kind = ctx.params.get("kind") or ""
-    known = ("connections", "demands", "nodes", "overrides", "proposals")
-    kinds = {"leases": "demands", "services": "releases"} | {name: name for name in known}
+    same = ("connections", "demands", "nodes", "overrides", "proposals")
+    kinds = {"leases": "demands", "services": "releases"} | {name: name for name in same}
     return names_of(kinds[kind])(ctx, param, incomplete) if kind in kinds else []
 
 
@@ -76,7 +72,13 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 @click.command()
-@click.argument("kind", required=False, callback=_kind, shell_complete=_kinds, metavar="KIND")
+@click.argument(
+    "kind",
+    required=False,
+    callback=_kind_named,
+    shell_complete=lambda ctx, param, text: [name for name in KINDS if name.startswith(text)],
+    metavar="KIND",
+)
 @click.argument("names", nargs=-1, metavar="[NAME…]", shell_complete=_item_names)
 @state_repo_option
 @_filters
@@ -119,34 +121,30 @@ def get(
     shown = KINDS[kind]
     wanted = {name: value for name, value in filters.items() if value is not None}
     for name in wanted.keys() - shown.filters.keys():
-        can = ", ".join(f"--{one}" for one in FILTERS if one in shown.filters)
+        can = ", ".join(f"--{each}" for each in FILTERS if each in shown.filters)
         raise click.UsageError(f"{kind} have no --{name}; they can be filtered by {can}")
     with reader.opened(state_repo) as repo:
-        source = _read(repo, at)
+        source = _read_source(repo, at)
         items = shown.items(source)
         _refuse_unknown(shown, items, source.snapshot.state, names, wanted)
         items = _matching(shown, items, names, wanted)
-        _print(kind, source, items, output, watch)
+        _print_list(kind, source, items, output, watch)
         while watch:
             REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
-            if not _has_newer_commit(repo, source) and kind != "proposals":
+            try:
+                is_same = repo.refresh() == str(source.snapshot.commit)
+            except RemoteAway as error:
+                errors.print(f"warning: {error}")
+                is_same = True
+            if is_same and kind != "proposals":  # a proposal is a branch, and no commit on main
                 continue
-            source = _read(repo, None)
+            source = _read_source(repo, None)
             before, items = items, _matching(shown, shown.items(source), names, wanted)
             if items != before:
-                _print(kind, source, items, output, watch)
+                _print_list(kind, source, items, output, watch)
 
 
-def _has_newer_commit(repo: Reader, source: Source) -> bool:
-    """Return whether there is a newer commit; false if the remote cannot be reached."""
-    try:
-        return repo.refresh() != str(source.snapshot.commit)
-    except RemoteAway as error:
-        errors.print(f"warning: {error}")
-        return False
-
-
-def _read(repo: Reader, at: str | None) -> Source:
+def _read_source(repo: Reader, at: str | None) -> Source:
     with progress("reading the ledger") as report:
         snapshot = repo.snapshot(at, report)
     warn_of(repo.problems() if at is None else ())
@@ -172,34 +170,28 @@ def _matching(
 def _refuse_unknown(
     kind: Kind, items: list[Json], world: World, names: tuple[str, ...], wanted: dict[str, str]
 ) -> None:
-    """Refuse names and filters that match nothing: they are probably misspelled.
-
-    A filter that matches no item is allowed if it names something that exists, such as a node.
-    """
-    faults: list[Fault] = []
+    """Refuse names and filters that match nothing: they are probably misspelled."""
+    # a filter may match no item if it names something that exists, such as a node without demands
+    existing: dict[str, Iterable[str]] = {
+        "node": {*world.config.nodes, *world.ledger.indexed_names("node")},
+        "domain": world.config.domains,
+        "requester": world.ledger.indexed_names("requester"),
+        "application": world.ledger.subjects(SubjectKind.APPLICATION),
+    }
     asked = [(name, "", {item["name"] for item in items}) for name in names]
-    for name, value in wanted.items():
-        listed = (one for item in items for one in kind.filters[name](item))
-        asked.append((value, f"--{name}", {*_known(name, world), *listed}))
-    for pattern, option, known in asked:
-        if not any(matches(name, (pattern,)) for name in known):
-            message = f"nothing is called {quoted(pattern)}{suggestion(pattern, known)}"
-            faults.append(fault(option, message))
+    for name, pattern in wanted.items():
+        listed = (value for item in items for value in kind.filters[name](item))
+        asked.append((pattern, f"--{name}", {*existing[name], *listed}))
+    faults = [
+        fault(option, f"nothing is called {quoted(pattern)}{suggestion(pattern, candidates)}")
+        for pattern, option, candidates in asked
+        if not any(matches(name, (pattern,)) for name in candidates)
+    ]
     if faults:
         raise InvalidInput(faults)
 
 
-def _known(filter: str, world: World) -> Iterable[str]:
-    if filter == "node":
-        return {*world.config.nodes, *world.ledger.indexed_names("node")}
-    if filter == "domain":
-        return world.config.domains
-    if filter == "requester":
-        return world.ledger.indexed_names("requester")
-    return world.ledger.subjects(SubjectKind.APPLICATION)
-
-
-def _print(kind: str, source: Source, items: list[Json], output: str, watch: bool) -> None:
+def _print_list(kind: str, source: Source, items: list[Json], output: str, watch: bool) -> None:
     commit, shown = str(source.snapshot.commit), KINDS[kind]
     data = {"kind": kind, "commit": commit, "items": items}
     plain = json.loads(json.dumps(data))
@@ -212,10 +204,8 @@ def _print(kind: str, source: Source, items: list[Json], output: str, watch: boo
     elif output == "name":
         show(output, None, [item["name"] for item in items])
     else:
-        wide = output == "wide"
-        columns = [*shown.columns, *(shown.wide if wide else ())]
-        rows = [shown.cells(item, source.now)[: len(columns)] for item in items]
-        table = Table(columns, rows, empty=f"no {kind}", styles=_COLORS, whole=wide)
+        table = shown.table(items, source.now, wide=output == "wide")
+        table = replace(table, empty=f"no {kind}", styles=_COLORS)
         when = f"{source.now:%H:%M:%S} UTC, " if watch else ""
         note = painted(f"{when}at {commit[:10]}", "dim")
         show(output, None, [table, *([note] if watch else [])])

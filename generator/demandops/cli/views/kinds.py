@@ -17,7 +17,7 @@ from demandops.cli.json_output import (
     time_text,
 )
 from demandops.cli.output import version_lines
-from demandops.cli.table import Cell, Column
+from demandops.cli.table import Cell, Column, Table
 from demandops.cli.views.proposal_list import proposals
 from demandops.config.durations import duration_text, relative
 from demandops.config.override import parse_time
@@ -30,71 +30,83 @@ from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
 
 Values = Callable[[Json], Iterable[str]]
+CellOf = Callable[[Json, datetime], Cell]
 
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """The data for every list: the state repo, its state at a commit, and the time."""
-
     repo: Reader
     snapshot: Snapshot
     now: datetime
-    not_rendered: Collection[str] = ()
-    """The generated files that a generator has yet to write or remove."""
+    not_rendered: Collection[str] = ()  # files that a generator has yet to write or remove
 
 
 @dataclass(frozen=True, slots=True)
 class Kind:
     """A kind of thing: its items, each with a ``name``, and how they are shown.
 
-    ``cells`` returns an item's cells, first for ``columns`` and then for ``wide``. Only ``-o wide``
-    shows the columns in ``wide``. ``filters`` maps an option to a function from an item to
-    values. An item is listed if the option matches one of the values.
+    Only ``-o wide`` shows the columns in ``wide``. ``filters`` maps an option to a function from an
+    item to values. An item is listed if the option matches one of the values.
     """
 
     items: Callable[[Source], list[Json]]
-    columns: Sequence[Column]
-    cells: Callable[[Json, datetime], Sequence[Cell]]
-    wide: Sequence[Column]
+    columns: Sequence[tuple[Column, CellOf]]
+    wide: Sequence[tuple[Column, CellOf]]
     filters: Mapping[str, Values] = field(default_factory=dict)
+
+    def table(self, items: Iterable[Json], now: datetime, *, wide: bool = False) -> Table:
+        shown = [*self.columns, *(self.wide if wide else ())]
+        rows = [[cell_of(item, now) for _, cell_of in shown] for item in items]
+        return Table([column for column, _ in shown], rows, whole=wide)
+
+
+def _column(
+    title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False
+) -> tuple[Column, CellOf]:
+    """Return a column whose cells are a field of the items, or what a function returns."""
+    cell_of = cell if callable(cell) else lambda item, now: item[cell] or ""
+    return Column(title, rank, wraps), cell_of
 
 
 def _demands(source: Source) -> list[Json]:
-    found = demand_list.demands(source.snapshot.state)
     return [
         {
-            **asdict(one),
-            "state": _now(one.state, one.lease, source.now),
-            "since": time_data(one.since),
-            "lease": lease_data(one.lease),
+            **asdict(demand),
+            "state": _state_now(demand.state, demand.lease, source.now),
+            "since": time_data(demand.since),
+            "lease": lease_data(demand.lease),
         }
-        for one in found
+        for demand in demand_list.demands(source.snapshot.state)
     ]
 
 
-def _now(state: str, lease: Lease | None, now: datetime) -> str:
+def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
 
 
 def _leases(source: Source) -> list[Json]:
-    leased = [one for one in _demands(source) if one["lease"]]
-    return sorted(leased, key=lambda one: (one["lease"]["until"] or "~", one["name"]))
+    leased = [demand for demand in _demands(source) if demand["lease"]]
+    # "~" sorts a lease that has not started behind every time
+    return sorted(leased, key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]))
 
 
 def _nodes(source: Source) -> list[Json]:
     world = source.snapshot.state
-    found = node_list.nodes(world, release_causes.releases(world))
     return [
-        {**asdict(one), "position": one.position.model_dump() if one.position else None}
-        for one in found
+        {**asdict(node), "position": node.position.model_dump() if node.position else None}
+        for node in node_list.nodes(world, release_causes.releases(world))
     ]
 
 
 def _services(source: Source) -> list[Json]:
     world = source.snapshot.state
     return [
-        {"name": name, "domains": demand_list.domains_of([one.node], world.config), **asdict(one)}
-        for name, one in bookkeeping(world).services.items()
+        {
+            "name": name,
+            "domains": demand_list.domains_of([service.node], world.config),
+            **asdict(service),
+        }
+        for name, service in bookkeeping(world).services.items()
     ]
 
 
@@ -103,10 +115,10 @@ def _connections(source: Source) -> list[Json]:
     return [
         {
             "name": name,
-            "domains": demand_list.domains_of([one.source, one.target], world.config),
-            **asdict(one),
+            "domains": demand_list.domains_of([each.source, each.target], world.config),
+            **asdict(each),
         }
-        for name, one in bookkeeping(world).connections.items()
+        for name, each in bookkeeping(world).connections.items()
     ]
 
 
@@ -116,7 +128,7 @@ def _claims(source: Source) -> list[Json]:
     return [
         {
             "name": (data := claim_data(claim))["file"],
-            "state": _now(demand_list.state_of(claim, world), claim.lease, source.now),
+            "state": _state_now(demand_list.state_of(claim, world), claim.lease, source.now),
             "nodes": (nodes := demand_list.nodes_of(claim)),
             "domains": demand_list.domains_of(nodes, world.config),
             **data,
@@ -137,15 +149,8 @@ def _overrides(source: Source) -> list[Json]:
     ]
 
 
-def _when(time: str | None, now: datetime) -> str:
-    return relative(parse_time(time), now) if time else ""
-
-
-def _absolute_time(time: str | None) -> str:
-    return time_text(time).removesuffix(" UTC") if time else ""
-
-
-def _lease_text(lease: Json | None, now: datetime) -> str:
+def _lease_text(item: Json, now: datetime) -> str:
+    lease = item["lease"]
     if lease is None:
         return ""
     if not lease["until"]:
@@ -159,7 +164,6 @@ def _lease_text(lease: Json | None, now: datetime) -> str:
 
 
 def effect_words(override: Json) -> list[str]:
-    """Return each effect of an override as text for people. ``override`` is JSON data."""
     shown = ("version", "replicas", "node")
     listed = ("images", "values")
     return [
@@ -172,45 +176,60 @@ def effect_words(override: Json) -> list[str]:
     ]
 
 
-def _override_targets(item: Json) -> list[str]:
-    claims = (f"{one['subject']['kind']} {one['subject']['id']}" for one in item["claims"])
-    return [*dict.fromkeys((*(release["name"] for release in item["releases"]), *claims))]
+def _override_targets(item: Json, now: datetime) -> list[str]:
+    releases = (release["name"] for release in item["releases"])
+    subjects = ("{kind} {id}".format(**claim["subject"]) for claim in item["claims"])
+    return [*dict.fromkeys((*releases, *subjects))]
+
+
+def _node_state(item: Json, now: datetime) -> str:
+    if item["type"] is None:  # only claims name it
+        return "not in the inventory"
+    return "drained" if item["drained"] else "open"
+
+
+def _holds(item: Json, now: datetime) -> list[str]:
+    return [*item["applications"], *item["connections"]]
+
+
+def _joined(key: str) -> CellOf:
+    return lambda item, now: ", ".join(item[key])
+
+
+def _ago(key: str) -> CellOf:
+    return lambda item, now: relative(parse_time(item[key]), now) if item[key] else ""
+
+
+def _utc(key: str) -> CellOf:
+    return lambda item, now: time_text(item[key]).removesuffix(" UTC") if item[key] else ""
 
 
 def _key(name: str) -> Values:
     def values(item: Json) -> Iterable[str]:
-        found = item[name]
-        return [found] if isinstance(found, str) else found or ()
+        value = item[name]
+        return [value] if isinstance(value, str) else value or ()
 
     return values
 
 
 _COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _key("domains")}
-_SINCE = Column("Since (UTC)")
 
 KINDS: dict[str, Kind] = {
     "claims": Kind(
         _claims,
         (
-            Column("Subject"),
-            Column("Requesters", 1, wraps=True),
-            Column("State", 2),
-            Column("Since", 3),
-            Column("Lease", 4, wraps=True),
-            Column("Demand", 5),
+            _column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
+            _column("Requesters", _joined("requesters"), 1, wraps=True),
+            _column("State", "state", 2),
+            _column("Since", _ago("since"), 3),
+            _column("Lease", _lease_text, 4, wraps=True),
+            _column("Demand", "demand", 5),
         ),
-        lambda item, now: (
-            f"{item['subject']['kind']} {item['subject']['id']}",
-            ", ".join(item["requesters"]),
-            item["state"],
-            _when(item["since"], now),
-            _lease_text(item["lease"], now),
-            item["demand"],
-            item["request"],
-            _absolute_time(item["since"]),
-            item["file"],
+        (
+            _column("Request", "request"),
+            _column("Since (UTC)", _utc("since")),
+            _column("File", "file"),
         ),
-        (Column("Request"), _SINCE, Column("File")),
         _COMMON
         | {
             "application": lambda item: (
@@ -221,95 +240,73 @@ KINDS: dict[str, Kind] = {
     "connections": Kind(
         _connections,
         (
-            Column("Connection"),
-            Column("Type", 2),
-            Column("From", 1),
-            Column("To", 1),
-            Column("Requesters", 3, wraps=True),
+            _column("Connection", "name"),
+            _column("Type", "type", 2),
+            _column("From", "source", 1),
+            _column("To", "target", 1),
+            _column("Requesters", _joined("requesters"), 3, wraps=True),
         ),
-        lambda item, now: (
-            item["name"],
-            item["type"],
-            item["source"],
-            item["target"],
-            ", ".join(item["requesters"]),
-            list(item["topics"]),
-        ),
-        (Column("Topics"),),
+        (_column("Topics", lambda item, now: list(item["topics"])),),
         _COMMON | {"node": lambda item: [item["source"], item["target"]]},
     ),
     "demands": Kind(
         _demands,
         (
-            Column("Demand"),
-            Column("State", 3),
-            Column("Requesters", 1, wraps=True),
-            Column("Holds", 2),
-            Column("Since", 5),
-            Column("Lease", 4, wraps=True),
+            _column("Demand", "name"),
+            _column("State", "state", 3),
+            _column("Requesters", _joined("requesters"), 1, wraps=True),
+            _column("Holds", _holds, 2),
+            _column("Since", _ago("since"), 5),
+            _column("Lease", _lease_text, 4, wraps=True),
         ),
-        lambda item, now: (
-            item["name"],
-            item["state"],
-            ", ".join(item["requesters"]),
-            [*item["applications"], *item["connections"]],
-            _when(item["since"], now),
-            _lease_text(item["lease"], now),
-            item["requests"],
-            item["nodes"],
-            _absolute_time(item["since"]),
-            item["suspended_by"],
+        (
+            _column("Requests", "requests"),
+            _column("Nodes", "nodes"),
+            _column("Since (UTC)", _utc("since")),
+            _column("Suspended by", "suspended_by"),
         ),
-        (Column("Requests"), Column("Nodes"), _SINCE, Column("Suspended by")),
         _COMMON | {"application": _key("applications")},
     ),
     "leases": Kind(
         _leases,
         (
-            Column("Demand"),
-            Column("Requesters", 2, wraps=True),
-            Column("Term", 3),
-            Column("Ends", 1, wraps=True),
+            _column("Demand", "name"),
+            _column("Requesters", _joined("requesters"), 2, wraps=True),
+            _column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
+            _column(
+                "Ends",
+                lambda item, now: _lease_text(item, now).removeprefix("ends "),
+                1,
+                wraps=True,
+            ),
         ),
-        lambda item, now: (
-            item["name"],
-            ", ".join(item["requesters"]),
-            duration_text(item["lease"]["seconds"]),
-            _lease_text(item["lease"], now).removeprefix("ends "),
-            _absolute_time(item["lease"]["until"]),
-            [*item["applications"], *item["connections"]],
+        (
+            _column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
+            _column("Holds", _holds),
         ),
-        (Column("Ends (UTC)"), Column("Holds")),
         _COMMON | {"application": _key("applications")},
     ),
     "nodes": Kind(
         _nodes,
         (
-            Column("Node"),
-            Column("Type", 2),
-            Column("Domain", 3),
-            Column("Cluster", 5),
-            Column("State", 1),
-            Column("Releases", 4),
-            Column("Requesters", 6, wraps=True),
+            _column("Node", "name"),
+            _column("Type", "type", 2),
+            _column("Domain", "domain", 3),
+            _column("Cluster", "cluster", 5),
+            _column("State", _node_state, 1),
+            _column("Releases", lambda item, now: str(len(item["releases"])), 4),
+            _column("Requesters", _joined("requesters"), 6, wraps=True),
         ),
-        lambda item, now: (
-            item["name"],
-            item["type"] or "",
-            item["domain"] or "",
-            item["cluster"] or "",
-            "not in the inventory"
-            if item["type"] is None
-            else "drained"
-            if item["drained"]
-            else "open",
-            str(len(item["releases"])),
-            ", ".join(item["requesters"]),
-            item["capabilities"],
-            [f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()],
-            item["releases"],
+        (
+            _column("Capabilities", "capabilities"),
+            _column(
+                "Properties",
+                lambda item, now: [
+                    f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
+                ],
+            ),
+            _column("Names of releases", "releases"),
         ),
-        (Column("Capabilities"), Column("Properties"), Column("Names of releases")),
         {
             "node": _key("name"),
             "requester": _key("requesters"),
@@ -320,76 +317,61 @@ KINDS: dict[str, Kind] = {
     "overrides": Kind(
         _overrides,
         (
-            Column("Override"),
-            Column("State", 1),
-            Column("Does", 2, wraps=True),
-            Column("Until", 3),
-            Column("Owner", 4),
-            Column("To", 5),
-            Column("Reason", 6, wraps=True),
+            _column("Override", "name"),
+            _column("State", "state", 1),
+            _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
+            _column("Until", _ago("until"), 3),
+            _column("Owner", "owner", 4),
+            _column("To", _override_targets, 5),
+            _column("Reason", "reason", 6, wraps=True),
         ),
-        lambda item, now: (
-            item["name"],
-            item["state"],
-            effect_words(item),
-            _when(item["until"], now),
-            item["owner"],
-            _override_targets(item),
-            item["reason"],
-            str(item["priority"]),
-            _absolute_time(item["until"]),
+        (
+            _column("Priority", lambda item, now: str(item["priority"])),
+            _column("Until (UTC)", _utc("until")),
         ),
-        (Column("Priority"), Column("Until (UTC)")),
         {
-            "node": lambda item: [one["node"] for one in item["releases"]],
-            "domain": lambda item: [one["domain"] for one in item["releases"]],
-            "requester": lambda item: [who for one in item["claims"] for who in one["requesters"]],
+            "node": lambda item: [release["node"] for release in item["releases"]],
+            "domain": lambda item: [release["domain"] for release in item["releases"]],
+            "requester": lambda item: [
+                who for claim in item["claims"] for who in claim["requesters"]
+            ],
         },
     ),
     "proposals": Kind(
         lambda source: proposals(source.repo),
         (
-            Column("Branch"),
-            Column("Commit"),
-            Column("Requesters", 1, wraps=True),
-            Column("Since", 2),
-            Column("What", 3, wraps=True),
-            Column("Link", 5),
+            _column("Branch", "branch"),
+            _column("Commit", lambda item, now: item["commit"][:10]),
+            _column("Requesters", _joined("requesters"), 1, wraps=True),
+            _column("Since", _ago("since"), 2),
+            _column("What", "summary", 3, wraps=True),
+            _column("Link", "link", 5),
         ),
-        lambda item, now: (
-            item["branch"],
-            item["commit"][:10],
-            ", ".join(item["requesters"]),
-            _when(item["since"], now),
-            item["summary"],
-            item["link"] or "",
-            item["demands"],
-            _absolute_time(item["since"]),
-        ),
-        (Column("Demands"), _SINCE),
+        (_column("Demands", "demands"), _column("Since (UTC)", _utc("since"))),
         {"requester": _key("requesters")},
     ),
     "services": Kind(
         _services,
         (
-            Column("Service"),
-            Column("Kind", 4),
-            Column("Version", 5),
-            Column("Node", 1),
-            Column("For", 3, wraps=True),
-            Column("Requesters", 2, wraps=True),
+            _column("Service", "name"),
+            _column("Kind", "service", 4),
+            _column("Version", lambda item, now: version_lines(item), 5),
+            _column("Node", "node", 1),
+            _column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
+            _column("Requesters", _joined("requesters"), 2, wraps=True),
         ),
-        lambda item, now: (
-            item["name"],
-            item["service"],
-            version_lines(item),
-            item["node"],
-            item["source"] or item["applications"],
-            ", ".join(item["requesters"]),
-            [topic for topics in item["inputs"].values() for topic in topics],
-            [f"{name} = {value}" for name, value in item["parameters"].items()],
+        (
+            _column(
+                "Takes in",
+                lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
+            ),
+            _column(
+                "Parameters",
+                lambda item, now: [
+                    f"{name} = {value}" for name, value in item["parameters"].items()
+                ],
+            ),
         ),
-        (Column("Takes in"), Column("Parameters")),
         _COMMON | {"node": _key("node"), "application": _key("applications")},
     ),
 }

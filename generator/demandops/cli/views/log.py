@@ -24,6 +24,7 @@ from demandops.staterepo.history import revisions
 from demandops.staterepo.history.commit_log import LogEntry
 from demandops.staterepo.reader import Reader
 
+# The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
     "join",
     "shutdown",
@@ -42,7 +43,6 @@ OPERATIONS = (
     "init",
     "by-hand",
 )
-"""The operations that ``--operation`` accepts. ``by-hand`` selects the commits by people."""
 
 _TRAILERS = {
     "requester": "Requester",
@@ -144,7 +144,16 @@ def log(
       demandops log main~20..main -o wide
     """
     with reader.opened(state_repo) as repo:
-        commits = _walked(repo, commit_range, given.pop("release"))
+        release, path = given.pop("release"), None
+        if release is not None:
+            tip = repo.commit((commit_range or "").rpartition("..")[2])
+            path = release if "/" in release else repo.release_path(release, tip)
+            if path is None:
+                raise StateRepoError(
+                    f"up to commit {tip[:10]}, there was no release {quoted(release)}; "
+                    "`demandops status` lists the current ones"
+                )
+        commits = repo.log(commit_range, path) if path else repo.log(commit_range)
         with busy("looking through the commits"):
             entries = list(islice(_matching(repo, commits, **given), max_count))
             if not entries:
@@ -155,24 +164,22 @@ def log(
 
 
 def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
-    """Refuse names that are probably misspelled.
-
-    These are names that no commit is about. A node's name is not refused if the inventory has it.
-    """
-    known: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
-    for entry in repo.log() if known else ():
-        for name, values in known.items():
+    """Refuse names that no commit is about: they are probably misspelled."""
+    names: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
+    for entry in repo.log() if names else ():
+        for name, values in names.items():
             values.update(entry.trailers.get(_TRAILERS[name], ()))
     faults = [
         fault(
             f"--{name}",
             f"no commit is about {quoted(given[name])}{suggestion(given[name], values)}",
         )
-        for name, values in known.items()
+        for name, values in names.items()
         if given[name] not in values
     ]
     node = given["node"]
     if node is not None:
+        # no commit needs to have changed a node that the inventory has
         nodes = {*repo.last_valid_snapshot(repo.commit()).state.config.nodes}
         if node not in nodes and not any(
             repo.changes_node(entry.commit, node) for entry in repo.log()
@@ -181,19 +188,6 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
             faults.append(fault("--node", message))
     if faults:
         raise InvalidInput(faults)
-
-
-def _walked(repo: Reader, commit_range: str | None, release: str | None) -> Iterable[LogEntry]:
-    if release is None:
-        return repo.log(commit_range)
-    tip = repo.commit((commit_range or "").rpartition("..")[2])
-    path = release if "/" in release else repo.release_path(release, tip)
-    if path is None:
-        raise StateRepoError(
-            f"up to commit {tip[:10]}, there was no release {quoted(release)}; `demandops status` "
-            "lists the current ones"
-        )
-    return repo.log(commit_range, path)
 
 
 def _matching(
@@ -206,10 +200,7 @@ def _matching(
     until: datetime | None,
     **trailers: str | None,
 ) -> Iterable[LogEntry]:
-    """Return the commits that match every given filter.
-
-    ``trailers`` maps keys of ``_TRAILERS`` to the values to match.
-    """
+    """Return the commits that match every filter; ``trailers`` has keys of ``_TRAILERS``."""
     wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
 
     def matches(entry: LogEntry) -> bool:
@@ -218,6 +209,7 @@ def _matching(
             and operation in (None, entry.first("Operation") or "by-hand")
             and (since is None or entry.time >= since)
             and (until is None or entry.time <= until)
+            # last, because it reads the trees of the commit
             and (node is None or repo.changes_node(entry.commit, node))
         )
 
@@ -234,10 +226,10 @@ _WIDE = (Column("Time (UTC)"), Column("Operation"), Column("Author"), Column("Re
 
 
 def log_table(rows: list[Json], now: datetime, *, wide: bool = False) -> Table:
-    """Return a table of commits. ``rows`` are the commits as JSON data."""
     cells = []
     for row in rows:
         requesters = row["requesters"] or [row["author"]]
+        # the trailers name the requesters whose claims changed; a person asked for it
         if row["operation"] == "rollback":
             requesters = [f"{row['author']}, for {', '.join(row['requesters'])}"]
         shown = (

@@ -49,10 +49,8 @@ class Match:
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
     """Return the object that a name or path identifies; ``kind`` limits the search to one kind.
 
-    Only the history up to the commit of ``snapshot`` counts.
-
-    Raises:
-        StateRepoError: if the name identifies nothing, or several things.
+    Only the history up to the commit of ``snapshot`` counts. A StateRepoError says that the name
+    identifies nothing, or several things.
     """
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
@@ -74,22 +72,19 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
     running_names = {release.name for release in release_causes.releases(world)}
-    known = {
-        *running_names,
-        *repo.stopped_release_names(str(snapshot.commit)),
-    }
-    known |= {id for each in SubjectKind for id in world.ledger.subjects(each)}
-    known |= {*world.config.nodes, *world.config.appdefs, *world.config.overrides}
-    known |= {id for kind in ("demand", "requester") for id in world.ledger.indexed_names(kind)}
+    names = {*running_names, *repo.stopped_release_names(str(snapshot.commit))}
+    names |= {id for each in SubjectKind for id in world.ledger.subjects(each)}
+    names |= {*world.config.nodes, *world.config.appdefs, *world.config.overrides}
+    names |= {id for kind in ("demand", "requester") for id in world.ledger.indexed_names(kind)}
     parts = {part for running_name in running_names for part in running_name.split("-")}
-    close = closest(name, known | parts)  # a part of a release's name is also accepted
-    known = {close} if close else known
+    close = closest(name, names | parts)  # a part of a release's name is also accepted
+    names = {close} if close else names
     if kind is not None:
-        remedy = "; leave out --kind" if close in (None, name) else suggestion(name, known)
+        remedy = "; leave out --kind" if close in (None, name) else suggestion(name, names)
         raise StateRepoError(f"no {kind} is called {quoted(name)}{remedy}")
     raise StateRepoError(
         f"nothing called {quoted(name)} runs or ran up to commit {str(snapshot.commit)[:10]}"
-        f"{suggestion(name, known)}"
+        f"{suggestion(name, names)}"
     )
 
 
@@ -112,27 +107,32 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
 def _by_looser_match(
     repo: Reader, snapshot: Snapshot, name: str, kind: str | None
 ) -> Iterator[Match]:
-    """Yield the first object of this name that :func:`_named` finds.
-
-    If there is none, yield the first of these that exists: a current release whose name contains
-    ``name``, a held demand whose id begins with ``name``, an ended demand of exactly this id, an
-    ended release whose name contains ``name``.
-
-    Raises:
-        StateRepoError: if the name is a part of several names.
-    """
-    world = snapshot.state
-    found = next((one for one in _named(world, name) if kind in (None, one.kind)), None)
-    if found is not None:
-        yield found
-    elif kind in (None, "release") and (running := _release_with(name, world)):
-        yield Match("release", running.name, path_of(running), running)
-    elif kind in (None, "demand") and (begun := _demand_from(name, world)):
-        yield Match("demand", begun)
-    elif kind in (None, "demand") and demand_commits(repo, snapshot, name):
-        yield Match("demand", name)
-    elif kind in (None, "release"):
-        yield from _ended_release_with(repo, snapshot, name)
+    """Yield what a name may mean that is no whole name of a release or subject."""
+    world, commit = snapshot.state, str(snapshot.commit)
+    named = next((each for each in _named(world, name) if kind in (None, each.kind)), None)
+    if named is not None:
+        yield named
+        return
+    # what runs or is held comes before what has ended
+    if kind in (None, "release"):
+        parts = {each.name: each for each in release_causes.releases(world) if name in each.name}
+        if parts:
+            release = parts[_the_only_name(name, [*parts])]
+            yield Match("release", release.name, path_of(release), release)
+            return
+    if kind in (None, "demand"):
+        ids = sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(name))
+        if ids:
+            yield Match("demand", _the_only_name(name, ids, "demand ids begin with {}"))
+            return
+        if demand_commits(repo, snapshot, name):
+            yield Match("demand", name)
+            return
+    if kind in (None, "release"):
+        ended = sorted(each for each in repo.stopped_release_names(commit) if name in each)
+        if ended:
+            only = _the_only_name(name, ended)
+            yield Match("release", only, repo.release_path(only, commit) or "")
 
 
 def _named(world: World, name: str) -> Iterator[Match]:
@@ -148,39 +148,6 @@ def _named(world: World, name: str) -> Iterator[Match]:
         yield Match("override", name, config.overrides[name].path)
     if ("requester", name) in world.ledger.index:
         yield Match("requester", name)
-
-
-def _release_with(part: str, world: World) -> Release | None:
-    """Return the release whose name contains ``part``; None if there is none.
-
-    Raises:
-        StateRepoError: if several releases have such a name.
-    """
-    found = {one.name: one for one in release_causes.releases(world) if part in one.name}
-    return found[_the_only_name(part, [*found])] if found else None
-
-
-def _ended_release_with(repo: Reader, snapshot: Snapshot, part: str) -> Iterator[Match]:
-    """Yield the ended release whose name contains ``part``, if there is one.
-
-    Raises:
-        StateRepoError: if several ended releases have such a name.
-    """
-    commit = str(snapshot.commit)
-    found = sorted(name for name in repo.stopped_release_names(commit) if part in name)
-    if found:
-        name = _the_only_name(part, found)
-        yield Match("release", name, repo.release_path(name, commit) or "")
-
-
-def _demand_from(start: str, world: World) -> str | None:
-    """Return the demand id that begins with ``start``; None if there is none.
-
-    Raises:
-        StateRepoError: if several demands have such an id.
-    """
-    found = sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(start))
-    return _the_only_name(start, found, "demand ids begin with {}") if found else None
 
 
 def _the_only_name(

@@ -23,10 +23,10 @@ from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.cluster.bootstrap_status import OldBootstrap, old_bootstraps
 from demandops.cluster.health import health_reader
-from demandops.cluster.health.release_health import ClusterDomain, ObjectSelector
+from demandops.cluster.health.release_health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.orphans import Orphan, orphans
-from demandops.cluster.release_status import ReleaseStatus, statuses
+from demandops.cluster.release_status import statuses
 from demandops.config.durations import duration_text
 from demandops.errors import suggestion
 from demandops.plan.overrides.claim_overrides import without_suspended
@@ -102,51 +102,36 @@ def status(
             "--wait needs --clusters FILE with a kubeconfig: without one the state is unknown"
         )
     with reader.opened(state_repo) as repo:
-        found = Status.of(repo, clusters, request_timeout)
-        if wait:
-            found = _wait_until_healthy(repo, clusters, found, timeout, request_timeout)
-    show(output, found.data(), found.text())
-    warn_of_not_rendered(found.not_rendered)
-    for missing in dict.fromkeys((one.application, one.reason) for one in found.missing_inputs):
-        errors.print(f"warning: application '{missing[0]}': {missing[1]}")
-    for name, reason in found.unreadable.items():
+        status = Status.of(repo, clusters, request_timeout)
+        end, told = REAL.monotonic() + timeout, ""
+        while wait and (amiss := status.amiss(clusters)) and REAL.monotonic() < end:
+            if amiss != told:
+                errors.print(f"waiting: {amiss}")
+                told = amiss
+            REAL.sleep(_POLL_S)
+            try:
+                repo.refresh()
+            except RemoteAway as error:  # then the last fetched commit is shown
+                errors.print(f"warning: {error}")
+            status = Status.of(repo, clusters, request_timeout)
+    show(output, status.data(), status.text())
+    warn_of_not_rendered(status.not_rendered)
+    for application, reason in dict.fromkeys(
+        (missing.application, missing.reason) for missing in status.missing_inputs
+    ):
+        errors.print(f"warning: application '{application}': {reason}")
+    for name, reason in status.unreadable.items():
         errors.print(f"warning: cluster '{name}' cannot be read: {reason}")
-    for name in clusters.keys() - found.clusters:
+    for name in clusters.keys() - status.clusters:
         errors.print(
             f"warning: --clusters: the inventory has no cluster '{name}'"
-            f"{suggestion(name, found.clusters)}"
+            f"{suggestion(name, status.clusters)}"
         )
     if not clusters and output == "text":
         errors.print("the state of the clusters is unknown: give --clusters FILE (docs/status.md)")
-    if amiss := found.amiss(clusters):
+    if amiss := status.amiss(clusters):
         errors.print(f"not well: {amiss}")
         raise click.exceptions.Exit(1)
-
-
-def _wait_until_healthy(
-    repo: Reader,
-    clusters: Mapping[str, clusters_file.ClusterAccess],
-    found: Status,
-    timeout: int,
-    patience_s: int,
-) -> Status:
-    """Wait until nothing is wrong or ``timeout`` seconds have passed; return the last status.
-
-    A cluster may take ``patience_s`` seconds to answer. While the state repo cannot be reached, the
-    status is that of the commit fetched last.
-    """
-    end, told = REAL.monotonic() + timeout, ""
-    while (amiss := found.amiss(clusters)) and REAL.monotonic() < end:
-        if amiss != told:
-            errors.print(f"waiting: {amiss}")
-            told = amiss
-        REAL.sleep(_POLL_S)
-        try:
-            repo.refresh()
-        except RemoteAway as error:  # then the last fetched commit is shown
-            errors.print(f"warning: {error}")
-        found = Status.of(repo, clusters, patience_s)
-    return found
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,8 +146,7 @@ class Status:
     old_bootstraps: tuple[OldBootstrap, ...]
     orphans: tuple[Orphan, ...]
     missing_inputs: tuple[MissingInput, ...]
-    unreadable: Mapping[str, str]
-    """The reasons why clusters' objects cannot be read, by the name of the cluster."""
+    unreadable: Mapping[str, str]  # the reason, by the name of the cluster
 
     @classmethod
     def of(
@@ -175,32 +159,48 @@ class Status:
         problems = repo.problems()
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(progress=report)
-        targets = rollout_targets.targets_of_state(snapshot.state)
-        domains = rollout_targets.domains_of_state(snapshot.state)
-        wanted = _wanted({*domains, *(target.domain for _, target in targets)})
-        stores = _read(clusters, wanted, patience_s)
-        old = tuple(old_bootstraps(domains, stores, repo.file_reader(str(snapshot.commit))))
         commit = str(snapshot.commit)
+        releases = rollout_targets.targets_of_state(snapshot.state)
+        targets = [target for _, target in releases]
+        domains = rollout_targets.domains_of_state(snapshot.state)
+        wanted: dict[str, dict[ObjectSelector, None]] = {}
+        for domain in {*domains, *(target.domain for target in targets)}:
+            watched = health_reader(domain).objects_to_watch(domain)
+            wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
+        caches = _read_clusters(clusters, wanted, patience_s)
         ledger = without_suspended(snapshot.state).ledger
-        wanted_releases = [target for _, target in targets]
-        found = statuses(wanted_releases, commit, stores, repo.repository)
-        left = tuple(orphans(domains, wanted_releases, commit, stores, repo.repository))
         rows = [
-            release_data(release) | version_data(release, ledger) | _state(each)
-            for (release, _), each in zip(targets, found, strict=True)
+            release_data(release)
+            | version_data(release, ledger)
+            | {
+                "seen": reported.seen or None,
+                "health": reported.state,
+                "since": reported.since or None,
+                "failing": reported.health.failing,
+                "object": reported.health.object or None,
+                "reason": reported.health.reason or None,
+            }
+            for (release, _), reported in zip(
+                releases, statuses(targets, commit, caches, repo.repository), strict=True
+            )
         ]
-        missing = tuple(missing_inputs(snapshot.state))
-        known = frozenset(snapshot.state.config.clusters)
-        reasons = {name: store.why_unknown(wanted[name]) for name, store in stores.items()}
-        unreadable = {name: reason for name, reason in sorted(reasons.items()) if reason}
-        pending = repo.not_rendered(snapshot)
-        return cls(commit, rows, problems, known, pending, old, left, missing, unreadable)
+        reasons = {name: cache.why_unknown(wanted[name]) for name, cache in caches.items()}
+        return cls(
+            commit,
+            rows,
+            problems,
+            frozenset(snapshot.state.config.clusters),
+            repo.not_rendered(snapshot),
+            tuple(old_bootstraps(domains, caches, repo.file_reader(commit))),
+            tuple(orphans(domains, targets, commit, caches, repo.repository)),
+            tuple(missing_inputs(snapshot.state)),
+            {name: reason for name, reason in sorted(reasons.items()) if reason},
+        )
 
     def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
         """Return a text that counts everything that is wrong; empty if nothing is wrong.
 
-        Of the releases, only those on clusters with a kubeconfig in ``clusters`` count. Missing
-        inputs do not count.
+        Of the releases, only those on clusters with a kubeconfig in ``clusters`` count.
         """
         readable = {name for name, cluster in clusters.items() if cluster.kubeconfig}
         watched = [row for row in self.rows if row["cluster"] in readable]
@@ -218,7 +218,6 @@ class Status:
         return ", ".join(f"{what}: {count}" for what, count in counts.items() if count)
 
     def data(self) -> Json:
-        """Return the status as JSON data."""
         faults = [{"code": "invalid", **asdict(problem)} for problem in self.problems]
         return {
             "commit": self.commit,
@@ -234,7 +233,6 @@ class Status:
         }
 
     def text(self) -> list[str | Table]:
-        """Return the status as lines of text and a table of the releases."""
         text: list[str | Table] = [f"  {problem}" for problem in self.problems]
         if self.problems:
             count = len(self.problems)
@@ -244,51 +242,29 @@ class Status:
         return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
 
 
-def _wanted(domains: Iterable[ClusterDomain]) -> dict[str, list[ObjectSelector]]:
-    """Return a map from each cluster to the selectors of the objects to read in that cluster."""
-    wanted: dict[str, dict[ObjectSelector, None]] = {}
-    for domain in domains:
-        watched = health_reader(domain).objects_to_watch(domain)
-        wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
-    return {name: [*selectors] for name, selectors in wanted.items()}
-
-
-def _read(
+def _read_clusters(
     clusters: Mapping[str, clusters_file.ClusterAccess],
     wanted: Mapping[str, Iterable[ObjectSelector]],
     patience_s: int,
 ) -> dict[str, ObjectCache]:
-    """Return, for each cluster that has a kubeconfig, a cache of the cluster's ``wanted`` objects.
-
-    All clusters are read at the same time, so that a slow cluster does not delay the others.
-    """
-    stores = {
+    """Return a cache of the ``wanted`` objects of each cluster that has a kubeconfig."""
+    caches = {
         name: ObjectCache(name, cluster, lambda: None)
         for name, cluster in clusters.items()
         if cluster.kubeconfig and name in wanted
     }
     threads = {
-        name: REAL.start_thread(f"read-{name}", partial(store.read_once, wanted[name]))
-        for name, store in stores.items()
+        name: REAL.start_thread(f"read-{name}", partial(cache.read_once, wanted[name]))
+        for name, cache in caches.items()
     }
+    # all clusters are read at the same time, so that a slow cluster does not delay the others
     end = REAL.monotonic() + patience_s
     with busy("asking the clusters"):
         for name, thread in threads.items():
             thread.join(max(0.0, end - REAL.monotonic()))
             if thread.is_alive():
-                stores[name].give_up(f"it did not answer within {duration_text(patience_s)}")
-    return stores
-
-
-def _state(found: ReleaseStatus) -> Json:
-    return {
-        "seen": found.seen or None,
-        "health": found.state,
-        "since": found.since or None,
-        "failing": found.health.failing,
-        "object": found.health.object or None,
-        "reason": found.health.reason or None,
-    }
+                caches[name].give_up(f"it did not answer within {duration_text(patience_s)}")
+    return caches
 
 
 _COLORS = {"failing": "red", "healthy": "green", "unknown": "yellow", "waiting": "yellow"}
@@ -306,7 +282,6 @@ _COLUMNS = (
 
 
 def releases_table(rows: Iterable[Json]) -> Table:
-    """Return a table of releases. ``rows`` are the releases as JSON data."""
     cells = [
         (
             row["name"],

@@ -26,11 +26,9 @@ from demandops.staterepo.reader import Reader
 
 _PAUSE_S = 2.0
 _COMMITS = 6
+# Two lines are the title, one before each of the three parts is empty, and one at the bottom stays
+# free.
 _OTHER_LINES = 6
-"""How many lines are not for the three parts.
-
-Two lines are the title, one before each part is empty, and one at the bottom stays free.
-"""
 
 
 @click.command()
@@ -82,21 +80,20 @@ def _screen(
     status = Status.of(repo, clusters)
     source = Source(repo, repo.snapshot(), now)
     demands = KINDS["demands"]
-    held = demands.items(source)
+    items = demands.items(source)
     rows = [commit_data(entry) for entry in islice(repo.log(), _COMMITS)]
     amiss = "; ".join(filter(None, (status.amiss(clusters), away)))
     health = painted(f"not well: {amiss}", "red") if amiss else painted("all is well", "green")
     if not clusters and not amiss:
         health = "the health is unknown: give --clusters FILE"
     head = f"{repo.repository.address} at {status.commit[:10]}, {now:%H:%M:%S} UTC"
-    counts = f"{len(status.rows)} releases, {len(held)} demands"
+    counts = f"{len(status.rows)} releases, {len(items)} demands"
     releases = sorted(status.rows, key=lambda row: (row["health"] == "healthy", row["name"]))
     commits = log_table(rows, now)
     last = _part("Latest commits", commits, width, height // 3)
     room = height - _OTHER_LINES - len(last)
     first = _part("Releases", releases_table(releases), width, room * 2 // 3)
-    cells = [demands.cells(item, now)[: len(demands.columns)] for item in held]
-    middle = _part("Demands", Table(demands.columns, cells), width, room - len(first))
+    middle = _part("Demands", demands.table(items, now), width, room - len(first))
     title = [painted(head, "bold"), f"{counts}; {health}"]
     return [*title, "", *first, "", *middle, "", *last][: height - 1]
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable
 
 import click
 
 from demandops.cli.json_output import (
+    Json,
     claim_data,
     commit_data,
     output_option,
@@ -27,7 +27,6 @@ from demandops.cli.views.name_match import KINDS, Match, demand_commits, match_o
 from demandops.demand.claim import Claim
 from demandops.ledger.world import World
 from demandops.plan.overrides.claim_overrides import suspended_by, without_suspended
-from demandops.plan.release import Release
 from demandops.plan.views import release_causes
 from demandops.plan.views.demand_list import nodes_of
 from demandops.plan.views.missing_inputs import missing_inputs
@@ -37,7 +36,6 @@ from demandops.staterepo import reader
 from demandops.staterepo.history.commit_log import LogEntry, PathHistory
 from demandops.staterepo.load.snapshot import Snapshot
 from demandops.staterepo.reader import Reader
-from demandops.subject import Subject
 
 _MOST_CARRIED_OUT = 5
 
@@ -90,166 +88,126 @@ def why(
     with reader.opened(state_repo) as repo:
         snapshot = loaded(repo, at)
         with busy("looking through the commits"):
-            answer = _answer(repo, snapshot, match_of(repo, snapshot, name, kind), at, most)
+            match = match_of(repo, snapshot, name, kind)
+            answer: Json = {
+                "commit": str(snapshot.commit),
+                "kind": match.kind,
+                "name": match.name,
+                **_described(snapshot.state, match),
+            }
+            claim_files = {claim["file"] for claim in answer.get("claims", ())}
+            reasons = (
+                f"application '{missing.application}': {missing.reason}"
+                for missing in missing_inputs(snapshot.state)
+                if missing.file in claim_files
+            )
+            answer["missing_inputs"] = list(dict.fromkeys(reasons))
+            files = {match.path, *(release["file"] for release in answer.get("releases", ()))}
+            not_rendered = [] if at else sorted(files & repo.not_rendered(snapshot))
+            if not_rendered and answer.get("state") == "in force":
+                answer["state"] = "not rendered yet"
+            answer["not_rendered"] = not_rendered
+            answer |= {"file": match.path or None, **_commits(repo, snapshot, match, most)}
     show(output, answer, why_text.lines_of(answer))
 
 
-def _answer(
-    repo: Reader, snapshot: Snapshot, match: Match, at: str | None, most: int
-) -> dict[str, Any]:
-    """Return the explanation as JSON data; ``most`` limits the list of changes."""
-    answer: dict[str, Any] = {
-        "commit": str(snapshot.commit),
-        "kind": match.kind,
-        "name": match.name,
-    }
+def _described(world: World, match: Match) -> Json:
+    """Return as JSON data what the object of ``match`` is, and who needs it."""
+    name, config = match.name, world.config
     if match.release is not None:
-        answer |= _of_release(snapshot.state, match.release)
-    elif match.subject is not None:
-        answer |= _of_subject(snapshot.state, match.subject)
-    elif match.kind in _DESCRIBED:
-        answer |= _DESCRIBED[match.kind](snapshot.state, match.name)
-    else:
-        answer |= {"runs": False, **_denied(snapshot.state, match)}
-    answer |= {"missing_inputs": _missing(snapshot.state, answer)}
-    answer |= {"not_rendered": _not_rendered(repo, snapshot, answer, match) if not at else []}
-    answer |= {"file": match.path or None, **_commits(repo, snapshot, match, most)}
-    return answer
+        release = match.release
+        claims = release_causes.claims_behind(without_suspended(world).ledger, release)
+        return {
+            "runs": True,
+            **place_data(release),
+            **_claims(claims, world),
+            "shaped_by": [
+                {"file": file, "entry": entry or None, "what": what}
+                for file, entry, what in release_causes.shaping_files(release, config)
+            ],
+            "overrides": [override_data(*each) for each in release.shaping.by],
+        }
+    if match.subject is not None:
+        claims = sorted(world.ledger.claims_on(match.subject), key=lambda claim: claim.booked)
+        what = str(match.subject)
+        if claims and not claims[0].is_on_application:
+            connection = claims[0].connection
+            word = connection.type.word.upper() if connection.type else ""
+            what = f"{word} {what} from {connection.source} to {connection.target}".lstrip()
+        releases = release_causes.releases(world, match.subject)
+        return {
+            "runs": any(suspended_by(claim, world) is None for claim in claims),
+            "what": what,
+            "subject": subject_data(match.subject),
+            **_claims(claims, world),
+            "releases": [release_data(release) for release in releases],
+        }
+    if match.kind == "release":  # it does not run; perhaps an override denies it
+        file_name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
+        denied = release_causes.denied_release_named(world, file_name)
+        if denied is None:
+            return {"runs": False}
+        release, override = denied
+        return {
+            "runs": False,
+            **place_data(release),
+            "denied_by": override_data(override, ("deny",)),
+        }
+    if match.kind == "demand":
+        return _held(world, f"demand '{name}'", lambda claim: claim.demand == name)
+    if match.kind == "requester":
+        return _held(world, f"requester '{name}'", lambda claim: name in claim.requesters)
+    if match.kind == "appdef":
+        return _held(
+            world,
+            config.appdefs[name].description,
+            lambda claim: claim.is_on_application and claim.application.appdef == name,
+        )
+    if match.kind == "node":
+        node, domain = config.nodes[name], config.domain_of.get(name)
+        claims = [claim for claim in world.ledger if name in nodes_of(claim)]
+        claims.sort(key=lambda claim: (str(claim.subject), claim.demand))
+        running = [each for each in release_causes.releases(world) if each.node.id == name]
+        return {
+            "runs": bool(running or claims),
+            "what": f"{node.type} in cluster {node.cluster}, access domain "
+            f"{domain.name if domain else 'none'}{', drained' if node.drained else ''}",
+            **_claims(claims, world),
+            "releases": [release_data(release) for release in running],
+        }
+    if match.kind == "override":
+        override = config.overrides[name]
+        report = override_report(world, REAL.now())
+        (entry,) = (entry for entry in report if entry.override == override)
+        effects = ", ".join(effect_words(override_data(override)))
+        return {
+            "runs": entry.state == "in force",
+            "state": entry.state,
+            "what": f"{effects}, of {override.owner}: {override.reason}",
+            **_claims([*entry.claims], world),
+            "releases": [release_data(release) for release in affected_releases(entry, world)],
+        }
+    return {"runs": False}
 
 
-def _missing(world: World, answer: dict[str, Any]) -> list[str]:
-    """Return the reasons why inputs of the applications in ``answer`` do not arrive."""
-    files = {one["file"] for one in answer.get("claims", ())}
-    found = (one for one in missing_inputs(world) if one.file in files)
-    return list(dict.fromkeys(f"application '{one.application}': {one.reason}" for one in found))
-
-
-def _not_rendered(
-    repo: Reader, snapshot: Snapshot, answer: dict[str, Any], match: Match
-) -> list[str]:
-    """Return those files of ``answer`` that a generator has yet to write or remove.
-
-    If there are such files, change the state ``in force`` in ``answer`` to ``not rendered yet``.
-    """
-    files = {match.path, *(one["file"] for one in answer.get("releases", ()))}
-    found = sorted(files & repo.not_rendered(snapshot))
-    if found and answer.get("state") == "in force":
-        answer["state"] = "not rendered yet"
-    return found
-
-
-def _of_release(world: World, running: Release) -> dict[str, Any]:
-    claims = release_causes.claims_behind(without_suspended(world).ledger, running)
-    return {
-        "runs": True,
-        **place_data(running),
-        **_claims(claims, world),
-        "shaped_by": [
-            {"file": file, "entry": entry or None, "what": what}
-            for file, entry, what in release_causes.shaping_files(running, world.config)
-        ],
-        "overrides": [override_data(*each) for each in running.shaping.by],
-    }
-
-
-def _denied(world: World, match: Match) -> dict[str, Any]:
-    """Return as JSON data which override denies a release, and where the release would run.
-
-    Return an empty mapping if no override denies it.
-    """
-    if match.kind != "release":
-        return {}
-    name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    stopped = release_causes.denied_release_named(world, name)
-    if stopped is None:
-        return {}
-    return {**place_data(stopped[0]), "denied_by": override_data(stopped[1], ("deny",))}
-
-
-def _of_subject(world: World, claimed: Subject) -> dict[str, Any]:
-    claims = sorted(world.ledger.claims_on(claimed), key=lambda claim: claim.booked)
-    return {
-        "runs": any(suspended_by(claim, world) is None for claim in claims),
-        "what": _subject_text(claimed, claims),
-        "subject": subject_data(claimed),
-        **_claims(claims, world),
-        "releases": [release_data(each) for each in release_causes.releases(world, claimed)],
-    }
-
-
-def _of_demand(world: World, id: str) -> dict[str, Any]:
-    return _held(world, f"demand '{id}'", (one for one in world.ledger if one.demand == id))
-
-
-def _of_requester(world: World, id: str) -> dict[str, Any]:
-    return _held(world, f"requester '{id}'", (one for one in world.ledger if id in one.requesters))
-
-
-def _of_appdef(world: World, name: str) -> dict[str, Any]:
-    claims = (
-        one for one in world.ledger if one.is_on_application and one.application.appdef == name
+def _held(world: World, what: str, is_held: Callable[[Claim], bool]) -> Json:
+    claims = sorted(
+        filter(is_held, world.ledger), key=lambda claim: (str(claim.subject), claim.demand)
     )
-    return _held(world, world.config.appdefs[name].description, claims)
-
-
-def _of_override(world: World, name: str) -> dict[str, Any]:
-    override = world.config.overrides[name]
-    (entry,) = (one for one in override_report(world, REAL.now()) if one.override == override)
-    return {
-        "runs": entry.state == "in force",
-        "state": entry.state,
-        "what": f"{', '.join(effect_words(override_data(override)))}, of {override.owner}: "
-        f"{override.reason}",
-        **_claims([*entry.claims], world),
-        "releases": [release_data(one) for one in affected_releases(entry, world)],
-    }
-
-
-def _held(world: World, what: str, held: Iterable[Claim]) -> dict[str, Any]:
-    """Return JSON data on claims, and on the releases that these claims need."""
-    claims = sorted(held, key=lambda claim: (str(claim.subject), claim.demand))
     needed = {
-        one.name: one for claim in claims for one in release_causes.releases(world, claim.subject)
+        release.name: release
+        for claim in claims
+        for release in release_causes.releases(world, claim.subject)
     }
     return {
         "runs": any(suspended_by(claim, world) is None for claim in claims),
         "what": what,
         **_claims(claims, world),
-        "releases": [release_data(one) for _, one in sorted(needed.items())],
+        "releases": [release_data(release) for _, release in sorted(needed.items())],
     }
 
 
-def _of_node(world: World, id: str) -> dict[str, Any]:
-    node, domain = world.config.nodes[id], world.config.domain_of.get(id)
-    claims = [claim for claim in world.ledger if id in nodes_of(claim)]
-    running = [one for one in release_causes.releases(world) if one.node.id == id]
-    return {
-        "runs": bool(running or claims),
-        "what": f"{node.type} in cluster {node.cluster}, access domain "
-        f"{domain.name if domain else 'none'}{', drained' if node.drained else ''}",
-        **_claims(sorted(claims, key=lambda claim: (str(claim.subject), claim.demand)), world),
-        "releases": [release_data(one) for one in running],
-    }
-
-
-_DESCRIBED = {
-    "demand": _of_demand,
-    "node": _of_node,
-    "appdef": _of_appdef,
-    "requester": _of_requester,
-    "override": _of_override,
-}
-
-
-def _subject_text(subject: Subject, claims: list[Claim]) -> str:
-    if not claims or claims[0].is_on_application:
-        return str(subject)
-    first = claims[0].connection
-    word = first.type.word.upper() if first.type else ""
-    return f"{word} {subject} from {first.source} to {first.target}".lstrip()
-
-
-def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
+def _claims(claims: list[Claim], world: World) -> Json:
     rows = []
     for claim in claims:
         suspended = suspended_by(claim, world)
@@ -269,11 +227,7 @@ def _claims(claims: list[Claim], world: World) -> dict[str, Any]:
     }
 
 
-def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[str, Any]:
-    """Return the commits that started, changed and stopped the object of ``match``.
-
-    Return no commits for a node, a requester, and a demand that no commit names.
-    """
+def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> Json:
     if match.kind in ("node", "requester"):  # `demandops log` lists their commits
         return _history(repo, PathHistory(None, (), 0, None))
     if match.kind != "demand":
@@ -284,14 +238,14 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> dict[
     *newer, first = about
     held = ("demand", match.name) in snapshot.state.ledger.index
     stopped = None if held or not newer else newer.pop(0)
-    left = max(len(newer) - most, 0)
-    return _history(repo, PathHistory(first, tuple(newer[:most]), left, stopped))
+    more = max(len(newer) - most, 0)
+    return _history(repo, PathHistory(first, tuple(newer[:most]), more, stopped))
 
 
-def _history(repo: Reader, history: PathHistory) -> dict[str, Any]:
+def _history(repo: Reader, history: PathHistory) -> Json:
     """Return commits as JSON data, each with the people's commits that it carries out."""
 
-    def row(entry: LogEntry | None) -> dict[str, Any] | None:
+    def row(entry: LogEntry | None) -> Json | None:
         if entry is None:
             return None
         behind = repo.person_commits_behind(entry, _MOST_CARRIED_OUT)

@@ -11,7 +11,6 @@ _OF_RELEASES = {"node": "runs", "appdef": "runs", "override": "applies to"}
 
 
 def lines_of(answer: Json) -> Iterator[str]:
-    """Yield the lines of the answer for people. ``answer`` is the JSON data."""
     runs = answer["runs"]
     yield f"{answer['kind']} {answer['name']} {_state(answer)} at {answer['commit'][:10]}"
     if runs or answer["kind"] in ("node", "appdef", "override"):

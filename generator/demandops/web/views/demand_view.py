@@ -46,39 +46,28 @@ class ExplainedDemand:
 
 
 def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand:
-    """Return a demand with its claims, and what would change if it were released.
-
-    Raises:
-        StateRepoError: if the demand holds nothing, or the state repo cannot be read.
-    """
+    """Return a demand and what would change if it were released; refuse one that holds nothing."""
     claims = now.commit_state.claims_of_demands.get(id)
     if not claims:
-        why = ", because it waits for room on a node" if _waits(now, id) else ""
+        waiting = now.commit_state.state.ledger.waiting.values()
+        is_waiting = any(demand.demand == id for demand in waiting)
+        why = ", because it waits for room on a node" if is_waiting else ""
         raise StateRepoError(f"demand {quoted(id)} holds nothing{why}")
-    releases = now.commit_state.releases_of_demands.get(id, [])
-    return ExplainedDemand(
-        id, claims, requesters_of(claims), releases, _consequence(now, reader, id)
-    )
-
-
-def _waits(now: Situation, id: str) -> bool:
-    return any(one.demand == id for one in now.commit_state.state.ledger.waiting.values())
-
-
-def _consequence(now: Situation, reader: Reader, id: str) -> Consequence:
-    claims = now.commit_state.claims_of_demands[id]
+    requesters = requesters_of(claims)
     goal = {
         "apiVersion": API_VERSION,
         "kind": "Demand",
         "operation": "release",
         "demand": id,
-        "requesters": list(requesters_of(claims)),
+        "requesters": list(requesters),
     }
     how = how_to_release(claims[0])
     file = strict_yaml.dump(goal) if is_released_by_demand_id(claims[0]) else ""
     try:
         read = reader.file_reader(now.commit_state.commit)
         decision = decide(now.commit_state.state, goal, now.now, read)
+        consequence = Consequence(decision.releases, how, file, decision.approval)
     except InvalidInput as error:
-        return Consequence((), how, file, refused=str(error))
-    return Consequence(decision.releases, how, file, decision.approval)
+        consequence = Consequence((), how, file, refused=str(error))
+    releases = now.commit_state.releases_of_demands.get(id, [])
+    return ExplainedDemand(id, claims, requesters, releases, consequence)

@@ -7,31 +7,29 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 from functools import cached_property
-from typing import TypeAlias
+from typing import TypeAlias, TypeVar
 
+# How many rows a page of a list has at most.
 PAGE = 100
-"""How many rows a page of a list has at most."""
 
+# How many texts of a cell the page shows.
 _MOST_PARTS = 4
 
 
 @dataclass(frozen=True, slots=True)
 class Link:
-    """A link to a view: the path of the view, and its parameters."""
-
     path: str
     params: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A text, and its link to a view, if any."""
-
     text: str
     link: Link | None = None
 
 
 Text: TypeAlias = "str | int | Part"
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +47,10 @@ class Cell:
 
     @property
     def shown(self) -> tuple[Part, ...]:
-        """The texts of the cell that the page shows: the first few."""
         return self.parts[:_MOST_PARTS]
 
     @property
     def more(self) -> int:
-        """The number of texts of the cell that the page leaves out."""
         return max(0, len(self.parts) - _MOST_PARTS)
 
     @property
@@ -70,8 +66,6 @@ class Cell:
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A field of every row: its name in filters, and its title."""
-
     key: str
     title: str
 
@@ -86,14 +80,15 @@ class Row:
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
         """The texts of each column and hidden field; lower case, because filters ignore case."""
-        found = {key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()}
+        all_texts = {
+            key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()
+        }
         for key, texts in self.hidden.items():
-            found[key] = (*found.get(key, ()), *texts)
-        return {key: tuple(text.casefold() for text in texts) for key, texts in found.items()}
+            all_texts[key] = (*all_texts.get(key, ()), *texts)
+        return {key: tuple(text.casefold() for text in texts) for key, texts in all_texts.items()}
 
     @cached_property
     def all_texts(self) -> str:
-        """All texts of the row in lower case, each on its own line."""
         return "\n".join(text for texts in self.texts.values() for text in texts)
 
 
@@ -111,16 +106,12 @@ class Table:
     matching: int
     sort: str
     page: int
-
-    @property
-    def pages(self) -> int:
-        """The number of pages of the filtered list."""
-        return max(1, -(-self.matching // PAGE))
+    pages: int
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
     """Return a cell with all of ``texts`` that are not empty."""
-    parts = (one if isinstance(one, Part) else Part(str(one)) for one in texts)
+    parts = (text if isinstance(text, Part) else Part(str(text)) for text in texts)
     return Cell(tuple(part for part in parts if part.text), tone=tone, order=order)
 
 
@@ -140,42 +131,47 @@ class Filter:
         self._words = [word.casefold() for word in words]
 
     def __bool__(self) -> bool:
-        """Return whether the filter has any words."""
         return bool(self._words)
 
     def matches(self, row: Row) -> bool:
-        """Return whether a row contains all words of the filter."""
-        return all(_has(row, word) for word in self._words)
+        def has(word: str) -> bool:
+            for sign in ":=":
+                key, separator, wanted = word.partition(sign)
+                if separator and key in row.texts:
+                    texts = row.texts[key]
+                    return wanted in texts if sign == "=" else any(wanted in text for text in texts)
+            return word in row.all_texts
 
-
-def _has(row: Row, word: str) -> bool:
-    for sign in ":=":
-        key, found, wanted = word.partition(sign)
-        if found and key in row.texts:
-            texts = row.texts[key]
-            return wanted in texts if sign == "=" else any(wanted in text for text in texts)
-    return word in row.all_texts
+        return all(map(has, self._words))
 
 
 def exactly(key: str, value: str) -> str:
-    """Return the filter text for rows that have exactly this value in the field ``key``."""
+    """Return the filter text for rows whose field ``key`` has exactly this value."""
     return shlex.quote(f"{key}={value}")
 
 
 def table(
     columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
 ) -> Table:
-    """Return a page of the rows that match the filter ``wanted``.
+    """Return a page of the rows that match the filter.
 
-    An unknown ``sort`` means the first column. A page number out of range means the nearest page.
+    An unknown ``sort`` means the first column.
     """
     every = list(rows)
-    found = [row for row in every if wanted.matches(row)]
+    matching = [row for row in every if wanted.matches(row)]
     key = sort.removeprefix("-")
     if key not in {column.key for column in columns}:
         sort = key = columns[0].key
-    found.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
-    last = max(1, -(-len(found) // PAGE))
-    page = min(max(page, 1), last)
-    shown = tuple(found[(page - 1) * PAGE : page * PAGE])
-    return Table(tuple(columns), shown, len(every), len(found), sort, page)
+    matching.sort(key=lambda row: row.cells[key].rank, reverse=sort.startswith("-"))
+    shown, page, pages = page_of(matching, page, PAGE)
+    return Table(tuple(columns), tuple(shown), len(every), len(matching), sort, page, pages)
+
+
+def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item], int, int]:
+    """Return the items of a page, the number of the page, and the number of pages.
+
+    A number out of range means the nearest page.
+    """
+    pages = max(1, -(-len(items) // size))
+    page = min(max(page, 1), pages)
+    return items[(page - 1) * size : page * size], page, pages

@@ -6,8 +6,8 @@ state gives the same picture; the browser only draws it.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 from demandops.config.inventory import Node
@@ -27,6 +27,7 @@ from demandops.web.views.map_layout import (
 )
 
 _LINE = 15.0
+# Up to how many nodes are drawn with their services, with their names only, and one by one.
 _MOST_DETAILED, _MOST_NAMED, _MOST_NODES = 40, 250, 1_000
 _MOST_SERVICES = 5
 _MOST_LINES = 300
@@ -34,8 +35,6 @@ _MOST_LINES = 300
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """The connections from one node to another, drawn as one line."""
-
     path: str
     tone: str
     is_lit: bool
@@ -59,68 +58,53 @@ class Picture:
     width: float
     height: float
     boxes: tuple[Box, ...]
+    # Nodes and lines that are drawn one by one, with details.
     nodes: tuple[NodeCard, ...]
-    """The nodes that are drawn one by one, with details."""
     lines: tuple[Line, ...]
-    """The lines that are drawn one by one."""
+    # The others, one shape for each color, so that a map of thousands of nodes stays small.
     many_nodes: tuple[Mass, ...]
-    """The other nodes, drawn as one shape for each color."""
     many_lines: tuple[Mass, ...]
-    """The other lines, drawn as one shape for each color."""
     total: int
-    """The number of all nodes."""
     only_lit: bool
-    """Whether only lit nodes are drawn."""
     layout: str
     layouts: tuple[str, ...]
     is_dimmed: bool
-    """Whether the parts that are not lit are drawn dimmed."""
     lit: int
-    """The number of lit nodes."""
-
-
-@dataclass(slots=True)
-class _Content:
-    marks: list[ServiceMark] = field(default_factory=list)
-
-    @property
-    def tone(self) -> str:
-        words = {"bad": 0, "busy": 1, "none": 2, "good": 3}
-        return min((one.tone for one in self.marks), key=words.__getitem__, default="empty")
 
 
 def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
-    """Return the map of a situation.
+    """Return the map of a situation; services, connections and nodes that match are lit.
 
-    Args:
-        now: the situation to draw.
-        wanted: the filter; services, connections and nodes that match are lit.
-        layout: ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
-            position, and ``cluster`` otherwise. If no node that is drawn has a position, nodes are
-            always drawn by cluster.
+    ``layout`` is ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
+    position, else ``cluster``. If no drawn node has a position, nodes are drawn by cluster.
     """
     config = now.commit_state.config
     nodes = list(config.nodes.values())
-    content = _contents(now, wanted)
+    marks = _marks(now, wanted)
     total, placed = len(nodes), [node for node in nodes if node.position]
     layouts = ("cluster", "place") if placed else ("cluster",)
     if layout not in layouts:
         layout = "place" if len(placed) > len(nodes) / 2 else "cluster"
-    lit = _lit_nodes(now, wanted, nodes, content)
+    lit = _lit_nodes(now, wanted, nodes, marks)
     only_lit = len(nodes) > _MOST_NAMED and 0 < len(lit) <= _MOST_NAMED
     if only_lit:
         nodes = [node for node in nodes if node.id in lit]
-    cards = {node.id: _card(node, content[node.id], node.id in lit, len(nodes)) for node in nodes}
+    cards = {node.id: _card(node, marks[node.id], node.id in lit, len(nodes)) for node in nodes}
     boxes: list[Box] = []
     if layout == "place" and any(node.position for node in nodes):
         cards, height = by_place(cards, nodes)
     else:
         cards, boxes, height = by_cluster(cards, nodes)
-    drawn = list(cards.values())
-    many, few = _apart(drawn, lambda one: one.is_lit, _MOST_NODES)
-    masses = {tone: "".join(map(_square, each)) for tone, each in _by_tone(many)}
-    more, lines = _apart(_lines(now, wanted, cards), lambda one: one.is_lit, _MOST_LINES)
-    curves = {tone: "".join(line.path for line in each) for tone, each in _by_tone(more)}
+    many, few = _apart(list(cards.values()), _MOST_NODES)
+    masses = {
+        tone: "".join(
+            f"M{card.x:.0f} {card.y:.0f}h{card.width:.0f}v{card.height:.0f}h-{card.width:.0f}z"
+            for card in group
+        )
+        for tone, group in _by_tone(many)
+    }
+    more, lines = _apart(_lines(now, wanted, cards), _MOST_LINES)
+    curves = {tone: "".join(line.path for line in group) for tone, group in _by_tone(more)}
     return Picture(
         WIDTH,
         height,
@@ -141,84 +125,73 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
 _Drawn = TypeVar("_Drawn", "NodeCard", "Line")
 
 
-def _apart(
-    drawn: list[_Drawn], is_special: Callable[[_Drawn], bool], most: int
-) -> tuple[list[_Drawn], list[_Drawn]]:
+def _apart(drawn: list[_Drawn], most: int) -> tuple[list[_Drawn], list[_Drawn]]:
     """Return the parts to draw together, and the parts to draw one by one.
 
-    No more than ``most`` parts are drawn one by one: if possible all parts, else if possible all
-    special parts, else none.
+    No more than ``most`` are drawn one by one: all parts, else only the lit ones, else none.
     """
     if len(drawn) <= most:
         return [], drawn
-    special = [one for one in drawn if is_special(one)]
-    if len(special) > most:
+    lit = [part for part in drawn if part.is_lit]
+    if len(lit) > most:
         return drawn, []
-    return [one for one in drawn if not is_special(one)], special
+    return [part for part in drawn if not part.is_lit], lit
 
 
 def _by_tone(drawn: Iterable[_Drawn]) -> Iterable[tuple[str, list[_Drawn]]]:
-    found: dict[str, list[_Drawn]] = {}
-    for one in drawn:
-        found.setdefault(one.tone, []).append(one)
-    return found.items()
-
-
-def _square(card: NodeCard) -> str:
-    return f"M{card.x:.0f} {card.y:.0f}h{card.width:.0f}v{card.height:.0f}h-{card.width:.0f}z"
+    groups: dict[str, list[_Drawn]] = {}
+    for part in drawn:
+        groups.setdefault(part.tone, []).append(part)
+    return groups.items()
 
 
 def _lit_nodes(
-    now: Situation, wanted: Filter, nodes: Iterable[Node], content: Mapping[str, _Content]
+    now: Situation, wanted: Filter, nodes: Iterable[Node], marks: Mapping[str, list[ServiceMark]]
 ) -> set[str]:
-    """Return the ids of nodes that match the filter, or have a service or connection that does."""
+    """Return the ids of nodes that match, or have a service or connection that does."""
     if not wanted:
         return set()
-    found = {id for id, each in content.items() if any(mark.is_lit for mark in each.marks)}
+    lit = {id for id, on_node in marks.items() if any(mark.is_lit for mark in on_node)}
     for row in rows_of(now, "connections"):
         if wanted.matches(row):
-            found.update(row.hidden["node"])
+            lit.update(row.hidden["node"])
     for node in nodes:
         row = Row({}, {"node": [node.id], "type": [node.type], "cluster": [node.cluster]})
         if wanted.matches(row):
-            found.add(node.id)
-    return found & {*content}
+            lit.add(node.id)
+    return lit & {*marks}
 
 
-def _contents(now: Situation, wanted: Filter) -> dict[str, _Content]:
-    found = {id: _Content() for id in now.commit_state.config.nodes}
-    lit = _lit_services(now, wanted)
+def _marks(now: Situation, wanted: Filter) -> dict[str, list[ServiceMark]]:
+    """Return the services of each node of the inventory."""
+    rows = rows_of(now, "services") if wanted else []
+    lit = {row.cells["release"].parts[0].text for row in rows if wanted.matches(row)}
+    marks: dict[str, list[ServiceMark]] = {id: [] for id in now.commit_state.config.nodes}
     for release, _ in now.commit_state.targets:
-        if isinstance(release, ServiceRelease) and release.node.id in found:
-            word = word_of(now.status(release.name))
-            of = release.key.source or ""
-            text = f"{release.key.service} · {of}" if of else release.key.service
-            found[release.node.id].marks.append(
-                ServiceMark(release.name, text, WORDS[word], release.name in lit)
-            )
-    return found
+        if isinstance(release, ServiceRelease) and release.node.id in marks:
+            tone = WORDS[word_of(now.status(release.name))]
+            source = release.key.source
+            text = f"{release.key.service} · {source}" if source else release.key.service
+            mark = ServiceMark(release.name, text, tone, release.name in lit)
+            marks[release.node.id].append(mark)
+    return marks
 
 
-def _lit_services(now: Situation, wanted: Filter) -> set[str]:
-    if not wanted:
-        return set()
-    rows = rows_of(now, "services")
-    return {row.cells["release"].parts[0].text for row in rows if wanted.matches(row)}
-
-
-def _card(node: Node, content: _Content, is_lit: bool, total: int) -> NodeCard:
-    marks = sorted(content.marks, key=lambda one: (not one.is_lit, one.text))
+def _card(node: Node, marks: list[ServiceMark], is_lit: bool, total: int) -> NodeCard:
+    marks = sorted(marks, key=lambda mark: (not mark.is_lit, mark.text))
+    worst_first = ("bad", "busy", "none", "good")
+    tone = min((mark.tone for mark in marks), key=worst_first.index, default="empty")
     title = f"{node.id}, {node.type} in {node.cluster}: {len(marks)} services"
     if node.drained:
         title += ", drained"
     card = NodeCard(
-        node.id, node.type, 0, 0, 14, 14, content.tone, is_lit, node.drained, len(marks), "", title
+        node.id, node.type, 0, 0, 14, 14, tone, is_lit, node.drained, len(marks), "", title
     )
     if total > _MOST_NAMED:
         return card
     if total > _MOST_DETAILED:
         return replace(card, width=104, height=24, label=_short(node.id, 13))
-    shown = tuple(replace(one, text=_short(one.text, 29)) for one in marks[:_MOST_SERVICES])
+    shown = tuple(replace(mark, text=_short(mark.text, 29)) for mark in marks[:_MOST_SERVICES])
     more = len(marks) - len(shown)
     height = HEAD + _LINE * (len(shown) + bool(more)) + (6 if shown else 0)
     return replace(
@@ -247,20 +220,20 @@ def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> lis
         is_lit = bool(wanted) and any(wanted.matches(row) for row in rows)
         path = _curve(cards[source], cards[target])
         lines.append(Line(path, WORDS[worst], is_lit, source, target, title))
-    return sorted(lines, key=lambda one: (one.is_lit, one.source, one.target))
+    return sorted(lines, key=lambda line: (line.is_lit, line.source, line.target))
 
 
-def _curve(one: NodeCard, other: NodeCard) -> str:
-    if one.y + one.height <= other.y:
-        start, end, bend = one.y + one.height, other.y, 1.0
-    elif other.y + other.height <= one.y:
-        start, end, bend = one.y, other.y + other.height, -1.0
-    else:
-        start, end, bend = one.y + one.height, other.y + other.height, 0.0
+def _curve(source: NodeCard, target: NodeCard) -> str:
+    if source.y + source.height <= target.y:  # down
+        start, end, bend = source.y + source.height, target.y, 1.0
+    elif target.y + target.height <= source.y:  # up
+        start, end, bend = source.y, target.y + target.height, -1.0
+    else:  # between cards side by side, in an arc below both
+        start, end, bend = source.y + source.height, target.y + target.height, 0.0
     reach = max(18.0, abs(end - start) / 2)
     first = start + (bend or 1.0) * reach
     second = end - bend * reach if bend else end + reach
     return (
-        f"M{one.middle:.1f} {start:.1f}C{one.middle:.1f} {first:.1f} "
-        f"{other.middle:.1f} {second:.1f} {other.middle:.1f} {end:.1f}"
+        f"M{source.middle:.1f} {start:.1f}C{source.middle:.1f} {first:.1f} "
+        f"{target.middle:.1f} {second:.1f} {target.middle:.1f} {end:.1f}"
     )

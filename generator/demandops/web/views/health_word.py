@@ -7,6 +7,7 @@ from datetime import datetime
 
 from demandops.cluster.release_status import ReleaseStatus
 
+# The words for a health, each with its color on the page, from the worst to the best health.
 WORDS = {
     "failing": "bad",
     "waiting": "busy",
@@ -14,14 +15,12 @@ WORDS = {
     "unknown": "none",
     "healthy": "good",
 }
-"""The words for a health, each with its color on the page, from the worst to the best health."""
 
+# The index of each word in `WORDS`; a lower index means worse health.
 RANKS = {word: float(place) for place, word in enumerate(WORDS)}
-"""The index of each word in ``WORDS``; a lower index means worse health."""
 
 
 def word_of(status: ReleaseStatus) -> str:
-    """Return the word for the health of a release."""
     if status.state == "unknown":
         return "unknown"
     if status.health.failing:
@@ -31,7 +30,7 @@ def word_of(status: ReleaseStatus) -> str:
 
 def since_of(status: ReleaseStatus) -> datetime | None:
     """Return when a release's state last changed; None if the cluster reports no valid time."""
-    try:
+    try:  # Python 3.10 reads no "Z"
         since = datetime.fromisoformat(status.since.replace("Z", "+00:00"))
     except ValueError:
         return None

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from datetime import datetime
 from typing import Any, TypeAlias
 
 from demandops.config.durations import duration_text
@@ -15,7 +14,7 @@ from demandops.plan.planner import connection_topics
 from demandops.plan.release import ServiceRelease
 from demandops.plan.views import demand_list
 from demandops.subject import SubjectKind
-from demandops.web.situation import CommitState, ReusableRows, Situation
+from demandops.web.situation import ReusableRows, Situation
 from demandops.web.views.filtered_table import Cell, Column, Link, Part, Row, cell, exactly
 from demandops.web.views.health_word import RANKS, WORDS, word_of, worst_word
 
@@ -39,63 +38,61 @@ class ListKind:
     row: Callable[..., Row]
 
 
-def release_part(name: str) -> Part:
-    """Return a release's name with a link to the view of the release."""
+def _release_part(name: str) -> Part:
     return Part(name, Link("release", {"name": name}))
 
 
-def demand_part(id: str) -> Part:
-    """Return a demand's id with a link to the view of the demand."""
+def _demand_part(id: str) -> Part:
     return Part(id, Link("demand", {"id": id}))
 
 
-def health_cell(word: str) -> Cell:
+def _health_cell(word: str) -> Cell:
     """Return the cell for a health word; its sort key puts the worst health first."""
     return cell(word, tone=WORDS[word], order=RANKS[word])
 
 
-def _filtered(view: str, key: str, values: Iterable[str]) -> list[Part]:
-    """Return each value as a text, linked to the rows that have the value in field ``key``."""
-    return [Part(value, Link(view, {"q": exactly(key, value)})) for value in values]
+def _linked(view: str, key: str, values: Iterable[str]) -> Cell:
+    """Return a cell in which each value is linked to the rows that have it in field ``key``."""
+    return cell(*(Part(value, Link(view, {"q": exactly(key, value)})) for value in values))
 
 
-def _requesters(of: Iterable[str]) -> Cell:
-    return cell(*_filtered("demands", "requester", of))
+def _requesters(requesters: Iterable[str]) -> Cell:
+    return _linked("demands", "requester", requesters)
 
 
 def _services(now: Situation) -> Iterator[tuple[str, Values]]:
     for release, _ in now.commit_state.targets:
         if isinstance(release, ServiceRelease):
             name = release.name
-            yield (
-                name,
-                (release, now.commit_state.claims_of_releases[name], word_of(now.status(name))),
-            )
+            claims = now.commit_state.claims_of_releases[name]
+            yield name, (release, claims, word_of(now.status(name)))
 
 
 def _service(world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
     return Row(
         {
-            "release": cell(release_part(release.name)),
+            "release": cell(_release_part(release.name)),
             "service": cell(release.key.service),
-            "node": cell(*_filtered("services", "node", [release.node.id])),
+            "node": _linked("services", "node", [release.node.id]),
             "cluster": cell(release.node.cluster),
-            "application": cell(*_filtered("services", "application", release.applications)),
+            "application": _linked("services", "application", release.applications),
             "version": cell(release.version.name or release.chart.version),
             "requester": _requesters(release.requesters),
-            "health": health_cell(word),
+            "health": _health_cell(word),
         },
-        {
-            "demand": [*dict.fromkeys(claim.demand for claim in claims)],
-            "type": [release.node.type],
-        },
+        {"demand": [*dict.fromkeys(claim.demand for claim in claims)], "type": [release.node.type]},
     )
 
 
 def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
-    ledger, carrying = now.commit_state.active.ledger, clients_of(now.commit_state)
+    ledger = now.commit_state.active.ledger
+    clients_of: dict[str, list[str]] = {}
+    for name, release in now.commit_state.releases.items():
+        if not isinstance(release, ServiceRelease):
+            for id in release.connections:
+                clients_of.setdefault(id, []).append(name)
     for id in ledger.subjects(SubjectKind.CONNECTION):
-        claims, clients = ledger.connection_claims(id), carrying.get(id, [])
+        claims, clients = ledger.connection_claims(id), clients_of.get(id, [])
         if claims:  # at least one claim is not suspended
             yield id, (claims, clients, worst_word(map(now.status, clients)))
 
@@ -106,28 +103,15 @@ def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], wor
         {
             "connection": cell(held.id),
             "by": cell(held.type.word if held.type else ""),
-            "from": cell(*_filtered("connections", "from", [held.source])),
-            "to": cell(*_filtered("connections", "to", [held.target])),
+            "from": _linked("connections", "from", [held.source]),
+            "to": _linked("connections", "to", [held.target]),
             "topic": cell(*(route.source for route in connection_topics(claims))),
             "requester": _requesters(requesters_of(claims)),
-            "release": cell(*map(release_part, clients)),
-            "health": health_cell(word),
+            "release": cell(*map(_release_part, clients)),
+            "health": _health_cell(word),
         },
-        {
-            "demand": [claim.demand for claim in claims],
-            "node": [held.source, held.target],
-        },
+        {"demand": [claim.demand for claim in claims], "node": [held.source, held.target]},
     )
-
-
-def clients_of(commit_state: CommitState) -> dict[str, list[str]]:
-    """Return a map from each connection's id to the names of the releases that carry it."""
-    found: dict[str, list[str]] = {}
-    for name, release in commit_state.releases.items():
-        if not isinstance(release, ServiceRelease):
-            for id in release.connections:
-                found.setdefault(id, []).append(name)
-    return found
 
 
 def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
@@ -135,8 +119,8 @@ def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
     for id, claims in commit_state.claims_of_demands.items():
         releases = commit_state.releases_of_demands.get(id, [])
         yield id, (claims, releases, worst_word(map(now.status, releases)))
-    for one in commit_state.state.ledger.waiting.values():
-        yield f"waiting {one.demand}", (one, [], "waiting")
+    for demand in commit_state.state.ledger.waiting.values():
+        yield f"waiting {demand.demand}", (demand, [], "waiting")
 
 
 def _demand(
@@ -146,20 +130,20 @@ def _demand(
         held = demand_list.waiting_demand(holds)
     else:
         held = demand_list.held_demand(holds, world)
-    health = health_cell(word)
+    health = _health_cell(word)
     if held.state == "suspended":
         health = cell("suspended", tone="bad", order=0.0)
     elif held.state == "waiting":
         health = cell("waits for room", tone="busy", order=RANKS["waiting"])
     return Row(
         {
-            "demand": cell(demand_part(held.name)),
+            "demand": cell(_demand_part(held.name)),
             "request": cell(*held.requests),
             "requester": _requesters(held.requesters),
-            "application": cell(*_filtered("services", "application", held.applications)),
-            "connection": cell(*_filtered("connections", "connection", held.connections)),
-            "since": _time(held.since),
-            "lease": _time(held.lease.until if held.lease else None),
+            "application": _linked("services", "application", held.applications),
+            "connection": _linked("connections", "connection", held.connections),
+            "since": Cell(time=held.since),
+            "lease": Cell(time=held.lease.until if held.lease else None),
             "health": health,
         },
         {"release": releases, "node": held.nodes},
@@ -177,20 +161,16 @@ def _lease(world: World, claim: Claim) -> Row:
     assert lease is not None  # noqa: S101 - only claims with a lease are listed
     return Row(
         {
-            "ends": _time(lease.until),
+            "ends": Cell(time=lease.until),
             "subject": cell(claim.subject.id),
             "kind": cell(claim.subject.kind.value[:-1]),
-            "demand": cell(demand_part(claim.demand)),
+            "demand": cell(_demand_part(claim.demand)),
             "requester": _requesters(claim.requesters),
             "term": cell(duration_text(lease.seconds), order=float(lease.seconds)),
             "slack": cell(duration_text(lease.slack), order=float(lease.slack)),
         },
         {"node": demand_list.nodes_of(claim)},
     )
-
-
-def _time(at: datetime | None) -> Cell:
-    return Cell(time=at)
 
 
 def _columns(*named: str) -> tuple[Column, ...]:
@@ -200,17 +180,18 @@ def _columns(*named: str) -> tuple[Column, ...]:
 def rows_of(now: Situation, name: str) -> list[Row]:
     """Return the rows of a list; reuse the rows of entries that have not changed."""
     commit_state, kind = now.commit_state, LISTS[name]
-    known = commit_state.rows.get(name, ReusableRows(None, {}))
-    if known.statuses is not now.statuses:
-        made: dict[str, tuple[Values, Row]] = {}
+    reusable = commit_state.rows.get(name, ReusableRows(None, {}))
+    # the follower makes a new mapping of statuses whenever it looks, so the same mapping means that
+    # nothing has changed
+    if reusable.statuses is not now.statuses:
+        rows: dict[str, tuple[Values, Row]] = {}
         for id, values in kind.entries(now):
-            before = known.rows.get(id)
-            is_same = before is not None and before[0] == values
-            made[id] = (
-                before if before and is_same else (values, kind.row(commit_state.state, *values))
-            )
-        known = commit_state.rows[name] = ReusableRows(now.statuses, made)
-    return [row for _, row in known.rows.values()]
+            before = reusable.rows.get(id)
+            if before is None or before[0] != values:
+                before = values, kind.row(commit_state.state, *values)
+            rows[id] = before
+        reusable = commit_state.rows[name] = ReusableRows(now.statuses, rows)
+    return [row for _, row in reusable.rows.values()]
 
 
 LISTS = {

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from demandops.config.inventory import Node
@@ -17,8 +17,6 @@ _TYPES = ("cloud", "edge", "station", "vehicle")
 
 @dataclass(frozen=True, slots=True)
 class ServiceMark:
-    """A service as it is drawn on the card of its node."""
-
     name: str
     text: str
     tone: str
@@ -51,14 +49,11 @@ class NodeCard:
 
     @property
     def middle(self) -> float:
-        """The x coordinate of the card's center."""
         return self.x + self.width / 2
 
 
 @dataclass(frozen=True, slots=True)
 class Box:
-    """A cluster as it is drawn: a box around the cards of its nodes."""
-
     name: str
     x: float
     y: float
@@ -74,7 +69,7 @@ def by_cluster(
     The cards in a box are in rows, grouped by the type of the node.
     """
     clusters: dict[str, dict[str, list[NodeCard]]] = {}
-    for node in sorted(nodes, key=lambda one: one.id):
+    for node in sorted(nodes, key=lambda node: node.id):
         clusters.setdefault(node.cluster, {}).setdefault(node.type, []).append(cards[node.id])
     placed: dict[str, NodeCard] = {}
     boxes: list[Box] = []
@@ -84,7 +79,7 @@ def by_cluster(
         if x and x + width > WIDTH:
             x, y, shelf = 0.0, y + shelf + _GAP, 0.0
         boxes.append(Box(name, x, y, width, height))
-        placed |= {one.id: replace(one, x=one.x + x, y=one.y + y) for one in inside}
+        placed |= {card.id: replace(card, x=card.x + x, y=card.y + y) for card in inside}
         x, shelf = x + width + _GAP, max(shelf, height)
     return placed, boxes, y + shelf
 
@@ -100,12 +95,13 @@ def _box(
     step = first.width + gap
     fitting = max(1, int((WIDTH - 2 * _GAP + gap) / step))
     widest = max(len(group) for group in groups.values())
+    # about 2.5 times as many columns as rows, but at least 4
     columns = min(fitting, widest, max(4, math.ceil(math.sqrt(total * 2.5))))
     order = {name: place for place, name in enumerate(_TYPES)}
     width = WIDTH if is_alone else max(130.0, 2 * _GAP + step * columns - gap)
     placed, y = list[NodeCard](), HEAD
     sides = iter((0.0, *(1.0, -1.0) * len(groups)))
-    for name in sorted(groups, key=lambda one: (order.get(one, len(order)), one)):
+    for name in sorted(groups, key=lambda type: (order.get(type, len(order)), type)):
         group = groups[name]
         # short rows move to a side, so that lines between other types can pass them
         side = next(sides) if len(group) < columns else 0.0
@@ -130,6 +126,7 @@ def by_place(
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
     widest = max(cards[id].width for id in spots)
+    # the same in both directions, so that distances on the map can be compared
     scale = min(
         (WIDTH - widest) / max(max(xs) - min(xs), 1.0),
         _PLACE_HEIGHT / max(max(ys) - min(ys), 1.0),
@@ -138,28 +135,24 @@ def by_place(
     for id, spot in sorted(spots.items(), key=lambda pair: (-pair[1].y, pair[1].x, pair[0])):
         x = (spot.x - min(xs)) * scale
         y = (max(ys) - spot.y) * scale
-        placed[id] = _pushed_down(replace(cards[id], x=x, y=y), placed.values())
+        card = replace(cards[id], x=x, y=y)
+        # move it down until it overlaps no other card
+        for other in sorted(placed.values(), key=lambda other: other.y):
+            is_apart = (
+                card.x + card.width + 4 <= other.x
+                or other.x + other.width + 4 <= card.x
+                or card.y + card.height + 4 <= other.y
+                or other.y + other.height + 4 <= card.y
+            )
+            if not is_apart:
+                card = replace(card, y=other.y + other.height + 6)
+        placed[id] = card
     height = max(card.y + card.height for card in placed.values()) + _GAP
-    x = 0.0
-    rest = sorted((card for id, card in cards.items() if id not in spots), key=lambda c: c.id)
-    row = 0.0
-    for card in rest:
+    x = row = 0.0
+    without_position = (card for id, card in cards.items() if id not in spots)
+    for card in sorted(without_position, key=lambda card: card.id):
         if x and x + card.width > WIDTH:
             x, height, row = 0.0, height + row + _GAP, 0.0
         placed[card.id] = replace(card, x=x, y=height)
         x, row = x + card.width + _GAP, max(row, card.height)
     return placed, height + row
-
-
-def _pushed_down(card: NodeCard, others: Iterable[NodeCard]) -> NodeCard:
-    """Return the card, moved down far enough not to overlap the others."""
-    for other in sorted(others, key=lambda one: one.y):
-        apart = (
-            card.x + card.width + 4 <= other.x
-            or other.x + other.width + 4 <= card.x
-            or card.y + card.height + 4 <= other.y
-            or other.y + other.height + 4 <= card.y
-        )
-        if not apart:
-            card = replace(card, y=other.y + other.height + 6)
-    return card

@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Collection, Iterable, Iterator
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 
-from demandops.cluster.bootstrap_status import OldBootstrap
-from demandops.cluster.orphans import Orphan
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.config.override import Override
 from demandops.demand.claim import Claim, requesters_of
-from demandops.ledger.waiting import WaitingDemand, in_turn
+from demandops.ledger.waiting import in_turn
 from demandops.plan.overrides.claim_overrides import suspended_claims
 from demandops.plan.release import ServiceRelease
 from demandops.plan.views import release_causes
 from demandops.staterepo.load.problem_report import Problem
-from demandops.staterepo.write.proposal_branch import PendingProposal
 from demandops.web.situation import CommitState, Situation
 from demandops.web.views.filtered_table import Cell, Filter, Link, Part, Row, cell, exactly
 from demandops.web.views.health_word import WORDS, since_of, word_of, worst_word
@@ -48,11 +45,9 @@ class Cause:
 
     @property
     def tone(self) -> str:
-        """The color of the cause on the page."""
         return KINDS[self.kind]
 
     def row(self) -> Row:
-        """Return the cause as a row, to which filters can be applied."""
         texts = {
             "release": self.releases,
             "application": self.applications,
@@ -75,48 +70,35 @@ class Ready:
 
     @property
     def tone(self) -> str:
-        """The color of :attr:`word` on the page."""
         return {**WORDS, **KINDS}[self.word]
 
 
 def causes(
     now: Situation, wanted: Filter, last_change: LastChange, pending: Collection[str] = ()
 ) -> list[Cause]:
-    """Return every cause that matches the filter ``wanted``.
+    """Return every cause that matches the filter, the worst kind first, then the oldest.
 
-    Causes are sorted by kind, from the worst to the mildest, and then by age, the oldest first.
-
-    Args:
-        now: the situation.
-        wanted: the filter.
-        last_change: returns the newest commit that changed a file or folder.
-        pending: the generated files that a generator must still write or remove.
+    ``last_change`` returns the newest commit that changed a file or folder. ``pending`` are the
+    generated files that a generator must still write or remove.
     """
-    found = [
-        *_unread(now),
-        *_invalid(now, last_change),
-        *_suspended(now.commit_state, last_change),
-        *_denied(now.commit_state, last_change),
+    all_causes = [
+        *_unread_or_invalid(now, last_change),
+        *_overridden(now.commit_state, last_change),
         *_of_releases(now, last_change),
-        *map(_waits, in_turn(now.commit_state.state.ledger.waiting)),
-        *map(_proposed, now.proposals),
-        *map(_unapplied, now.old_bootstraps),
-        *map(_orphaned, now.orphans),
-        *(_pending(now.commit_state, sorted(pending)) if pending else ()),
+        *_awaited(now, sorted(pending)),
     ]
     places = {kind: place for place, kind in enumerate(KINDS)}
     latest = now.now.timestamp()
-    found.sort(key=lambda one: (places[one.kind], one.since.timestamp() if one.since else latest))
-    return [cause for cause in found if wanted.matches(cause.row())]
+    all_causes.sort(
+        key=lambda cause: (places[cause.kind], cause.since.timestamp() if cause.since else latest)
+    )
+    return [cause for cause in all_causes if wanted.matches(cause.row())]
 
 
-def applications(now: Situation, found: Iterable[Cause], wanted: Filter) -> list[Ready]:
-    """Return the applications that match the filter ``wanted``.
-
-    Applications with a cause in ``found`` come first.
-    """
+def applications(now: Situation, causes: Iterable[Cause], wanted: Filter) -> list[Ready]:
+    """Return the applications that match the filter, those with a cause in ``causes`` first."""
     by_application: dict[str, list[Cause]] = {}
-    for cause in found:
+    for cause in causes:
         for application in cause.applications:
             by_application.setdefault(application, []).append(cause)
     statuses: dict[str, list[ReleaseStatus]] = {}
@@ -126,25 +108,26 @@ def applications(now: Situation, found: Iterable[Cause], wanted: Filter) -> list
             statuses.setdefault(application, []).append(now.status(name))
     for claim in now.commit_state.state.ledger:
         if claim.is_on_application:
-            known = rows.get(claim.subject.id)
-            who = {*claim.requesters, *(known.hidden["requester"] if known else ())}
-            demands = {claim.demand, *(known.hidden["demand"] if known else ())}
+            row_before = rows.get(claim.subject.id)
+            who = {*claim.requesters, *(row_before.hidden["requester"] if row_before else ())}
+            demands = {claim.demand, *(row_before.hidden["demand"] if row_before else ())}
             rows[claim.subject.id] = Row(
                 {"application": cell(claim.subject.id)},
                 {"requester": sorted(who), "demand": sorted(demands)},
             )
-    made = []
+    shown = []
     for application, row in sorted(rows.items()):
         if wanted.matches(row):
-            mine = tuple(by_application.get(application, ()))
+            its_causes = tuple(by_application.get(application, ()))
             word = worst_word(statuses.get(application, ()))
-            if mine and word in ("healthy", "unknown"):
-                word = mine[0].kind
-            made.append(Ready(application, word, mine))
-    return sorted(made, key=lambda one: (not one.causes, one.application))
+            # what runs well may still be denied or invalid; then the cause says more
+            if its_causes and word in ("healthy", "unknown"):
+                word = its_causes[0].kind
+            shown.append(Ready(application, word, its_causes))
+    return sorted(shown, key=lambda ready: (not ready.causes, ready.application))
 
 
-def _unread(now: Situation) -> Iterator[Cause]:
+def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
     if now.unread:
         yield Cause(
             "unread",
@@ -156,9 +139,6 @@ def _unread(now: Situation) -> Iterator[Cause]:
             ),
             told=now.unread,
         )
-
-
-def _invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
     for problem in now.commit_state.problems:
         change = last_change(problem.file)
         who = (
@@ -182,122 +162,107 @@ def _invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
         )
 
 
-def _suspended(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
+def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
+    """Yield a cause for each override that suspends claims, and for each release that one denies.
+
+    The claims that need a denied release are not suspended as a whole.
+    """
     by_override: dict[str, tuple[Override, list[Claim]]] = {}
     for claim, override in suspended_claims(commit_state.state):
         by_override.setdefault(override.name, (override, []))[1].append(claim)
+    denials: list[tuple[Override, Part, str, Sequence[Claim], Iterable[str], tuple[str, ...]]] = []
+    claims: Sequence[Claim]
+    applications: Iterable[str]
     for override, claims in by_override.values():
-        names = [claim.subject.id for claim in claims]
-        change = last_change(override.path)
-        yield Cause(
-            "suspended",
-            Part(" and ".join(dict.fromkeys(names)), Link("overrides")),
-            f"is booked, but {override.path} denies it",
-            _by_owner(override),
-            told=override.reason,
-            applications=tuple(dict.fromkeys(_applications_with(commit_state, claims))),
-            requesters=requesters_of(claims),
-            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
-            since=change.time if change else None,
-        )
-
-
-def _denied(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
-    """Yield a cause for each release that an override denies.
-
-    :func:`_suspended` yields the causes for claims that an override suspends as a whole.
-    """
-    ledger = commit_state.active.ledger
+        names = dict.fromkeys(claim.subject.id for claim in claims)
+        what = Part(" and ".join(names), Link("overrides"))
+        applications = _applications_with(commit_state, claims)
+        denials.append((override, what, "is booked", claims, applications, ()))
     for release, override in commit_state.denied:
-        claims = release_causes.claims_behind(ledger, release)
+        claims = release_causes.claims_behind(commit_state.active.ledger, release)
+        what = Part(release.description, Link("release", {"name": release.name}))
+        applications = release.applications if isinstance(release, ServiceRelease) else ()
+        denials.append((override, what, "is needed", claims, applications, (release.name,)))
+    for override, what, state, claims, applications, releases in denials:
+        ends = f", or wait until the override ends at {override.expires}"
         change = last_change(override.path)
         yield Cause(
             "suspended",
-            Part(release.description, Link("release", {"name": release.name})),
-            f"is needed, but {override.path} denies it",
-            _by_owner(override),
+            what,
+            f"{state}, but {override.path} denies it",
+            Remedy(
+                f"{override.owner}, who owns the override",
+                f"remove the file by pull request{ends if override.expires else ''}",
+                shlex.join(["git", "rm", override.path]),
+            ),
             told=override.reason,
-            releases=(release.name,),
-            applications=tuple(release.applications) if isinstance(release, ServiceRelease) else (),
+            releases=releases,
+            applications=tuple(dict.fromkeys(applications)),
             requesters=requesters_of(claims),
             demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
             since=change.time if change else None,
         )
 
 
-def _by_owner(override: Override) -> Remedy:
-    ends = f", or wait until the override ends at {override.expires}" if override.expires else ""
-    return Remedy(
-        f"{override.owner}, who owns the override",
-        f"remove the file by pull request{ends}",
-        shlex.join(["git", "rm", override.path]),
-    )
-
-
-def _proposed(proposal: PendingProposal) -> Cause:
-    return Cause(
-        "decision",
-        Part(proposal.summary, Link("overrides")),
-        "awaits a person's approval",
-        Remedy(
-            "a person who may merge to main",
-            "merge the branch to approve the demand, or delete the branch to refuse it",
-            shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit]),
-        ),
-        since=proposal.since,
-        requesters=proposal.requesters,
-        demands=proposal.demands,
-    )
-
-
-def _unapplied(old: OldBootstrap) -> Cause:
-    return Cause(
-        "decision",
-        Part(old.file),
-        f"is not applied to cluster '{old.cluster}' in the current version",
-        Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
-        told=f"access domains: {', '.join(old.domains)}",
-    )
-
-
-def _orphaned(left: Orphan) -> Cause:
-    return Cause(
-        "decision",
-        Part(left.object),
-        f"runs on cluster '{left.cluster}', but belongs to no release",
-        Remedy(f"an administrator of cluster {left.cluster}", "delete it", left.command),
-        told="the GitOps controller no longer knows that it created this object",
-    )
-
-
-def _pending(commit_state: CommitState, paths: list[str]) -> Iterator[Cause]:
-    more = f" and {len(paths) - _MOST_LISTED} more" if len(paths) > _MOST_LISTED else ""
-    yield Cause(
-        "waiting",
-        Part("1 generated file" if len(paths) == 1 else f"{len(paths)} generated files"),
-        f"{'waits' if len(paths) == 1 else 'wait'} for a generator to carry out a person's commit",
-        Remedy(
-            "the operator of the generator",
-            "start a generator; a running generator carries out the commit at its next fetch",
-        ),
-        told=", ".join(paths[:_MOST_LISTED]) + more,
-        since=commit_state.entry.time,
-    )
-
-
-def _waits(waiting: WaitingDemand) -> Cause:
-    return Cause(
-        "waiting",
-        Part(waiting.demand, Link("demands", {"q": exactly("demand", waiting.demand)})),
-        "waits for room on a node",
-        Remedy(
-            "the generator, as soon as a node has room; the nodes' operator can add room, or a "
-            "requester can release something"
-        ),
-        since=waiting.since,
-        requesters=waiting.requesters,
-        demands=(waiting.demand,),
-    )
+def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
+    """Yield what waits for room on a node, for a person's decision, or for a generator."""
+    for waiting in in_turn(now.commit_state.state.ledger.waiting):
+        yield Cause(
+            "waiting",
+            Part(waiting.demand, Link("demands", {"q": exactly("demand", waiting.demand)})),
+            "waits for room on a node",
+            Remedy(
+                "the generator, as soon as a node has room; the nodes' operator can add room, or a "
+                "requester can release something"
+            ),
+            since=waiting.since,
+            requesters=waiting.requesters,
+            demands=(waiting.demand,),
+        )
+    for proposal in now.proposals:
+        yield Cause(
+            "decision",
+            Part(proposal.summary, Link("overrides")),
+            "awaits a person's approval",
+            Remedy(
+                "a person who may merge to main",
+                "merge the branch to approve the demand, or delete the branch to refuse it",
+                shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit]),
+            ),
+            since=proposal.since,
+            requesters=proposal.requesters,
+            demands=proposal.demands,
+        )
+    for old in now.old_bootstraps:
+        yield Cause(
+            "decision",
+            Part(old.file),
+            f"is not applied to cluster '{old.cluster}' in the current version",
+            Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
+            told=f"access domains: {', '.join(old.domains)}",
+        )
+    for orphan in now.orphans:
+        yield Cause(
+            "decision",
+            Part(orphan.object),
+            f"runs on cluster '{orphan.cluster}', but belongs to no release",
+            Remedy(f"an administrator of cluster {orphan.cluster}", "delete it", orphan.command),
+            told="the GitOps controller no longer knows that it created this object",
+        )
+    if not_rendered:
+        count = len(not_rendered)
+        more = f" and {count - _MOST_LISTED} more" if count > _MOST_LISTED else ""
+        yield Cause(
+            "waiting",
+            Part("1 generated file" if count == 1 else f"{count} generated files"),
+            f"{'waits' if count == 1 else 'wait'} for a generator to carry out a person's commit",
+            Remedy(
+                "the operator of the generator",
+                "start a generator; a running generator carries out the commit at its next fetch",
+            ),
+            told=", ".join(not_rendered[:_MOST_LISTED]) + more,
+            since=now.commit_state.entry.time,
+        )
 
 
 def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
@@ -311,67 +276,45 @@ def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
             key = (word, health.object, health.reason, release.node.cluster)
             together.setdefault(key, []).append(name)
     for (word, object, reason, cluster), names in together.items():
-        first = now.commit_state.releases[names[0]]
-        several = len(names) > 1
+        releases = [now.commit_state.releases[name] for name in names]
+        first, several = releases[0], len(names) > 1
+        what = Part(first.description, Link("release", {"name": names[0]}))
+        if several:
+            link = Link("services", {"q": f"cluster={cluster}"})
+            what = Part(f"{len(names)} releases in {cluster}", link)
         kind: Kind = "failing" if word == "failing" else "starting"
+        fail, have, are = ("fail", "have", "are") if several else ("fails", "has", "is")
+        why = fail if kind == "failing" else f"{are} starting and not ready yet"
         if word == "waiting":
-            kind = "waiting"
+            kind, why = "waiting", f"{have} not been applied by the cluster yet"
+        if object.startswith("cluster "):
+            why = f"cannot be seen, because {object} cannot be read"
+        claims = [claim for name in names for claim in now.commit_state.claims_of_releases[name]]
+        applications: dict[str, None] = {}
+        for name, release in zip(names, releases, strict=True):
+            # a connection is needed by the applications of the demands that hold it
+            applications |= dict.fromkeys(
+                release.applications
+                if isinstance(release, ServiceRelease)
+                else _applications_with(now.commit_state, now.commit_state.claims_of_releases[name])
+            )
+        times = filter(None, (since_of(now.status(name)) for name in names))
         yield Cause(
             kind,
-            Part(
-                f"{len(names)} releases in {cluster}", Link("services", {"q": f"cluster={cluster}"})
-            )
-            if several
-            else Part(first.description, Link("release", {"name": names[0]})),
-            _why(kind, object, several),
+            what,
+            why,
             remedy_of(kind, first, now.commit_state.config, object, reason, last_change),
-            since=_since(now.status(name) for name in names),
+            since=min(times, default=None),
             told=f"{object}: {reason}" if object else reason,
             releases=tuple(names),
-            **_affected(now.commit_state, names),
+            applications=tuple(applications),
+            requesters=requesters_of(claims),
+            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
         )
-
-
-def _since(statuses: Iterable[ReleaseStatus]) -> datetime | None:
-    return min((at for status in statuses if (at := since_of(status))), default=None)
-
-
-def _why(kind: Kind, object: str, several: bool) -> str:
-    verbs = ("fail", "have", "are") if several else ("fails", "has", "is")
-    if object.startswith("cluster "):
-        return f"cannot be seen, because {object} cannot be read"
-    if kind == "failing":
-        return verbs[0]
-    if kind == "waiting":
-        return f"{verbs[1]} not been applied by the cluster yet"
-    return f"{verbs[2]} starting and not ready yet"
-
-
-def _affected(commit_state: CommitState, names: list[str]) -> dict[str, tuple[str, ...]]:
-    """Return the applications, requesters and demands that need the releases ``names``.
-
-    A connection is needed by the applications of the demands that hold it.
-    """
-    applications: dict[str, None] = {}
-    claims = [claim for name in names for claim in commit_state.claims_of_releases[name]]
-    demands = dict.fromkeys(claim.demand for claim in claims)
-    for name in names:
-        release = commit_state.releases[name]
-        if isinstance(release, ServiceRelease):
-            applications |= dict.fromkeys(release.applications)
-        else:
-            applications |= dict.fromkeys(
-                _applications_with(commit_state, commit_state.claims_of_releases[name])
-            )
-    return {
-        "applications": tuple(applications),
-        "requesters": requesters_of(claims),
-        "demands": tuple(demands),
-    }
 
 
 def _applications_with(commit_state: CommitState, claims: Iterable[Claim]) -> Iterator[str]:
     """Yield the ids of all applications of the demands to which these claims belong."""
     for demand in dict.fromkeys(claim.demand for claim in claims):
         held = commit_state.claims_of_demands.get(demand, ())
-        yield from (one.subject.id for one in held if one.is_on_application)
+        yield from (claim.subject.id for claim in held if claim.is_on_application)

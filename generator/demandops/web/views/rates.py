@@ -23,13 +23,11 @@ _BINS = 48
 
 @dataclass(frozen=True, slots=True)
 class Bar:
-    """One bar of a plot; the label says when its bin of time begins, and its value."""
-
     x: float
     y: float
     width: float
     height: float
-    label: str
+    label: str  # when its bin of time begins, and its value
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,13 +48,8 @@ class Plot:
     table: tuple[tuple[datetime, str], ...]
 
 
-@dataclass(frozen=True, slots=True)
-class Sample:
-    """A measured value, and the time at which it was measured."""
-
-    time: datetime
-    value: float
-
+# When a value was measured, and the value.
+Sample = tuple[datetime, float]
 
 _BOOKED = {"join", "put"}
 _RELEASED = {"shutdown", "release", "expire", "decommission"}
@@ -74,13 +67,14 @@ def plots(
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
     start = now - timedelta(seconds=seconds) if seconds else oldest
     span_s = max((now - start).total_seconds(), 1.0)
-    demands = [one.entry for one in commits if one.entry.first("Operation-Id")]
+    demands = [commit.entry for commit in commits if commit.entry.first("Operation-Id")]
+    # The author's time of a demand's commit is when the generator received the demand.
     waits = [
-        Sample(one.time, (one.time - one.authored).total_seconds())
-        for one in demands
-        if one.authored and one.first("Operation") in _BOOKED | _RELEASED
+        (entry.time, (entry.time - entry.authored).total_seconds())
+        for entry in demands
+        if entry.authored and entry.first("Operation") in _BOOKED | _RELEASED
     ]
-    ready = [Sample(one.time, one.lasted_s) for one in health if one.lasted_s is not None]
+    ready = [(change.time, change.lasted_s) for change in health if change.lasted_s is not None]
     make = _PlotMaker(start, span_s)
     return [
         make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
@@ -91,7 +85,7 @@ def plots(
         ),
         make.counts(
             "People's commits",
-            [one.entry.time for one in commits if not one.entry.by_generator],
+            [commit.entry.time for commit in commits if not commit.entry.by_generator],
             "commits that no generator made",
         ),
         make.medians("From received to committed", waits, "median (Git records whole seconds)"),
@@ -104,48 +98,45 @@ def plots(
 
 
 def _times(commits: Iterable[Commit], operations: set[str]) -> list[datetime]:
-    return [one.entry.time for one in commits if one.entry.first("Operation") in operations]
+    entries = (commit.entry for commit in commits)
+    return [entry.time for entry in entries if entry.first("Operation") in operations]
 
 
 class _PlotMaker:
-    """Makes plots of one span of time, which it divides into bins of equal length."""
-
     def __init__(self, start: datetime, span_s: float) -> None:
         self._start, self._bin_s = start, span_s / _BINS
         self._span = span_s
 
     def counts(self, title: str, times: Iterable[datetime], about: str) -> Plot:
-        """Return a plot of the number of events in each bin of time."""
-        bins = self._bins(Sample(at, 1.0) for at in times)
+        bins = self._bins((at, 1.0) for at in times)
         total = sum(map(len, bins))
         per_hour = total * 3600 / self._span
         summary = f"{total} in all, {per_hour:.3g} an hour"
-        values = [float(len(one)) for one in bins]
+        values = [float(len(each)) for each in bins]
         return self._plot(title, f"per {span(self._bin_s)}", about, values, summary, "")
 
     def medians(self, title: str, samples: Iterable[Sample], about: str) -> Plot:
-        """Return a plot of the median of the samples in each bin of time."""
         bins = self._bins(samples)
-        every = sorted(value for one in bins for value in one)
+        every = sorted(value for each in bins for value in each)
         summary = "no values in this span of time"
         if every:
             late = every[math.ceil(0.95 * len(every)) - 1]
             summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, {len(every)} values"
-        values = [median(one) if one else 0.0 for one in bins]
+        values = [median(each) if each else 0.0 for each in bins]
         return self._plot(title, "in seconds", about, values, summary, " s")
 
     def _bins(self, samples: Iterable[Sample]) -> list[list[float]]:
         bins: list[list[float]] = [[] for _ in range(_BINS)]
-        for one in samples:
-            place = int((one.time - self._start).total_seconds() / self._bin_s)
-            if one.time >= self._start:
-                bins[min(place, _BINS - 1)].append(one.value)
+        for time, value in samples:
+            place = int((time - self._start).total_seconds() / self._bin_s)
+            if time >= self._start:
+                bins[min(place, _BINS - 1)].append(value)
         return bins
 
     def _plot(
         self, title: str, unit: str, about: str, values: list[float], summary: str, suffix: str
     ) -> Plot:
-        top = max(*values, 1.0)
+        top = max(*values, 1.0)  # at least 1, so that bins without a value divide by no zero
         width = WIDTH / _BINS
         starts = [self._start + timedelta(seconds=self._bin_s * n) for n in range(_BINS)]
         texts = [f"{value:.3g}{suffix}" for value in values]

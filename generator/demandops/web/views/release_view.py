@@ -57,30 +57,25 @@ class Explained:
 
     @property
     def word(self) -> str:
-        """The release's health in one word, or ``stopped``."""
         return word_of(self.status) if self.release else "stopped"
 
     @property
     def tone(self) -> str:
-        """The color of :attr:`word` on the page."""
         return WORDS.get(self.word, "none")
 
     @property
     def since(self) -> datetime | None:
-        """When the release's state last changed; None if the cluster does not report it."""
         return since_of(self.status)
 
     @property
     def requesters(self) -> list[str]:
-        """The requesters of the claims that need the release."""
         return sorted({who for claim in self.claims for who in claim.requesters})
 
 
-def explained(now: Situation, reader: Reader, name: str) -> Explained:
+def explained_release(now: Situation, reader: Reader, name: str) -> Explained:
     """Return why a release runs, and the release's history.
 
-    Raises:
-        StateRepoError: if the situation's commit has no such release, and no earlier one had.
+    A StateRepoError says that the situation's commit has no such release, and no earlier one had.
     """
     commit_state = now.commit_state
     release = commit_state.releases.get(name)
@@ -96,6 +91,15 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
     last = next(iter(history.newest), None) or history.started
     if history.stopped and not release:
         last = history.stopped
+    difference: list[DiffLine] = []
+    if last:
+        after, before = reader.file_reader(last.commit)(path) or "", ""
+        with suppress(DemandOpsError):  # the first commit has no parent to compare with
+            before = reader.file_reader(f"{last.commit}~1")(path) or ""
+        lines = difflib.unified_diff(before.splitlines(), after.splitlines(), lineterm="", n=2)
+        for line in list(lines)[2:]:  # without the two lines that name the files
+            sign = line[:1].strip()
+            difference.append(DiffLine(sign, line if sign == "@" else line[1:]))
     return Explained(
         name=name,
         path=path,
@@ -108,39 +112,24 @@ def explained(now: Situation, reader: Reader, name: str) -> Explained:
         text=reader.file_reader(commit_state.commit)(path) or "",
         history=history,
         last_change=last,
-        difference=tuple(_difference(reader, last, path)) if last else (),
+        difference=tuple(difference),
         stop_with_it=tuple(_others_stopped(commit_state, release)) if release else (),
     )
 
 
 def _others_stopped(commit_state: CommitState, release: Release) -> Iterable[str]:
-    """Yield the names of the other releases that stop with ``release``.
-
-    The override that stops a service denies this service on its node. The override that stops a
-    communication client denies all connections that the client carries.
-    """
+    """Yield the names of the other releases that an override on ``release`` would stop."""
     for name, other in commit_state.releases.items():
         if name == release.name:
             continue
         if isinstance(release, ServiceRelease):
-            if isinstance(other, ServiceRelease) and _place(other) == _place(release):
+            # it denies the service on its node, whatever the service runs for
+            if isinstance(other, ServiceRelease) and (
+                (other.key.service, other.node.id) == (release.key.service, release.node.id)
+            ):
                 yield name
         elif not isinstance(other, ServiceRelease) and (
+            # it denies all connections that the client carries
             set(other.connections) <= set(release.connections)
         ):
             yield name
-
-
-def _place(release: ServiceRelease) -> tuple[str, str]:
-    return release.key.service, release.node.id
-
-
-def _difference(reader: Reader, change: LogEntry, path: str) -> Iterable[DiffLine]:
-    after = reader.file_reader(change.commit)(path) or ""
-    before = ""
-    with suppress(DemandOpsError):  # the first commit has no parent to compare with
-        before = reader.file_reader(f"{change.commit}~1")(path) or ""
-    lines = difflib.unified_diff(before.splitlines(), after.splitlines(), lineterm="", n=2)
-    for line in list(lines)[2:]:
-        sign = line[:1].strip()
-        yield DiffLine(sign, line if sign == "@" else line[1:])

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 from demandops.config.config import IMAGES_FILE, Config
-from demandops.config.registry import Image
 from demandops.plan.release import Release, ServiceRelease
 from demandops.staterepo.history.commit_log import GENERATOR_NAME, LogEntry
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
 
+# The color of each kind of cause, in the order in which the view lists the kinds.
 KINDS: dict[str, str] = {
     "unread": "bad",
     "failing": "bad",
@@ -24,10 +24,9 @@ KINDS: dict[str, str] = {
     "waiting": "busy",
     "starting": "busy",
 }
-"""The color of each kind of cause, in the order in which the view lists the kinds."""
 
+# A function that returns the newest commit that changed a file or folder, or None.
 LastChange = Callable[[str], "LogEntry | None"]
-"""A function that returns the newest commit that changed a file or folder, or None."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,18 +38,14 @@ class Remedy:
     command: str = ""
 
 
+# What kubelet and the scheduler write into a pod's status, which the reason of a release quotes.
 _IMAGE = re.compile(r"ImagePull|ErrImage|InvalidImage|manifest unknown|pull access denied", re.I)
 _ROOM = re.compile(r"not scheduled|Insufficient|didn't match|untolerated taint|unschedulable", re.I)
 _CRASH = re.compile(r"CrashLoop|exit code|OOMKilled|RunContainerError", re.I)
 
 
 def remedy_of(
-    kind: Kind,
-    release: Release,
-    config: Config,
-    object: str,
-    reason: str,
-    last_change: LastChange,
+    kind: Kind, release: Release, config: Config, object: str, reason: str, last_change: LastChange
 ) -> Remedy:
     """Return who can probably fix a release, and how.
 
@@ -87,9 +82,21 @@ def remedy_of(
             "make room on the node, or name another node in the demand",
             command,
         )
-    images = [name for name in release.images if name in config.images]
-    if images and _IMAGE.search(reason):
-        return _of_images(release, images, config, command, last_change)
+    names = [name for name in release.images if name in config.images]
+    if names and _IMAGE.search(reason):
+        images = [
+            release.image(name, config)
+            if isinstance(release, ServiceRelease)
+            else release.shaping.image(name, config.images[name])
+            for name in names
+        ]
+        files = dict.fromkeys(config.file_of(IMAGES_FILE, name) for name in names)
+        by = _changed_by(files, last_change)
+        return Remedy(
+            f"the publisher of image {', '.join(image.reference() for image in images)}",
+            f"push the image, or correct its entry in {' or '.join(files)} by pull request{by}",
+            command,
+        )
     how = "look at the log of the container" if _CRASH.search(reason) else ""
     if not isinstance(release, ServiceRelease):
         return Remedy(f"the maintainer of the {release.type.word} client", how, command)
@@ -98,27 +105,8 @@ def remedy_of(
     return Remedy(f"the maintainer of {where}{by}", how, command)
 
 
-def _of_images(
-    release: Release, names: list[str], config: Config, command: str, last_change: LastChange
-) -> Remedy:
-    images = [_image(release, name, config).reference() for name in names]
-    files = dict.fromkeys(config.file_of(IMAGES_FILE, name) for name in names)
-    by = _changed_by(files, last_change)
-    return Remedy(
-        f"the publisher of image {', '.join(images)}",
-        f"push the image, or correct its entry in {' or '.join(files)} by pull request{by}",
-        command,
-    )
-
-
 def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
     """Return a text that names the people who last changed each path; empty if no person did."""
     changes = filter(None, map(last_change, paths))
-    people = dict.fromkeys(one.author for one in changes if one.author != GENERATOR_NAME)
+    people = dict.fromkeys(change.author for change in changes if change.author != GENERATOR_NAME)
     return f" (last changed by {', '.join(people)})" if people else ""
-
-
-def _image(release: Release, name: str, config: Config) -> Image:
-    if isinstance(release, ServiceRelease):
-        return release.image(name, config)
-    return release.shaping.image(name, config.images[name])

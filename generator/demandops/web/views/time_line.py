@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
 
@@ -13,14 +13,15 @@ from demandops.web.situation import Commit, HealthChange
 from demandops.web.views.filtered_table import Filter, Row, cell
 from demandops.web.views.health_word import WORDS
 
+# The title of each lane of the time line, from top to bottom, by the lane's name.
 LANES = {
     "demands": "Demands",
     "overrides": "Overrides",
     "people": "People and generator",
     "health": "Health",
 }
-"""The title of each lane of the time line, from top to bottom, by the lane's name."""
 
+# The spans of time that a person can choose, in seconds; 0 means all known events.
 SPANS = {
     "15min": 900,
     "1h": 3600,
@@ -30,11 +31,11 @@ SPANS = {
     "30d": 30 * 86400,
     "all": 0,
 }
-"""The spans of time that a person can choose, in seconds; 0 means all known events."""
 
 WIDTH = 1000
 _BINS = 60
 _FEW = 20
+# The distances between ticks that people can read off easily, from a second to 30 days.
 _STEPS_S = (1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 86400, 7 * 86400, 30 * 86400)
 _TICKS = 8
 
@@ -43,8 +44,6 @@ _BY_DEMANDS = {"join", "shutdown", "put", "release", "renew", "expire", "decommi
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """An event of the time line: a commit, or a change of a release's health."""
-
     lane: str
     time: datetime
     word: str
@@ -55,7 +54,6 @@ class Event:
     tone: str = ""
 
     def row(self) -> Row:
-        """Return the event as a row, to which filters can be applied."""
         return Row(
             {"lane": cell(self.lane), "word": cell(self.word), "summary": cell(self.summary)},
             {"who": [self.who], "commit": [self.commit], "release": [self.release]},
@@ -81,8 +79,6 @@ class Dot:
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """A mark with a label for a time, below the time line."""
-
     x: float
     label: str
 
@@ -101,15 +97,20 @@ class Strip:
 
 
 def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
-    """Return the events of all commits and changes of health, newest first."""
-    found = [*map(of_commit, commits), *map(_of_health, health)]
-    return sorted(found, key=lambda one: one.time, reverse=True)
+    all_events = [of_commit(commit) for commit in commits]
+    for change in health:
+        reason = f": {change.reason}" if change.reason else ""
+        summary = f"was {change.before}, is {change.after}{reason}"
+        tone = WORDS[change.after]
+        all_events.append(
+            Event("health", change.time, change.after, summary, "", "", change.release, tone)
+        )
+    return sorted(all_events, key=lambda event: event.time, reverse=True)
 
 
 def of_commit(commit: Commit) -> Event:
-    """Return a commit as an event of the time line."""
     entry = commit.entry
-    word = entry.first("Operation") or "by hand"
+    word = entry.first("Operation") or "by hand"  # only generators write this trailer
     lane = "people"
     if word in _BY_DEMANDS or PROPOSAL in entry.trailers:
         lane = "demands"
@@ -119,88 +120,60 @@ def of_commit(commit: Commit) -> Event:
     return Event(lane, entry.time, word, entry.summary, who, entry.commit)
 
 
-def _of_health(change: HealthChange) -> Event:
-    reason = f": {change.reason}" if change.reason else ""
-    summary = f"was {change.before}, is {change.after}{reason}"
-    tone = WORDS[change.after]
-    return Event("health", change.time, change.after, summary, "", "", change.release, tone)
-
-
-def matching(found: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
-    """Return the events of ``lane`` (if empty, of all lanes) that match the filter ``wanted``."""
+def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
+    """Return the events of ``lane`` (if empty, of all lanes) that match the filter."""
     return [
-        one for one in found if lane in ("", one.lane) and (not wanted or wanted.matches(one.row()))
+        event
+        for event in events
+        if lane in ("", event.lane) and (not wanted or wanted.matches(event.row()))
     ]
 
 
 def strip(
-    found: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
+    events: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
 ) -> Strip:
-    """Return the picture of the time line.
+    """Return the picture of the time line that ends at ``now``, for events that are newest first.
 
-    Args:
-        found: the events, newest first.
-        now: the time at the end of the line.
-        span: a key of ``SPANS``; any other value means the shortest span that has enough
-            events: 20, or three quarters of all events, whichever is less.
-        chosen: the time and the id of the chosen commit; None if no earlier commit is chosen.
+    If ``span`` is no key of ``SPANS``, it is the shortest that has enough events. ``chosen`` is the
+    time and the id of the chosen commit; None if no earlier commit is chosen.
     """
     if span not in SPANS:
-        span = _span_with_some(found, now)
-    oldest = found[-1].time if found else now - timedelta(hours=1)
+        # enough events are 20, or three quarters of all events, whichever is less
+        last = min(_FEW, 3 * len(events) // 4) - 1
+        oldest_shown = events[last].time if len(events) > 1 else now
+        spans = (name for name, seconds in SPANS.items() if seconds)
+        span = next(
+            (name for name in spans if oldest_shown >= now - timedelta(seconds=SPANS[name])), "all"
+        )
+    oldest = events[-1].time if events else now - timedelta(hours=1)
     start = now - timedelta(seconds=SPANS[span]) if SPANS[span] else oldest
     length = max((now - start).total_seconds(), 1.0)
 
-    def place(at: datetime) -> float:
+    def x_of(at: datetime) -> float:
         return WIDTH * (at - start).total_seconds() / length
 
     bins: dict[tuple[str, int], list[Event]] = {}
-    for one in found:
-        if one.time >= start:
-            x = min(place(one.time), WIDTH - 1e-6)
-            bins.setdefault((one.lane, int(x * _BINS / WIDTH)), []).append(one)
-    dots = tuple(
-        _dot(lane, (place + 0.5) * WIDTH / _BINS, group, chosen[1] if chosen else "")
-        for (lane, place), group in sorted(bins.items())
-    )
-    mark = place(chosen[0]) if chosen else None
-    shown = mark if mark is not None and 0 <= mark <= WIDTH else None
-    return Strip(span, dots, tuple(_ticks(start, now, place)), shown)
-
-
-def _span_with_some(found: Sequence[Event], now: datetime) -> str:
-    few = found[min(_FEW, 3 * len(found) // 4) - 1].time if len(found) > 1 else now
-    for name, seconds in SPANS.items():
-        if seconds and few >= now - timedelta(seconds=seconds):
-            return name
-    return "all"
-
-
-def _dot(lane: str, x: float, group: Sequence[Event], chosen: str) -> Dot:
-    newest, count = group[0], len(group)
-    more = f", and {count - 1} more" if count > 1 else ""
-    what = " ".join(filter(None, (newest.release, newest.summary)))
-    label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
-    tone = next((one.tone for one in group if one.tone == "bad"), newest.tone)
-    radius = min(4.0 + math.log2(count), 8.0)
-    return Dot(
-        lane,
-        x,
-        radius,
-        count,
-        label,
-        newest.commit,
-        tone,
-        bool(chosen) and any(one.commit == chosen for one in group),
-    )
-
-
-def _ticks(start: datetime, end: datetime, place: Callable[[datetime], float]) -> Iterable[Tick]:
-    length = (end - start).total_seconds()
-    step = next((one for one in _STEPS_S if length / one <= _TICKS), length / _TICKS)
+    for event in events:
+        if event.time >= start:
+            x = min(x_of(event.time), WIDTH - 1e-6)  # an event of this moment is in the last bin
+            bins.setdefault((event.lane, int(x * _BINS / WIDTH)), []).append(event)
+    dots = []
+    for (lane, place), group in sorted(bins.items()):
+        newest, count = group[0], len(group)
+        more = f", and {count - 1} more" if count > 1 else ""
+        what = " ".join(filter(None, (newest.release, newest.summary)))
+        label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
+        tone = "bad" if any(event.tone == "bad" for event in group) else newest.tone
+        is_chosen = chosen is not None and any(event.commit == chosen[1] for event in group)
+        x, radius = (place + 0.5) * WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
+        dots.append(Dot(lane, x, radius, count, label, newest.commit, tone, is_chosen))
+    step = next((each for each in _STEPS_S if length / each <= _TICKS), length / _TICKS)
     form = "%H:%M:%S" if step < 60 else "%H:%M" if step < 86400 else "%m-%d"
-    at = math.ceil(start.timestamp() / step) * step
-    while at <= end.timestamp():
+    ticks, at = list[Tick](), math.ceil(start.timestamp() / step) * step
+    while at <= now.timestamp():
         moment = datetime.fromtimestamp(at, tz=timezone.utc)
-        yield Tick(place(moment), moment.strftime(form))
+        ticks.append(Tick(x_of(moment), moment.strftime(form)))
         at += step
+    mark = x_of(chosen[0]) if chosen else None
+    shown = mark if mark is not None and 0 <= mark <= WIDTH else None
+    return Strip(span, tuple(dots), tuple(ticks), shown)
