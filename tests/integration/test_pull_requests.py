@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.cli.main import run
-from demandops.cli.repo import pull_request_comment
+from demandops.cli.repo.pull_request_comment import LONGEST, MARK, report
 from demandops.staterepo.pull_request import merge_check as checking
 from demandops.staterepo.pull_request.merge_check import CheckResult
 from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
@@ -543,7 +543,7 @@ def test_what_people_wrote_cannot_act_in_a_comment(branch: Path, check: Run) -> 
 
 def test_why_a_chart_is_not_rendered_cannot_act_in_a_comment() -> None:
     charts = RenderedCharts(not_rendered={"cam": "its dependency @everyone is not in charts/"})
-    comment = pull_request_comment.report(CheckResult((), charts=charts))
+    comment = report(CheckResult((), charts=charts))
     told = "\nchart cam not rendered: `its dependency @everyone is not in charts/`\n"
     assert told in comment
 
@@ -574,8 +574,8 @@ def test_a_report_is_never_longer_than_a_comment_may_be(branch: Path, check: Run
     edit(branch / "registry" / "images.yaml", *NEWER_PERCEPTION)
     code, out, _ = check("--output", "markdown")
     assert code == 0
-    assert len(out) <= pull_request_comment.LONGEST == 60_000
-    assert out.startswith(f"{pull_request_comment.MARK}\n## DemandOps: valid")
+    assert len(out) <= LONGEST == 60_000
+    assert out.startswith(f"{MARK}\n## DemandOps: valid")
     assert "Releases: 3 to change." in out
     assert out.endswith(
         "\n3 parts of this report are left out because a comment has a limited length; "
