@@ -16,8 +16,8 @@ from types import FrameType
 
 import pytest
 import yaml
-from demandops.service import Generator
-from demandops.staterepo.pull_request.helm import HELM_BIN
+from demandops.repo.pull_request.helm import HELM_BIN
+from demandops.serve.generator import Generator
 from hypothesis import HealthCheck, settings
 
 from tests.kit import repo, sync

@@ -5,12 +5,16 @@ An adapter turns goals into plain data, and stages and outcomes into messages.
 
 from __future__ import annotations
 
+from collections import OrderedDict
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future
 from typing import Any
 
+import rclpy
+from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
-from demandops.cluster.health.release_health import Level
-from demandops.errors import (
+from demandops.base.errors import (
     DemandOpsError,
     InvalidInput,
     NotReached,
@@ -18,11 +22,19 @@ from demandops.errors import (
     TurnedDown,
     Withdrawn,
 )
-from demandops.quoting import one_line
-from demandops.service import Receipt
+from demandops.base.quoting import one_line
+from demandops.base.runtime import REAL
+from demandops.cluster.health.release_health import Level
+from demandops.serve.queue import Receipt
 from demandops_interfaces.action import Demand
+from rclpy.action import ActionClient, ActionServer
+from rclpy.action.client import ClientGoalHandle
+from rclpy.node import Node
+from rclpy.qos import QoSProfile
+from unique_identifier_msgs.msg import UUID
 
 from demandops_ros.messages import ANSWER_LEVELS, demand_goal_to_data, message_to_data
+from demandops_ros.ros_process import ExecutorThread
 
 # The first kind that fits counts.
 _CODES: tuple[tuple[type[BaseException], str], ...] = (
@@ -113,3 +125,240 @@ def _code(outcome: Receipt | BaseException) -> str:
     if isinstance(outcome, NotReached):
         return f"not-{outcome.level}"
     return next(code for kind, code in _CODES if isinstance(outcome, kind))
+
+
+# ---- action endpoints ----
+#
+# Parts for ROS actions: a client that sends goals, a server, and a search for other servers.
+
+# The length of the queues for goals, results, cancels and feedback. ROS's default of 10 is too
+# small for a burst, because a client's queue also gets the answers to other clients.
+DEEP_QOS = QoSProfile(depth=2000)
+
+# How long to wait for the node's response to a goal before the goal is sent again. A node normally
+# responds within milliseconds.
+_UNHEARD_S = 5.0
+
+_ASK_AGAIN_S = 0.2
+
+# How long ROS keeps a goal that has ended.
+_GOAL_KEPT_S = 10
+# How long LastingResults keeps a result that ROS has forgotten.
+_RESULT_S = 900
+# How many results it keeps; if there are more, it forgets the oldest ones earlier.
+_MOST_RESULTS = 2_000
+
+
+class DemandError(Exception):
+    """Raised when a demand fails or gets no answer in time.
+
+    ``code`` tells programs the reason, such as ``unknown-node``. After ``timeout``, nobody knows
+    whether the demand is booked.
+    """
+
+    def __init__(self, code: str, message: str) -> None:
+        super().__init__(message)
+        self.code = code
+
+
+def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rclpy
+    """Send the node a harmless request, and return the future of the node's answer.
+
+    The answer shows that the node has discovered the client.
+    """
+    # It asks to cancel a goal that does not exist.
+    nobodys = UUID(uuid=list(bytes.fromhex(REAL.fresh_id().replace("-", ""))))
+    return ClientGoalHandle(client, nobodys, None).cancel_goal_async()
+
+
+class GoalSender:
+    """Sends goals of one action and waits for the answers; many threads may send at once.
+
+    A call of :meth:`send` may take ``timeout_s``.
+    """
+
+    def __init__(
+        self,
+        action: Any,  # noqa: ANN401 - a generated class
+        action_name: str,
+        node_name: str,
+        timeout_s: float,
+        domain_id: int | None = None,
+    ) -> None:
+        self.timeout_s = timeout_s
+        self._action_name = action_name
+        self._context = rclpy.Context()
+        rclpy.init(context=self._context, domain_id=domain_id)
+        # a launch file renames all nodes of a process, unless a node has a rule of its own
+        own_name = ["--ros-args", "-r", f"__node:={node_name}"]
+        self._node = rclpy.create_node(node_name, context=self._context, cli_args=own_name)
+        self._client = ActionClient(
+            self._node,
+            action,
+            action_name,
+            goal_service_qos_profile=DEEP_QOS,
+            result_service_qos_profile=DEEP_QOS,
+            cancel_service_qos_profile=DEEP_QOS,
+            feedback_sub_qos_profile=DEEP_QOS,
+        )
+        self._thread = ExecutorThread(self._node, "client")
+        self._is_discovered = False
+
+    def close(self) -> None:
+        self._thread.close()
+        self._node.destroy_node()
+        self._context.try_shutdown()
+
+    def send(
+        self,
+        goal: Any,  # noqa: ANN401 - a generated class
+        on_feedback: Callable[[Any], None] = lambda feedback: None,
+    ) -> tuple[bool, Any, bool]:
+        """Send a goal and wait for its result.
+
+        Return whether the goal succeeded, its result, and whether an earlier attempt to send it got
+        no response. The node may have carried out that attempt too.
+
+        Raises:
+            DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
+                answer came in time.
+            ValueError: if ROS cannot carry a text of the goal, because it is not Unicode.
+        """
+        deadline = REAL.monotonic() + self.timeout_s
+        if not self._client.wait_for_server(timeout_sec=self.timeout_s):
+            raise DemandError(
+                "no-server",
+                f"no node in this ROS domain serves {self._action_name}; start one with demandops "
+                "serve, or correct the action's name or ROS_DOMAIN_ID",
+            )
+        # A client discovers the node before the node discovers the client. Until then, the node's
+        # answers to the client are lost.
+        while not self._is_discovered and REAL.monotonic() < deadline:
+            try:
+                self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)
+            except DemandError:
+                continue
+            self._is_discovered = True
+        # A response is lost also if a new node replaced the old one and has not yet discovered this
+        # client. Sending the goal again is harmless: a demand that is put twice counts once, and a
+        # second release finds nothing to release.
+        lost = False
+        while True:
+            try:
+                sent = self._start_sending(goal, on_feedback, deadline)
+                handle = self._await(sent, min(deadline, REAL.monotonic() + _UNHEARD_S))
+                break
+            except DemandError:
+                if REAL.monotonic() >= deadline:
+                    raise
+                lost = True
+        if not handle.accepted:
+            message = "the node did not accept the demand (its log says why); send it again later"
+            raise DemandError("rejected", message)
+        answer = self._await(handle.get_result_async(), deadline)
+        return answer.status == GoalStatus.STATUS_SUCCEEDED, answer.result, lost
+
+    def _start_sending(
+        self,
+        goal: Any,  # noqa: ANN401
+        on_feedback: Callable[[Any], None],
+        deadline: float,
+    ) -> Any:  # noqa: ANN401 - a future of rclpy
+        """Send a goal in the thread that also receives; return the future of the response."""
+        # rclpy 9.1 registers two futures for a goal, one after the other, and returns the second.
+        # If another thread sent the goal, a response could arrive between the two registrations. It
+        # would then resolve only the first future, for which nobody waits.
+        sent: Future[Any] = Future()
+        done = REAL.event()
+
+        def send() -> None:
+            try:
+                sent.set_result(
+                    self._client.send_goal_async(
+                        goal, feedback_callback=lambda message: on_feedback(message.feedback)
+                    )
+                )
+            except Exception as error:  # the caller must get it, not the executor
+                sent.set_exception(error)
+            done.set()
+
+        self._thread.call(send)
+        if not done.wait(max(0.0, deadline - REAL.monotonic())):
+            raise self._no_answer()
+        return sent.result()
+
+    def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
+        done = REAL.event()
+        future.add_done_callback(lambda _: done.set())
+        if not done.wait(max(0.0, deadline - REAL.monotonic())):
+            raise self._no_answer()
+        return future.result()
+
+    def _no_answer(self) -> DemandError:
+        text = f"no answer on {self._action_name} within {self.timeout_s:g} s"
+        return DemandError("timeout", text)
+
+
+class LastingResults(ActionServer):  # type: ignore[misc]
+    """An action server that keeps results longer than goals, for clients that ask late.
+
+    With a version of rclpy that does not call the overridden methods, results are kept for ten
+    seconds.
+    """
+
+    # Whenever a goal changes, ROS publishes the status of all goals that it keeps. So each kept
+    # goal slows down every other goal, in the server and in every client. Therefore ROS keeps a
+    # goal only for its default of ten seconds, and this class keeps the goal's result for longer.
+
+    def __init__(self, *args: Any, **options: Any) -> None:  # noqa: ANN401
+        self._lasting: OrderedDict[bytes, tuple[float, Any]] = OrderedDict()
+        super().__init__(*args, result_timeout=_GOAL_KEPT_S, **options)
+
+    async def _execute_expire_goals(self, expired_goals: Any) -> None:  # noqa: ANN401
+        now = REAL.monotonic()
+        for goal in expired_goals:
+            id = bytes(goal.goal_id.uuid)
+            self._lasting[id] = (now, self._result_futures[id])
+        while self._lasting:
+            oldest, _ = next(iter(self._lasting.values()))
+            if now - oldest <= _RESULT_S and len(self._lasting) <= _MOST_RESULTS:
+                break
+            self._lasting.popitem(last=False)
+        await super()._execute_expire_goals(expired_goals)
+
+    async def _execute_get_result_request(self, request: Any) -> None:  # noqa: ANN401
+        header, asked = request
+        id = bytes(asked.goal_id.uuid)
+        if id in self._lasting and id not in self._goal_handles:
+            self._send_result_response(header, self._lasting[id][1])
+        else:
+            await super()._execute_get_result_request(request)
+
+
+class OtherServers:
+    """Finds other nodes that serve the same actions as ``node``."""
+
+    def __init__(self, node: Node, actions: Iterable[str]) -> None:
+        self._node = node
+        self._own = f"{node.get_namespace().rstrip('/')}/{node.get_name()}"
+        self._found = {node.resolve_service_name(action): list[str]() for action in actions}
+
+    def find(self) -> dict[str, list[str]]:
+        """Return, for each action, the names of the other nodes that serve it; log changes.
+
+        A node that comes and goes between two calls is not seen.
+        """
+        for action, others in self._found.items():
+            publishers = self._node.get_publishers_info_by_topic(f"{action}/_action/status")
+            now = sorted(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)
+            if self._own in now:
+                now.remove(self._own)  # one entry only: another node may have this name
+            if now and now != others:
+                self._node.get_logger().warning(
+                    f"{', '.join(now)} serves {action} too, so a client may get its answer "
+                    "from another node, or no answer; give each node an action name of its own"
+                )
+            elif others and not now:
+                self._node.get_logger().info(f"no other node serves {action} any more")
+            self._found[action] = now
+        return self._found

@@ -20,11 +20,11 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
-from demandops.runtime import REAL, Thread
-from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
+from demandops.base.runtime import REAL, Thread
+from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
 
-from demandops_ros.action_endpoints import DemandError, GoalSender
+from demandops_ros.actions import DemandError, GoalSender
 from demandops_ros.messages import demand_goal_from_data
 
 __all__ = ["Answer", "DemandClient", "DemandError", "HeldDemand", "StageListener"]

@@ -6,14 +6,14 @@ import signal
 from typing import Any
 
 import click
-from demandops import strict_yaml
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput, fault
+from demandops.base.runtime import REAL
+from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
+from demandops.base.strict_yaml import read_input
 from demandops.cli.json_output import output_option, print_json
 from demandops.cli.output import console, errors
-from demandops.config.durations import duration_text
-from demandops.errors import InvalidInput, fault
-from demandops.input_file import read_input
-from demandops.runtime import REAL
-from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
+from demandops.model.config.base_model import duration_text
 
 from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
 

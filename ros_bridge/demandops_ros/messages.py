@@ -8,11 +8,11 @@ from importlib import import_module
 from typing import Any
 
 from builtin_interfaces.msg import Duration
+from demandops.base.errors import suggestion
+from demandops.base.settings import API_VERSION
 from demandops.cluster.health.release_health import Level
-from demandops.config.durations import seconds_of
-from demandops.connections.route import RouteOptions
-from demandops.errors import suggestion
-from demandops.settings import API_VERSION
+from demandops.connections.connection import RouteOptions
+from demandops.model.config.base_model import seconds_of
 from demandops_interfaces import msg as messages
 from demandops_interfaces.action import Demand as DemandMessage
 
@@ -57,7 +57,7 @@ _ROUTE |= {name: name for name in RouteOptions.model_fields}
 
 
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return a ``Demand.Goal`` as data for :func:`demandops.demand.demand_goal.parse`."""
+    """Return a ``Demand.Goal`` as data for :func:`.demand_goal.parse`."""
     data = {
         "apiVersion": API_VERSION,
         "kind": "Demand",

@@ -15,12 +15,13 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
+from demandops.base.errors import NotReached, Unsound, Withdrawn
+from demandops.base.quoting import one_line, quoted
+from demandops.base.runtime import REAL
 from demandops.cluster.health.release_health import Health, Level
 from demandops.cluster.rollout_watcher import RolloutWatcher
-from demandops.errors import NotReached, Unsound, Withdrawn
-from demandops.quoting import one_line, quoted
-from demandops.runtime import REAL
-from demandops.service import Generator, Receipt, Ticket
+from demandops.serve.generator import Generator
+from demandops.serve.queue import Receipt, Ticket
 from demandops_interfaces.srv import GetBookkeeping
 from rclpy.action import CancelResponse, GoalResponse
 from rclpy.action.server import ServerGoalHandle
@@ -28,10 +29,14 @@ from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallb
 from rclpy.node import Node
 from rclpy.task import Future
 
-from demandops_ros.action_endpoints import DEEP_QOS, LastingResults, OtherServers
-from demandops_ros.actions import DemandAdapter, DeploymentRequestAdapter
-from demandops_ros.bookkeeping_topic import BookkeepingTopic, fill_response
-from demandops_ros.diagnostics import Diagnostics
+from demandops_ros.actions import (
+    DEEP_QOS,
+    DemandAdapter,
+    DeploymentRequestAdapter,
+    LastingResults,
+    OtherServers,
+)
+from demandops_ros.publications import BookkeepingTopic, Diagnostics, fill_response
 
 # How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost.
 _DEFAULT_DEPTH = 10

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import click
 import rclpy
-from demandops.quoting import OneLineFormatter, one_line
-from demandops.runtime import REAL
+from demandops.base.quoting import OneLineFormatter, one_line
+from demandops.base.runtime import REAL
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.logging import LoggingSeverity, set_logger_level

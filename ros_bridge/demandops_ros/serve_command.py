@@ -11,24 +11,24 @@ from types import FrameType
 from typing import Any
 
 import click
+from demandops.base.runtime import REAL
+from demandops.base.strict_yaml import read_secret
 from demandops.cli.main import ExitCode
 from demandops.cli.output import errors, progress
 from demandops.cli.target import signing_option
 from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.leadership import Leadership
 from demandops.cluster.rollout_watcher import RolloutWatcher
-from demandops.input_file import read_secret
-from demandops.runtime import REAL
-from demandops.service import Generator
-from demandops.service.push_webhook import PushWebhook
-from demandops.service.timing.polling import DEFAULT_INTERVAL, parse_interval
-from demandops.staterepo.reader import Reader
+from demandops.repo.reader import Reader
+from demandops.serve.generator import Generator
+from demandops.serve.http_server import PushWebhook
+from demandops.serve.timing.timers import DEFAULT_INTERVAL, parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from rclpy.logging import get_logger
 from rclpy.signals import SignalHandlerOptions
 
-from demandops_ros import node_parameters, reference_parameters, ros_process
+from demandops_ros import node_parameters, ros_process
 from demandops_ros.node import DemandNode
 
 _POLL_S = 0.02
@@ -113,10 +113,10 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
       demandops serve --state-repo https://git.example/fleet.git --clusters c.yaml
     """
     with ros_process.started(ctx.args, SignalHandlerOptions.NO) as ros_args, ExitStack() as parts:
-        of_reference = reference_parameters.read(ros_args)
-        settings = node_parameters.read(
+        of_reference = node_parameters.read_reference_parameters(ros_args)
+        settings = node_parameters.read_node_parameters(
             {
-                "action_name": of_reference.get(reference_parameters.ACTION_NAME),
+                "action_name": of_reference.get(node_parameters.ACTION_NAME),
                 "state_repo": state_repo,
                 "fetch_interval": fetch_interval,
             }
@@ -136,7 +136,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
             )
         parts.callback(generator.close)
         signals = parts.enter_context(_Signals())
-        for warning in reference_parameters.warnings(of_reference, generator.snapshot.state.config):
+        for warning in node_parameters.warnings(of_reference, generator.snapshot.state.config):
             errors.print(f"warning: {warning}")
         trigger = reconcile_trigger.ReconcileTrigger(clusters, generator.changes_since)
         parts.callback(trigger.close)

@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any, Literal
 
 import pytest
-from demandops.config.appdef import Scaling
-from demandops.decision import rendered_files
-from demandops.demand.application import InputTopic
-from demandops.errors import InvalidInput
-from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import affected_keys
-from demandops.plan.replicas import replicas_of
-from demandops.plan.views.override_report import override_report, warnings
-from demandops.render.trial_render import render_trial_demands
+from demandops.base.errors import InvalidInput
+from demandops.decide.changes.trial_render import render_trial_demands
+from demandops.decide.planning.release_keys import affected_keys
+from demandops.decide.state import rendered_files
+from demandops.model.config.appdef import Scaling
+from demandops.model.demand.application import InputTopic
+from demandops.model.release import ServiceKey, replicas_of
+from demandops.views.override_report import override_report, warnings
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -16,8 +16,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import pygit2
-from demandops.service import Generator
-from demandops.staterepo import reader
+from demandops.repo import reader
+from demandops.serve.generator import Generator
 
 from tests.benchmarks import fleet
 

@@ -21,10 +21,10 @@ from tempfile import TemporaryDirectory
 
 import git
 import pygit2
-from demandops.service import Generator
-from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.new_objects import NewObjects
-from demandops.staterepo.history import commit_message
+from demandops.repo.git import tree as trees
+from demandops.repo.git.objects import NewObjects
+from demandops.repo.history import commit_message
+from demandops.serve.generator import Generator
 from rich.console import Console
 from rich.progress import Progress
 

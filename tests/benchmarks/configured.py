@@ -25,7 +25,7 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
-from demandops.service import Generator
+from demandops.serve.generator import Generator
 from rich.console import Console
 
 from tests.benchmarks import fleet

@@ -17,9 +17,9 @@ import time
 from pathlib import Path
 from typing import Any
 
-from demandops.detection.events.detection_state import Observation
-from demandops.detection.events.event_engine import EventEngine
-from demandops.detection.rules import rule_file
+from demandops.detect import rule_file
+from demandops.detect.detection_state import Observation
+from demandops.detect.event_engine import EventEngine
 
 from tests.kit.detection import POSE, rule, text_of
 

@@ -14,13 +14,14 @@ from pathlib import Path
 from typing import Any
 
 import pygit2
-from demandops import strict_yaml
-from demandops.config.load import load
-from demandops.decision import State, admit, rendered_files
-from demandops.ledger import claim_file
-from demandops.ledger.apply import apply
-from demandops.ledger.ledger import Ledger
-from demandops.staterepo.history import commit_message
+from demandops.base import strict_yaml
+from demandops.decide.admission.admitted_request import admit
+from demandops.decide.booking.apply import apply
+from demandops.decide.state import State, rendered_files
+from demandops.model.config.load import load
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import Ledger
+from demandops.repo.history import commit_message
 from rich.table import Table
 
 from tests.kit import goals

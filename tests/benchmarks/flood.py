@@ -16,8 +16,8 @@ from tempfile import TemporaryDirectory
 from typing import Any
 
 import yaml
-from demandops.errors import DemandOpsError
-from demandops.service import Generator
+from demandops.base.errors import DemandOpsError
+from demandops.serve.generator import Generator
 from rich.console import Console
 
 from tests.benchmarks import fleet

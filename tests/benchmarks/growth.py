@@ -19,7 +19,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from demandops.service import Generator
+from demandops.serve.generator import Generator
 from rich.console import Console
 
 from tests.benchmarks import fleet

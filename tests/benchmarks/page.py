@@ -17,8 +17,8 @@ import uuid
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from demandops.service import Generator
-from demandops.staterepo.reader import Reader
+from demandops.repo.reader import Reader
+from demandops.serve.generator import Generator
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from playwright.sync_api import Browser, expect

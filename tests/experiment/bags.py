@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-from demandops.detection.rules import rule_file
-from demandops_ros.detector.recorded_bag import RecordedBag
+from demandops.detect import rule_file
+from demandops_ros.detector.replay import RecordedBag
 
 from .routes import VEHICLES, Track, tracks
 from .rules import RULES, Near

@@ -9,8 +9,8 @@ from typing import Any
 
 import rclpy
 from application_manager_interfaces.action import DeploymentRequest
-from demandops.settings import DEFAULT_ACTION_NAME
-from demandops_ros.action_endpoints import DEEP_QOS
+from demandops.base.settings import DEFAULT_ACTION_NAME
+from demandops_ros.actions import DEEP_QOS
 from demandops_ros.ros_process import ExecutorThread
 from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.node import Node

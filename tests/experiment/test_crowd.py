@@ -6,8 +6,8 @@ import math
 from dataclasses import replace
 
 import pytest
-from demandops.detection.rules import rule_file
-from demandops.detection.rules.rule_file import RuleFile
+from demandops.detect import rule_file
+from demandops.detect.rule_file import RuleFile
 
 from tests.experiment import crowd, report, routes
 from tests.experiment.outcome import Formed, Outcome, Settings

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops.detection.rules import rule_file
+from demandops.detect import rule_file
 from rosbags.rosbag2 import StoragePlugin
 
 from examples.experiment import paper

@@ -11,7 +11,7 @@ from hashlib import sha256
 from pathlib import Path
 
 import demandops
-from demandops.settings import data_folder
+from demandops.base.settings import data_folder
 
 from tests.faults.injection import Result
 

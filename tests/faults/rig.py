@@ -28,7 +28,7 @@ from pathlib import Path
 from uuid import NAMESPACE_OID, uuid5
 
 import yaml
-from demandops.runtime import Runtime
+from demandops.base.runtime import Runtime
 
 from tests.kit.goals import Goal, numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git

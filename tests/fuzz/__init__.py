@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from demandops.errors import InvalidInput, StateRepoError
+from demandops.base.errors import InvalidInput, StateRepoError
 from hypothesis import strategies as st
 
 

@@ -16,33 +16,27 @@ import click
 import pygit2
 import yaml
 from application_manager_interfaces.action import DeploymentRequest
-from demandops import strict_yaml
-from demandops.cli import contexts
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput
+from demandops.cli import target
 from demandops.cli.actions.override import ends_at
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import Target as ReleaseTarget
-from demandops.config import override, policy
-from demandops.config.load import load
-from demandops.decision import try_configuration
-from demandops.detection.detector import Detector, Want
-from demandops.detection.events.detection_state import Observation
-from demandops.detection.message_reader import MessageReader, Unreadable
-from demandops.detection.rules import rule_file
-from demandops.detection.rules.rule_file import RuleFile
-from demandops.errors import InvalidInput
-from demandops.forge import ForgeError, Gitea, GitHub
-from demandops.ledger import (
-    claim_file,
-    ended_override_file,
-    kept_replicas,
-    recent_shutdowns,
-    waiting,
-)
-from demandops.service.push_webhook import PushWebhook
-from demandops.service.ticket import ticket_from_journal
-from demandops.staterepo.git import open_repository as addresses
-from demandops.staterepo.history import commit_log, revisions
-from demandops.staterepo.write import journal
+from demandops.decide.state import try_configuration
+from demandops.detect import rule_file
+from demandops.detect.detection_state import Observation
+from demandops.detect.detector import Detector, Want
+from demandops.detect.message_reader import MessageReader, Unreadable
+from demandops.detect.rule_file import RuleFile
+from demandops.model.config import override, policy
+from demandops.model.config.load import load
+from demandops.model.ledger import claim_file, records
+from demandops.repo.forge import ForgeError, Gitea, GitHub
+from demandops.repo.git import open_repository as addresses
+from demandops.repo.history import commit_log, revisions
+from demandops.repo.write import journal
+from demandops.serve.http_server import PushWebhook
+from demandops.serve.queue import ticket_from_journal
 from demandops_interfaces.action import Demand
 from demandops_ros import messages
 from hypothesis import strategies as st
@@ -222,24 +216,24 @@ def claim(data: bytes) -> None:
 
 
 def marker(data: bytes) -> None:
-    ended_override_file.read({ended_override_file.path_of("x"): _text(data)})
+    records.read_ended_override({records.ended_override_path("x"): _text(data)})
 
 
 def shutdown(data: bytes) -> None:
-    recent_shutdowns.read_all({recent_shutdowns.path_of("0f" * 10): _text(data)})
+    records.read_all_shutdowns({records.shutdowns_path("0f" * 10): _text(data)})
 
 
 def replicas(data: bytes) -> None:
-    path = kept_replicas.path_of(("replicas", "object-fusion", "edge", "", "", "", "", ""))
-    record = kept_replicas.read(_text(data), path)
-    assert record is None or kept_replicas.read(kept_replicas.text_of(*record), path) == record
+    path = records.replicas_path(("replicas", "object-fusion", "edge", "", "", "", "", ""))
+    record = records.read_replicas(_text(data), path)
+    assert record is None or records.read_replicas(records.replicas_text(*record), path) == record
 
 
 def waiting_demand(data: bytes) -> None:
-    path = waiting.path_of("x")
-    record = waiting.read(_text(data), path)
+    path = records.waiting_path("x")
+    record = records.read_waiting(_text(data), path)
     if record is not None:
-        assert waiting.read(waiting.text_of(record), path) == record
+        assert records.read_waiting(records.waiting_text(record), path) == record
         goal_as_data(dict(record.goal))
 
 
@@ -248,15 +242,15 @@ def waiting_demand(data: bytes) -> None:
 
 def contexts_file(data: bytes) -> None:
     os.environ["XDG_CONFIG_HOME"] = str(_folder())
-    contexts.path().parent.mkdir(exist_ok=True)
-    contexts.path().write_bytes(data)
+    target.path().parent.mkdir(exist_ok=True)
+    target.path().write_bytes(data)
     try:
-        content = contexts.read()
+        content = target.read()
     except InvalidInput as error:
         _told(error)
         return
-    contexts.write(content)
-    assert contexts.read() == content
+    target.write(content)
+    assert target.read() == content
 
 
 def detector_rules(data: bytes) -> None:

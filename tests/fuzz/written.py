@@ -16,22 +16,21 @@ from typing import Any
 import pygit2
 import pyjson5
 import yaml
-from demandops import naming, strict_yaml
+from demandops.base import naming, strict_yaml
+from demandops.base.errors import InvalidInput
+from demandops.base.naming import Subject, SubjectKind, topic_problem
 from demandops.cli.actions.override import new_override
 from demandops.cli.actions.person_change import EditOptions
-from demandops.config.base_model import parse_file
-from demandops.config.load import load
-from demandops.config.override import Override, OverrideFile
-from demandops.decision import try_configuration
-from demandops.demand.claim import ClaimKey
-from demandops.demand.demand_goal import _value_problem
-from demandops.errors import InvalidInput
-from demandops.identifiers import topic_problem
-from demandops.ledger import claim_file
-from demandops.service.approvals import proposal
-from demandops.staterepo.history import commit_log, commit_message
-from demandops.staterepo.write.proposal_branch import branch_name
-from demandops.subject import Subject, SubjectKind
+from demandops.decide.state import try_configuration
+from demandops.model.config.base_model import parse_file
+from demandops.model.config.load import load
+from demandops.model.config.override import Override, OverrideFile
+from demandops.model.demand.claim import ClaimKey
+from demandops.model.demand.demand_goal import _value_problem
+from demandops.model.ledger import claim_file
+from demandops.repo.history import commit_log, commit_message
+from demandops.repo.write.proposal_branch import branch_name
+from demandops.serve.approvals import proposal
 from hypothesis import strategies as st
 
 from tests.fuzz import Target

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from demandops.decision import rendered_files
-from demandops.ledger.recent_shutdowns import SHUTDOWNS_ROOT
+from demandops.decide.state import rendered_files
+from demandops.model.ledger.records import SHUTDOWNS_ROOT
 
 from tests.kit.golden import CASES, START, play, read, rendered, to_store, whole
 

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 from demandops.cli.main import run as run_command
-from demandops.config.override import format_time
-from demandops.ledger.claim_file import read
+from demandops.model.config.override import format_time
+from demandops.model.ledger.claim_file import read
 
 from tests.kit.goals import APP, EXPERIMENT, application, connection, goal, perception, put
 from tests.kit.golden import GOLDEN, requests_of

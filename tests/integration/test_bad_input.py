@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.cli.contexts import ContextsFile
 from demandops.cli.repo.schema import SCHEMAS
+from demandops.cli.target import ContextsFile
 from demandops.cluster.clusters_file import AccessFile
-from demandops.detection.rules.rule_file import RuleFile
+from demandops.detect.rule_file import RuleFile
 
 from tests.kit.goals import perception
 from tests.kit.limits import PATIENCE_S

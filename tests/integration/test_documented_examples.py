@@ -13,18 +13,19 @@ import jsonschema_rs
 import pytest
 import yaml
 from click.testing import CliRunner
+from demandops.base.errors import Refused
 from demandops.cli.main import cli
-from demandops.config.load import load
-from demandops.decision import State, decide, rendered_files
-from demandops.demand.demand_request import Expire
-from demandops.detection.detector import Detector
-from demandops.detection.events.detection_state import Observation
-from demandops.detection.rules import rule_file
-from demandops.errors import Refused
-from demandops.plan.views.bookkeeping import as_data, bookkeeping
-from demandops.render.output_check import check_files
-from demandops.staterepo import skeleton
-from demandops.staterepo.history import commit_message
+from demandops.decide.decision import decide
+from demandops.decide.state import State, rendered_files
+from demandops.detect import rule_file
+from demandops.detect.detection_state import Observation
+from demandops.detect.detector import Detector
+from demandops.model.config.load import load
+from demandops.model.demand.demand_request import Expire
+from demandops.render.release_file import check_files
+from demandops.repo import new_repo
+from demandops.repo.history import commit_message
+from demandops.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit.config import brokers, configuration, edited, state_of
 from tests.kit.goals import put
@@ -193,7 +194,7 @@ def test_the_application_definition_of_the_documentation_runs() -> None:
                 files["registry/images.yaml"]["images"][image] = entry
     for path in ("registry/charts.yaml", "registry/images.yaml"):
         section = next(iter(files[path]))
-        whole = yaml.safe_load(skeleton.files("flux")[path])
+        whole = yaml.safe_load(new_repo.files("flux")[path])
         whole[section] |= files[path][section]
         files[path] = whole
     on = state(**{path: yaml.safe_dump(data) for path, data in files.items()})
@@ -259,7 +260,7 @@ def test_the_policy_of_the_documentation_closes_the_namespace() -> None:
 def test_the_versions_of_the_documentation_are_an_update_and_back() -> None:
     listed = block("versions.md", "apiVersion: demandops/v1\nkind: Versions")
     source = "{oci: 'oci://charts.example/object-fusion', version: 0.2.0}"
-    charts = f"{skeleton.files()['registry/charts.yaml']}    channels: {{next: {source}}}\n"
+    charts = f"{new_repo.files()['registry/charts.yaml']}    channels: {{next: {source}}}\n"
     definition = "appdefs/object-detection-fusion/appdef.yaml"
     repo = MemoryRepo(
         {"registry/versions.yaml": listed, "registry/charts.yaml": charts}
@@ -366,7 +367,7 @@ def test_the_rules_of_the_documentation_form_demands_that_are_booked() -> None:
 
 
 def test_each_schema_accepts_the_file_of_init_and_refuses_an_unknown_field() -> None:
-    runner, files = CliRunner(), skeleton.files()
+    runner, files = CliRunner(), new_repo.files()
     listed = dict(
         line.split(maxsplit=1) for line in runner.invoke(cli, ["schema"]).output.splitlines()
     )

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.settings import LEDGER_API_VERSION
+from demandops.base.settings import LEDGER_API_VERSION
 
 from tests.kit.cli import Ran, Run
 from tests.kit.repo import GitRepo, first_version, git

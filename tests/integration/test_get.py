@@ -11,11 +11,11 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.base.runtime import REAL
 from demandops.cli.views.kinds import KINDS
-from demandops.config.override import parse_time
-from demandops.runtime import REAL
-from demandops.staterepo.git.repository import RemoteAway
-from demandops.staterepo.reader import Reader
+from demandops.model.config.override import parse_time
+from demandops.repo.git.repository import RemoteAway
+from demandops.repo.reader import Reader
 
 from tests.kit.cli import Run
 from tests.kit.goals import APP, EXPERIMENT, perception, put

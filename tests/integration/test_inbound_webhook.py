@@ -13,9 +13,9 @@ from contextlib import ExitStack, closing, suppress
 from urllib.parse import urlsplit
 
 import pytest
-from demandops.errors import InvalidInput
-from demandops.service import http_server
-from demandops.service.push_webhook import PushWebhook
+from demandops.base.errors import InvalidInput
+from demandops.serve import http_server
+from demandops.serve.http_server import PushWebhook
 
 from tests.kit.limits import LONGEST_TEST_S, PATIENCE_S
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops import naming
-from demandops.cli.actions.suspend import name_of
+from demandops.base import naming
+from demandops.cli.actions.override import name_of
 
 from tests.kit.cli import Ran, Run
 from tests.kit.dialogue import CTRL_C, Dialogue

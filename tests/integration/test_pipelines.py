@@ -18,7 +18,7 @@ import check_jsonschema
 import pytest
 import yaml
 from click.testing import CliRunner
-from demandops.cli.repo.pull_request_comment import MARK
+from demandops.cli.repo.check import MARK
 
 from tests.kit.config import skeleton
 from tests.kit.repo import git

@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import yaml
 from demandops.cli.main import run
-from demandops.cli.repo.pull_request_comment import LONGEST, MARK, report
-from demandops.staterepo.pull_request import merge_check as checking
-from demandops.staterepo.pull_request.merge_check import CheckResult
-from demandops.staterepo.pull_request.rendered_charts import RenderedCharts
+from demandops.cli.repo.check import LONGEST, MARK, report
+from demandops.repo.pull_request import merge_check as checking
+from demandops.repo.pull_request.merge_check import CheckResult
+from demandops.repo.pull_request.rendered_charts import RenderedCharts
 
 from tests.kit.cli import Run
 from tests.kit.goals import APP

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.staterepo.git.signing import Signer, SigningFailed
-from demandops.staterepo.history import allowed_signers
+from demandops.repo.git.signing import Signer, SigningFailed
+from demandops.repo.history import allowed_signers
 
 from tests.kit import rig
 from tests.kit.goals import connection, goal
@@ -252,7 +252,7 @@ class TestKeysThatCannotSign:
 def test_a_key_that_is_gone_later_is_told_to_the_requester(
     state: Any, key: Path, tmp_path: Path, data_home: Path
 ) -> None:
-    from demandops.service import Generator
+    from demandops.serve.generator import Generator
 
     generator = Generator(str(state.path), signing_key=key)
     try:

@@ -19,10 +19,10 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
-from demandops.errors import StateRepoError
-from demandops.service import Generator
-from demandops.staterepo import upgrade
-from demandops.staterepo.git import remote_repository
+from demandops.base.errors import StateRepoError
+from demandops.repo import upgrade
+from demandops.repo.git import remote_repository
+from demandops.serve.generator import Generator
 
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import perception
@@ -66,7 +66,7 @@ def newer_program(tmp_path_factory: pytest.TempPathFactory) -> Iterator[subproce
     for part in PARTS:
         shutil.copytree(ROOT / part, folder / part, ignore=shutil.ignore_patterns("__pycache__"))
     for path, old, new in (
-        ("generator/demandops/settings.py", "RENDER_VERSION = 2\n", "RENDER_VERSION = 3\n"),
+        ("generator/demandops/base/settings.py", "RENDER_VERSION = 2\n", "RENDER_VERSION = 3\n"),
         ("templates/flux/release.yaml.j2", "timeout: 5m", "timeout: 6m"),
     ):
         text = (folder / path).read_text()

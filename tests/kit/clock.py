@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from datetime import datetime, timedelta
 
-from demandops.runtime import Runtime
+from demandops.base.runtime import Runtime
 
 _LONGEST_WAIT_S = 0.05
 

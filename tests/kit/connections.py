@@ -7,8 +7,8 @@ from copy import deepcopy
 from typing import Any
 
 import yaml
-from demandops.config.load import load
-from demandops.decision import State
+from demandops.decide.state import State
+from demandops.model.config.load import load
 
 from tests.kit import plain_yaml
 from tests.kit.config import configuration, skeleton, state_of

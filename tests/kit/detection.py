@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
-from demandops import strict_yaml
-from demandops.detection.events.detection_state import Event, Observation, State
-from demandops.detection.events.event_engine import EventEngine
-from demandops.detection.rules import rule_file
-from demandops.detection.rules.rule_file import RuleFile
+from demandops.base import strict_yaml
+from demandops.detect import rule_file
+from demandops.detect.detection_state import Event, Observation, State
+from demandops.detect.event_engine import EventEngine
+from demandops.detect.rule_file import RuleFile
 
 POSE = "geometry_msgs/msg/PoseStamped"
 SOURCES = {

@@ -24,12 +24,13 @@ from concurrent.futures import Future, wait
 from pathlib import Path
 from typing import Any
 
-from demandops.service import Generator, Receipt, Ticket
-from demandops.staterepo.git.local_repository import LocalRepository
-from demandops.staterepo.git.remote_repository import RemoteRepository
-from demandops.staterepo.write.commit_batch import CommitBatch
-from demandops.staterepo.write.journal import Journal
-from demandops.staterepo.write.proposal_branch import ProposalBranches
+from demandops.repo.git.local_repository import LocalRepository
+from demandops.repo.git.remote_repository import RemoteRepository
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.repo.write.journal import Journal
+from demandops.repo.write.proposal_branch import ProposalBranches
+from demandops.serve.generator import Generator
+from demandops.serve.queue import Receipt, Ticket
 
 from tests.kit import sync
 from tests.kit.limits import PATIENCE_S

@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from demandops.service import Generator, Receipt, Ticket
+from demandops.serve.generator import Generator
+from demandops.serve.queue import Receipt, Ticket
 
 from tests.kit.goals import Goal
 from tests.kit.limits import PATIENCE_S

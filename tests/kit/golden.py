@@ -20,8 +20,8 @@ from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 
-from demandops import strict_yaml
-from demandops.decision import State, rendered_files
+from demandops.base import strict_yaml
+from demandops.decide.state import State, rendered_files
 
 from tests.kit import goals
 from tests.kit.memory import MemoryRepo

@@ -10,15 +10,16 @@ from functools import lru_cache
 from typing import Any
 
 import yaml
-from demandops.config.config import Config
-from demandops.config.load import load
-from demandops.decision import Decision, State, decide, rendered_files, scale_down
-from demandops.demand.claim import Claim
-from demandops.errors import Refused
-from demandops.ledger import claim_file, kept_replicas, recent_shutdowns, waiting
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.recent_shutdowns import RecentShutdowns
-from demandops.plan.views.bookkeeping import as_data, bookkeeping
+from demandops.base.errors import Refused
+from demandops.decide.decision import Decision, decide, scale_down
+from demandops.decide.state import State, rendered_files
+from demandops.model.config.config import Config
+from demandops.model.config.load import load
+from demandops.model.demand.claim import Claim
+from demandops.model.ledger import claim_file, records
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.records import RecentShutdowns
+from demandops.views.bookkeeping import as_data, bookkeeping
 
 from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.goals import Goal
@@ -117,7 +118,7 @@ class MemoryRepo:
             self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
         )
         for digest in shutdowns.by_digest:
-            del self.files[recent_shutdowns.path_of(digest)]
+            del self.files[records.shutdowns_path(digest)]
 
     def faults(self, goal: object) -> list[str]:
         """Send a goal that must be refused; return its faults, each as ``field: message``."""
@@ -178,9 +179,9 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 def is_of_ledger(path: str) -> bool:
     """Return whether a file contains a claim, shutdowns, kept replicas or a waiting demand."""
     roots = (
-        recent_shutdowns.SHUTDOWNS_ROOT,
-        kept_replicas.REPLICAS_ROOT,
-        waiting.WAITING_ROOT,
+        records.SHUTDOWNS_ROOT,
+        records.REPLICAS_ROOT,
+        records.WAITING_ROOT,
     )
     return bool(claim_file.kind_of(path)) or path.startswith(roots)
 
@@ -192,9 +193,9 @@ def ledger_in(files: Mapping[str, str]) -> Ledger:
     ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
     return replace(
         ledger,
-        shutdowns=recent_shutdowns.read_all(booked),
-        waiting=waiting.read_all(booked),
-        kept=kept_replicas.read_all(booked),
+        shutdowns=records.read_all_shutdowns(booked),
+        waiting=records.read_all_waiting(booked),
+        kept=records.read_all_replicas(booked),
     )
 
 

@@ -9,7 +9,7 @@ from itertools import islice
 from typing import Any, NamedTuple
 
 import jsonschema_rs
-from demandops.errors import Fault
+from demandops.base.errors import Fault
 
 from tests.kit.chance import IN_FULL, TIMES
 

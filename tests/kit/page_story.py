@@ -10,8 +10,8 @@ from pathlib import Path
 
 import yaml
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.service import Generator
-from demandops.staterepo.reader import Reader
+from demandops.repo.reader import Reader
+from demandops.serve.generator import Generator
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 

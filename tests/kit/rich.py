@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import Any
 
-from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
-from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
-from demandops.config.override import OverrideFile
-from demandops.config.policy import AccessDomainsFile
-from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile, VersionsFile
-from demandops.config.repo_settings import RepoSettings
-from demandops.demand.demand_goal import DemandGoal
-from demandops.demand.deployment_request_goal import WireGoal
+from demandops.model.config.appdef import ApplicationDefinition, ServiceDefinition
+from demandops.model.config.inventory import BrokersFile, ClustersFile, NodesFile
+from demandops.model.config.override import OverrideFile
+from demandops.model.config.policy import AccessDomainsFile
+from demandops.model.config.registry import ChartsFile, ClientsFile, ImagesFile, VersionsFile
+from demandops.model.config.repo_settings import RepoSettings
+from demandops.model.demand.demand_goal import DemandGoal
+from demandops.model.demand.deployment_request_goal import WireGoal
 from pydantic import BaseModel
 
 from tests.kit import plain_yaml

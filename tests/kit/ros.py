@@ -23,9 +23,9 @@ from typing import Any
 import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
+from demandops.base.settings import DEFAULT_ACTION_NAME
 from demandops.cli.main import run
-from demandops.settings import DEFAULT_ACTION_NAME
-from demandops_ros.action_endpoints import DEEP_QOS, ask_the_node
+from demandops_ros.actions import DEEP_QOS, ask_the_node
 from demandops_ros.messages import fill_message
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import pygit2
-from demandops.staterepo.git import tree as _  # noqa: F401 - its import switches libgit2's fsync on
+from demandops.repo.git import tree as _  # noqa: F401 - its import switches libgit2's fsync on
 
 _CALLS: Mapping[str, object] = {name: getattr(os, name) for name in ("fsync", "fdatasync")}
 

@@ -12,7 +12,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from axe_playwright_python.sync_playwright import Axe
-from demandops.staterepo.reader import Reader
+from demandops.repo.reader import Reader
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from playwright.sync_api import Browser, Route, expect

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 import rclpy
 import yaml
-from demandops.settings import DEFAULT_DEMAND_ACTION_NAME
+from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops_interfaces.action import Demand
 from demandops_interfaces.msg import Bookkeeping
 from demandops_ros import Answer, DemandClient, DemandError

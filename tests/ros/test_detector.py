@@ -15,8 +15,8 @@ from typing import Any
 import pytest
 import rclpy
 import yaml
-from demandops import strict_yaml
-from demandops.detection.rules.rule_file import read
+from demandops.base import strict_yaml
+from demandops.detect.rule_file import read
 from demandops_ros.detector.detector_node import DetectorNode
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from application_manager_interfaces.action import DeploymentRequest
-from demandops.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
+from demandops.base.settings import DEFAULT_ACTION_NAME, DEFAULT_DEMAND_ACTION_NAME
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.action import ActionServer
 

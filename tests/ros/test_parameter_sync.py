@@ -12,8 +12,8 @@ from pathlib import Path
 from queue import Empty, Queue
 
 import pytest
-from demandops.errors import InvalidInput
-from demandops_ros.parameter_sync.parameter_file import parameters_of
+from demandops.base.errors import InvalidInput
+from demandops_ros.parameter_sync import parameters_of
 from rclpy.parameter import Parameter
 
 from tests.kit.http import Answer, Call, kubeconfig, serving

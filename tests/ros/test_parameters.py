@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 import rclpy
-from demandops.config.load import load
-from demandops_ros import node_parameters, reference_parameters
+from demandops.model.config.load import load
+from demandops_ros import node_parameters
 from rcl_interfaces.srv import DescribeParameters
 
 from tests.kit.config import configuration
@@ -57,9 +57,9 @@ def told(folder: Path, text: str, **files: str) -> list[str]:
     file.write_text(text)
     # a launch file sets the node's name like this
     args = ["--ros-args", "-r", "__node:=demandops", "--params-file", str(file)]
-    values = reference_parameters.read(args)
+    values = node_parameters.read_reference_parameters(args)
     assert values["deployment_action_name"] == "/fleet/deployment_request"
-    return list(reference_parameters.warnings(values, load(configuration(files))))
+    return list(node_parameters.warnings(values, load(configuration(files))))
 
 
 REPLACED = [
@@ -111,8 +111,8 @@ def test_what_the_state_repo_lacks_is_named(ros: None, tmp_path: Path) -> None:
 def test_a_broker_without_a_port_is_any_broker_of_the_host() -> None:
     name = "connections.communication_broker.host"
     config = load(configuration({}))
-    assert [*reference_parameters.warnings({name: "service-mqtt-broker-edge"}, config)] == []
-    (warning,) = reference_parameters.warnings({name: "elsewhere"}, config)
+    assert [*node_parameters.warnings({name: "service-mqtt-broker-edge"}, config)] == []
+    (warning,) = node_parameters.warnings({name: "elsewhere"}, config)
     assert "the broker at elsewhere is not in inventory/brokers.yaml" in warning
 
 
@@ -132,10 +132,12 @@ def test_the_parameters_of_an_older_file(ros: None, tmp_path: Path) -> None:
 
 
 def test_the_parameter_file_of_the_package_leaves_options_alone() -> None:
-    file = Path(reference_parameters.__file__).parents[1] / "ros_package" / "config" / "params.yaml"
+    file = Path(node_parameters.__file__).parents[1] / "ros_package" / "config" / "params.yaml"
     rclpy.init(args=["--ros-args", "--params-file", str(file)])
     try:
-        read = node_parameters.read({"state_repo": "fleet.git", "fetch_interval": "5s"})
+        read = node_parameters.read_node_parameters(
+            {"state_repo": "fleet.git", "fetch_interval": "5s"}
+        )
     finally:
         rclpy.try_shutdown()
     assert read == node_parameters.DEFAULTS | {"state_repo": "fleet.git", "fetch_interval": "5s"}

@@ -12,9 +12,8 @@ from xml.etree import ElementTree
 import numpy
 import pytest
 import yaml
-from demandops.detection.rules import rule_file
-from demandops_ros.detector.recorded_bag import REST_OF_BAG
-from demandops_ros.detector.replay import Replay, show
+from demandops.detect import rule_file
+from demandops_ros.detector.replay import REST_OF_BAG, Replay, show
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 

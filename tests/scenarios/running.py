@@ -13,19 +13,19 @@ from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from demandops.config.base_model import FrozenModel, parse_file
-from demandops.config.durations import seconds_of
-from demandops.config.load import load
-from demandops.decision import Decision, State, decide, rendered_files
-from demandops.demand.demand_request import Expire
-from demandops.errors import Fault, Refused
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.operations.drain import Drain
-from demandops.ledger.waiting import in_turn
-from demandops.plan.nodes.relocation import following_overrides
-from demandops.plan.override_lifecycle import changed_claim_files
-from demandops.service.timing.expiry import LeaseExpiry
-from demandops.service.timing.rate_limit import RateLimit
+from demandops.base.errors import Fault, Refused
+from demandops.decide.booking.leaving import Drain
+from demandops.decide.decision import Decision, decide
+from demandops.decide.override_lifecycle import changed_claim_files
+from demandops.decide.placement.relocation import following_overrides
+from demandops.decide.state import State, rendered_files
+from demandops.model.config.base_model import FrozenModel, parse_file, seconds_of
+from demandops.model.config.load import load
+from demandops.model.demand.demand_request import Expire
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.records import in_turn
+from demandops.serve.timing.limits import RateLimit
+from demandops.serve.timing.own_work import LeaseExpiry
 from pydantic import Field, model_validator
 
 from tests.kit import plain_yaml

@@ -11,42 +11,38 @@ from dataclasses import replace
 from datetime import timedelta
 from typing import Any
 
-from demandops.config.appdef.scaling import Scaling
-from demandops.config.config import Config
-from demandops.config.override import by_rank
-from demandops.connections import route
-from demandops.connections.route import Route
-from demandops.decision import Decision, decision
-from demandops.demand import chosen_domain, permission, separate_instance
-from demandops.demand.claim import Claim
-from demandops.demand.lease import Lease
-from demandops.errors import InvalidInput
-from demandops.ledger import claim_file, world
-from demandops.ledger.operations import conflicts, demand_release, ownership, put
-from demandops.ledger.recent_shutdowns import RecentShutdowns
-from demandops.ledger.waiting import Wait, WaitingDemand
-from demandops.plan import override_lifecycle, planner, release_keys, scale_down
-from demandops.plan.checks import denial, quota
-from demandops.plan.nodes import placement
-from demandops.plan.nodes.capacity import Room, Usage
-from demandops.plan.nodes.choice import Choice
-from demandops.plan.overrides import claim_overrides
-from demandops.render.changes import changeset
-from demandops.service import Receipt, demand_lifecycle, generator
-from demandops.service.approvals.approvals import Approvals
-from demandops.service.demand_lifecycle import Demands
-from demandops.service.evaluation import Evaluator
-from demandops.service.ticket import Ticket
-from demandops.service.timing import expiry, waiting_turns
-from demandops.service.timing.draining import Draining
-from demandops.service.timing.expiry import LeaseExpiry, ScaleDown
-from demandops.service.timing.waiting_turns import WaitingTurns
-from demandops.service.worker import Worker
-from demandops.staterepo.git.remote_repository import RemoteRepository
-from demandops.staterepo.load import snapshot
-from demandops.staterepo.write import journal
-from demandops.staterepo.write.commit_batch import CommitBatch
-from demandops.staterepo.write.proposal_branch import ProposalBranches
+from demandops.base.errors import InvalidInput
+from demandops.connections import connection
+from demandops.connections.connection import Route
+from demandops.decide import decision, override_lifecycle
+from demandops.decide.admission import admitted_request, permission
+from demandops.decide.booking import joining, leaving
+from demandops.decide.changes import changeset
+from demandops.decide.checks import quotas
+from demandops.decide.decision import Decision
+from demandops.decide.placement import placement
+from demandops.decide.placement.capacity import Room, Usage
+from demandops.decide.placement.choice import Choice
+from demandops.decide.planning import overrides, planner, release_keys
+from demandops.model.config.appdef import Scaling
+from demandops.model.config.config import Config
+from demandops.model.config.override import by_rank
+from demandops.model.demand.claim import Claim, Lease
+from demandops.model.ledger import claim_file, ledger
+from demandops.model.ledger.records import RecentShutdowns, Wait, WaitingDemand
+from demandops.repo.git.remote_repository import RemoteRepository
+from demandops.repo.load import snapshot
+from demandops.repo.write import journal
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.repo.write.proposal_branch import ProposalBranches
+from demandops.serve import demand_lifecycle, generator
+from demandops.serve.approvals.approvals import Approvals
+from demandops.serve.demand_lifecycle import Demands
+from demandops.serve.evaluation import Evaluator
+from demandops.serve.queue import Receipt, Ticket
+from demandops.serve.timing import own_work
+from demandops.serve.timing.own_work import Draining, LeaseExpiry, ScaleDown, WaitingTurns
+from demandops.serve.worker import Worker
 
 Patch = Callable[[Any, str, Any], None]
 
@@ -54,24 +50,24 @@ Patch = Callable[[Any, str, Any], None]
 
 
 def keep_former_requesters(patch: Patch) -> None:
-    book = put.book
+    book = joining.book
 
     def kept(ledger: Any, one: Any, request: str, key: Any, current: Any, now: Any) -> Any:
         former = current.requesters if current else ()
         one = replace(one, requesters=(*one.requesters, *former))
         return book(ledger, one, request, key, current, now)
 
-    patch(put, "book", kept)
+    patch(joining, "book", kept)
 
 
 def let_strangers_change_a_demand(patch: Patch) -> None:
-    patch(ownership, "refuse_other_owners", lambda *_: None)
-    patch(put, "refuse_other_owners", lambda *_: None)
+    patch(joining, "refuse_other_owners", lambda *_: None)
+    patch(joining, "refuse_other_owners", lambda *_: None)
 
 
 def release_only_the_first_claim(patch: Patch) -> None:
-    owned = demand_release.owned_claims
-    patch(demand_release, "owned_claims", lambda *given: owned(*given)[:1])
+    owned = leaving.owned_claims
+    patch(leaving, "owned_claims", lambda *given: owned(*given)[:1])
 
 
 def replace_what_was_joined(patch: Patch) -> None:
@@ -83,7 +79,7 @@ def commit_what_is_booked_already(patch: Patch) -> None:
 
 
 def grant_one_claim_too_many(patch: Patch) -> None:
-    patch(quota, "_held", lambda *given, held=quota._held: held(*given) - 1)
+    patch(quotas, "_held", lambda *given, held=quotas._held: held(*given) - 1)
 
 
 def take_a_repeat_for_another_shutdown(patch: Patch) -> None:
@@ -103,7 +99,7 @@ def end_leases_by_the_wall_clock(patch: Patch) -> None:
 
 
 def come_down_at_once(patch: Patch) -> None:
-    patch(scale_down, "_steps", lambda *_: ())
+    patch(planner, "_steps", lambda *_: ())
 
 
 def come_down_early(patch: Patch) -> None:
@@ -116,27 +112,27 @@ def never_come_down(patch: Patch) -> None:
 
 
 def share_one_instance(patch: Patch) -> None:
-    patch(separate_instance, "_separated", lambda app, config: app)
+    patch(admitted_request, "_separated", lambda app, config: app)
 
 
 def move_instances_with_the_channel(patch: Patch) -> None:
-    separated = separate_instance._separated
+    separated = admitted_request._separated
 
     def by_name(app: Any, config: Any) -> Any:
         made = separated(app, config)
         return replace(made, version=app.version)
 
-    patch(separate_instance, "_separated", by_name)
+    patch(admitted_request, "_separated", by_name)
 
 
 def keep_the_channel_of_the_default_version(patch: Patch) -> None:
-    separated = separate_instance._separated
+    separated = admitted_request._separated
 
     def by_name(app: Any, config: Any) -> Any:
         made = separated(app, config)
         return made if made.separate else app
 
-    patch(separate_instance, "_separated", by_name)
+    patch(admitted_request, "_separated", by_name)
 
 
 def take_the_first_domain(patch: Patch) -> None:
@@ -144,9 +140,9 @@ def take_the_first_domain(patch: Patch) -> None:
 
 
 def forget_what_is_booked_in_a_domain(patch: Patch) -> None:
-    chosen = chosen_domain._chosen
+    chosen = admitted_request._chosen
     patch(
-        chosen_domain,
+        admitted_request,
         "_chosen",
         lambda one, booked, *more: chosen(one, None, *more),
     )
@@ -164,7 +160,7 @@ def name_a_shared_route_twice(patch: Patch) -> None:
     def each(routes: Iterable[Any]) -> tuple[Any, ...]:
         return tuple(sorted(routes, key=lambda one: one.source))
 
-    patch(route, "merged_routes", each)
+    patch(connection, "merged_routes", each)
 
 
 def deliver_under_the_source_topic(patch: Patch) -> None:
@@ -172,7 +168,7 @@ def deliver_under_the_source_topic(patch: Patch) -> None:
 
 
 def send_a_source_topic_to_two_targets(patch: Patch) -> None:
-    patch(conflicts, "_route_conflicts", lambda *_: ())
+    patch(joining, "_route_conflicts", lambda *_: ())
 
 
 def leave_the_clients_of_a_released_connection(patch: Patch) -> None:
@@ -194,8 +190,8 @@ def leave_the_far_end(patch: Patch) -> None:
 
 
 def let_the_last_in_first(patch: Patch) -> None:
-    in_turn = waiting_turns.in_turn
-    patch(waiting_turns, "in_turn", lambda waiting: in_turn(waiting)[::-1])
+    in_turn = own_work.in_turn
+    patch(own_work, "in_turn", lambda waiting: in_turn(waiting)[::-1])
 
 
 def ignore_priorities(patch: Patch) -> None:
@@ -272,16 +268,16 @@ def apply_overrides_only_to_new_demands(patch: Patch) -> None:
 
 
 def let_the_lowest_priority_win(patch: Patch) -> None:
-    patch(world, "by_rank", lambda overrides: by_rank(overrides)[::-1])
+    patch(ledger, "by_rank", lambda overrides: by_rank(overrides)[::-1])
 
 
 def override_all_nodes(patch: Patch) -> None:
-    fits = claim_overrides.fits
+    fits = overrides.fits
 
     def anywhere(selector: Any, traits: Any, config: Any) -> bool:
         return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
-    patch(claim_overrides, "fits", anywhere)
+    patch(overrides, "fits", anywhere)
 
 
 def run_what_is_denied(patch: Patch) -> None:
@@ -290,11 +286,11 @@ def run_what_is_denied(patch: Patch) -> None:
 
 
 def book_what_is_denied(patch: Patch) -> None:
-    patch(denial, "faults", lambda *_: ())
+    patch(quotas, "denial_faults", lambda *_: ())
 
 
 def end_overrides_early(patch: Patch) -> None:
-    for module in (expiry, override_lifecycle):
+    for module in (own_work, override_lifecycle):
         expired = module.expired_overrides
         patch(
             module,

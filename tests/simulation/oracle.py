@@ -12,14 +12,14 @@ from pathlib import Path
 from typing import Any
 
 import pygit2
-from demandops.demand.claim import Claim
-from demandops.errors import InvalidInput, TurnedDown
-from demandops.ledger import claim_file
-from demandops.service import Ticket
-from demandops.staterepo.audit import verification
-from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.repository import MAIN
-from demandops.staterepo.history.commit_log import PROPOSAL, entry_of
+from demandops.base.errors import InvalidInput, TurnedDown
+from demandops.model.demand.claim import Claim
+from demandops.model.ledger import claim_file
+from demandops.repo import verification
+from demandops.repo.git import tree as trees
+from demandops.repo.git.repository import MAIN
+from demandops.repo.history.commit_log import PROPOSAL, entry_of
+from demandops.serve.queue import Ticket
 
 from tests.kit import plain_yaml
 from tests.kit.promises import claims_of, name_of

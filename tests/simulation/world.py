@@ -19,11 +19,12 @@ from typing import Any
 
 import git
 import pygit2
-from demandops.errors import DemandOpsError, StateRepoError
-from demandops.runtime import Runtime
-from demandops.service import Generator, generator
-from demandops.staterepo.git.remote_repository import RemoteRepository
-from demandops.staterepo.git.repository import MAIN, FetchInterrupted
+from demandops.base.errors import DemandOpsError, StateRepoError
+from demandops.base.runtime import Runtime
+from demandops.repo.git.remote_repository import RemoteRepository
+from demandops.repo.git.repository import MAIN, FetchInterrupted
+from demandops.serve import generator
+from demandops.serve.generator import Generator
 from greenlet import getcurrent
 
 from tests.kit.turns import Turns

@@ -14,9 +14,9 @@ from tempfile import TemporaryDirectory
 import click
 import pytest
 import yaml
+from demandops.base.runtime import REAL
 from demandops.cli.main import COMMANDS as COMMAND_NAMES
 from demandops.cli.main import cli, load, run
-from demandops.runtime import REAL
 
 from tests.kit.goals import EXPERIMENT, put
 from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, git, init

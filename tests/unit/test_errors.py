@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from demandops.config.base_model import parse_file
-from demandops.errors import MOST_FAULTS, Fault, InvalidInput
-from demandops.field_lines import located_in
-from demandops.ledger.kept_replicas import _KeptReplicasFile
+from demandops.base.errors import MOST_FAULTS, Fault, InvalidInput
+from demandops.base.strict_yaml import located_in
+from demandops.model.config.base_model import parse_file
+from demandops.model.ledger.records import _KeptReplicasFile
 
 
 def test_faults_that_are_passed_on_are_still_counted_right() -> None:

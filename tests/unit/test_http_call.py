@@ -14,8 +14,8 @@ from itertools import repeat
 from pathlib import Path
 
 import pytest
-from demandops import http_call
-from demandops.http_call import HttpAnswer, NoAnswer
+from demandops.base import http_call
+from demandops.base.http_call import HttpAnswer, NoAnswer
 
 from tests.kit.http import Answer, serving
 

@@ -17,7 +17,7 @@ import demandops
 import demandops_ros
 import pytest
 import yaml
-from demandops import settings
+from demandops.base import settings
 from demandops.cli import main
 from demandops.cli.repo.schema import SCHEMAS
 

@@ -10,12 +10,8 @@ import unicodedata
 from typing import Any
 
 import pytest
-from demandops.cli import output
-from demandops.cli.json_output import print_json, show
-from demandops.cli.repo import pull_request_comment
-from demandops.cli.table import Column, Table
-from demandops.errors import Fault, InvalidInput, StateRepoError, fault
-from demandops.quoting import (
+from demandops.base.errors import Fault, InvalidInput, StateRepoError, fault
+from demandops.base.quoting import (
     LONGEST_LINE,
     OneLineFormatter,
     is_visible,
@@ -24,7 +20,11 @@ from demandops.quoting import (
     one_line,
     quoted,
 )
-from demandops.staterepo.load import problem_report
+from demandops.cli import output
+from demandops.cli.json_output import print_json, show
+from demandops.cli.repo import check
+from demandops.cli.table import Column, Table
+from demandops.repo.load import last_valid_config
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -95,17 +95,14 @@ def test_commands_print_no_text_that_controls_a_terminal(
 
 
 def test_a_comment_has_no_text_that_ends_its_span() -> None:
-    assert is_visible(pull_request_comment.code(HOSTILE))
-    assert (
-        pull_request_comment.fence("a\u202e\n```\nb", "yaml")
-        == "````yaml\na\\u202e\n```\nb\n````\n"
-    )
+    assert is_visible(check.code(HOSTILE))
+    assert check.fence("a\u202e\n```\nb", "yaml") == "````yaml\na\\u202e\n```\nb\n````\n"
 
 
 def test_the_problem_report_quotes_and_finds_its_problems_again() -> None:
     found = [Fault("invalid", "a\u202e", HOSTILE, "overrides/a\n\u200b.yaml")]
-    first = problem_report.with_origins(found, (), lambda path: ("c" * 40, "Eve\u202e <e@x>"))
-    text = problem_report.write(first)
+    first = last_valid_config.with_origins(found, (), lambda path: ("c" * 40, "Eve\u202e <e@x>"))
+    text = last_valid_config.write(first)
     assert text and all(is_visible(line) for line in text.split("\n"))
-    again = problem_report.with_origins(found, problem_report.read(text), lambda path: None)
+    again = last_valid_config.with_origins(found, last_valid_config.read(text), lambda path: None)
     assert again == first

@@ -48,7 +48,7 @@ def test_the_launch_file_of_the_detector_uses_all_its_arguments() -> None:
 
 
 def test_the_parameter_file_of_the_detector_has_the_defaults() -> None:
-    parameters = pytest.importorskip("demandops_ros.detector.detector_parameters").PARAMETERS
+    parameters = pytest.importorskip("demandops_ros.detector.detect_command").PARAMETERS
     data = yaml.safe_load((PACKAGE / "config" / "detector_params.yaml").read_text())
     named = data["/**"]["ros__parameters"]
     assert named == {name: parameters[name][0] for name in named}

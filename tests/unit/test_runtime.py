@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 
 import pytest
-from demandops.errors import StateRepoError, Unsound
+from demandops.base.errors import StateRepoError, Unsound
 
 from tests.kit.turns import Turns
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import pytest
-from demandops.config.load import load
-from demandops.errors import InvalidInput
+from demandops.base.errors import InvalidInput
+from demandops.model.config.load import load
 
 from tests.scenarios import running
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import jsonschema_rs
 import pytest
-from demandops.cli.repo import schema, schema_properties
+from demandops.cli.repo import schema
 
 FILE = "templates/schemas/properties.yaml"
 
@@ -41,7 +41,7 @@ def test_every_property_has_a_description_and_a_valid_example(name: str) -> None
 def test_each_entry_is_a_description_and_at_most_an_example() -> None:
     odd = [
         (model, field, said)
-        for model, fields in schema_properties._properties().items()
+        for model, fields in schema._properties().items()
         if model != "inherits"
         for field, said in fields.items()
         if len(said) > 2 or not isinstance(said[0], str)
@@ -53,7 +53,7 @@ def test_nothing_is_described_that_is_not_there() -> None:
     known = {field for name in schema.SCHEMAS for field, *_ in properties(name)}
     listed = {
         f"{model.rpartition('/')[2]}.{field}"
-        for model, fields in schema_properties._properties().items()
+        for model, fields in schema._properties().items()
         if model != "inherits"
         for field in fields
     }

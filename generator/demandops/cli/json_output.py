@@ -11,21 +11,20 @@ from typing import Any
 
 import click
 
+from demandops.base.errors import DemandOpsError, InvalidInput, fault
+from demandops.base.naming import Subject
+from demandops.base.quoting import json_escaped, lines
 from demandops.cli.output import painted, print_lines, terminal_width
 from demandops.cli.table import Table
-from demandops.config.override import Override, format_time
-from demandops.config.registry import ImagePin
-from demandops.demand.claim import Claim
-from demandops.demand.lease import Lease
-from demandops.errors import DemandOpsError, InvalidInput, fault
-from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
-from demandops.plan.release import Release, ServiceRelease
-from demandops.plan.views.release_causes import versions_asked
-from demandops.quoting import json_escaped, lines
-from demandops.render.gitops.paths import path_of
-from demandops.staterepo.history.commit_log import LogEntry
-from demandops.subject import Subject
+from demandops.model.config.override import Override, format_time
+from demandops.model.config.registry import ImagePin
+from demandops.model.demand.claim import Claim, Lease
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.release import Release, ServiceRelease
+from demandops.render.paths import path_of
+from demandops.repo.history.commit_log import LogEntry
+from demandops.views.release_causes import versions_asked
 
 Json = dict[str, Any]
 Command = Callable[..., Any]

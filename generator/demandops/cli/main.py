@@ -14,10 +14,10 @@ from importlib import import_module
 import click
 
 from demandops import __version__
+from demandops.base.errors import DemandOpsError, InvalidInput, Unsound
+from demandops.base.quoting import OneLineFormatter
 from demandops.cli.output import errors, show_slow
-from demandops.errors import DemandOpsError, InvalidInput, Unsound
-from demandops.quoting import OneLineFormatter
-from demandops.staterepo.git import slow_git
+from demandops.repo.git import slow_git
 
 # The package of each command's module, and the short help, which `--help` shows without importing
 # the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 
 import click
 
+from demandops.base.naming import SubjectKind
 from demandops.cli.target import readable_repo
-from demandops.plan.views import release_causes
-from demandops.staterepo import reader
-from demandops.staterepo.reader import Reader
-from demandops.staterepo.write.proposal_branch import pending_proposals
-from demandops.subject import SubjectKind
+from demandops.repo import reader
+from demandops.repo.reader import Reader
+from demandops.repo.write.proposal_branch import pending_proposals
+from demandops.views import release_causes
 
 Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from demandops import quoting
-from demandops.runtime import REAL
+from demandops.base import quoting
+from demandops.base.runtime import REAL
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -107,7 +107,7 @@ at_option = click.option(
 
 
 def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
-    from demandops.config.durations import seconds_of  # noqa: PLC0415 - --help must be fast
+    from demandops.model.config.base_model import seconds_of  # noqa: PLC0415 - --help must be fast
 
     try:
         return seconds_of(text)
@@ -118,7 +118,7 @@ def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
 def version_lines(data: Mapping[str, Any]) -> list[str]:
     """Return a line with a release's version, and a line for each version that demands ask for.
 
-    ``data`` has the form that :func:`demandops.cli.json_output.version_data` returns.
+    ``data`` has the form that :func:`.json_output.version_data` returns.
     """
     asked = data["versions_asked"].items()
     return [

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from rich.cells import cell_len
 
-from demandops.quoting import one_line
+from demandops.base.quoting import one_line
 
 _GAP = "  "
 # The smallest width, in characters, to which a column is narrowed by wrapping its text.

@@ -1,34 +1,115 @@
-"""Which state repo a command works on, and with which access: options, environment, contexts.
+"""Contexts: the fleets that a person works with. A file in the user's config folder lists them.
 
-The first of these that is given decides:
-
-1. ``--state-repo``
-2. ``--context``
-3. the environment variable. If it names a relative folder that does not exist, it is ignored inside
-   a checkout, and is an error outside.
-4. the checkout around the current folder. A command that writes uses the checkout's remote.
-5. the current context
-
-The default signing key and clusters come from the same context as the state repo. In a checkout,
-they come from the first context whose state repo is this checkout or its remote. If
-``--state-repo`` or the environment variable decides, there are no such defaults.
+A context replaces options that a person would repeat: the state repo, the access to the clusters,
+the signing key. docs/commands.md describes the file.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import click
 from click.core import ParameterSource
+from pydantic import Field, StringConstraints, model_validator
 
-from demandops.quoting import quoted
-from demandops.staterepo.git.checkout import checkout_around, origin_of
-from demandops.staterepo.git.open_repository import is_url
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput, suggestion
+from demandops.base.quoting import quoted
+from demandops.base.settings import API_VERSION
+from demandops.base.strict_yaml import located_in
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
+from demandops.repo.git.local_repository import checkout_around, origin_of
+from demandops.repo.git.open_repository import is_url
 
 if TYPE_CHECKING:
-    from demandops.cli.contexts import Context
+    pass  # DROPPED
+Filled = Annotated[str, StringConstraints(min_length=1)]
+
+
+class Context(CamelModel):
+    """The values that a context gives to a command; :mod:`.target` says when."""
+
+    state_repo: Filled
+    clusters: Filled | None = None
+    signing_key: Filled | None = None
+
+
+class ContextsFile(FileModel):
+    """``~/.config/demandops/contexts.yaml``: contexts by name, and the one in use."""
+
+    kind: Literal["Contexts"]
+    current: DnsLabel | None = None
+    contexts: dict[DnsLabel, Context] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _known(self) -> ContextsFile:
+        if self.current is not None and self.current not in self.contexts:
+            raise ValueError(
+                f"current: there is no context '{self.current}'"
+                f"{suggestion(self.current, self.contexts)}"
+            )
+        return self
+
+
+def path() -> Path:
+    root = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
+    return Path(root) / "demandops" / "contexts.yaml"
+
+
+def read() -> ContextsFile:
+    """Return the contexts in the file; without a file there are none."""
+    try:
+        text = path().read_text(encoding="utf-8")
+    except FileNotFoundError:
+        return ContextsFile(apiVersion=API_VERSION, kind="Contexts")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InvalidInput.at(
+            "", f"cannot be read: {error}; replace the file", file=str(path())
+        ) from None
+    with located_in(text):
+        return parse_file(ContextsFile, text, str(path()))
+
+
+def write(content: ContextsFile) -> None:
+    """Write the contexts to the file, which only its owner may read."""
+    file = path()
+    file.parent.mkdir(parents=True, exist_ok=True)
+    data = content.model_dump(by_alias=True, exclude_none=True)
+    # written beside the file and then renamed, so that no other command reads half a file
+    new = file.with_name(f".{file.name}.new")
+    new.write_text(strict_yaml.dump(data), encoding="utf-8")
+    new.chmod(0o600)
+    new.replace(file)
+
+
+def named(name: str, field: str = "") -> Context:
+    """Return the context of this name; a fault names ``field`` as the place of the name."""
+    contexts = read().contexts
+    if name not in contexts:
+        message = f"there is no context '{name}'{suggestion(name, contexts)}"
+        raise InvalidInput.at(field, message, file=str(path()))
+    return contexts[name]
+
+
+# ---- target ----
+#
+# Which state repo a command works on, and with which access: options, environment, contexts.
+#
+# The first of these that is given decides:
+#
+# 1. ``--state-repo``
+# 2. ``--context``
+# 3. the environment variable. If it names a relative folder that does not exist, it is ignored
+#    inside a checkout, and is an error outside.
+# 4. the checkout around the current folder. A command that writes uses the checkout's remote.
+# 5. the current context
+#
+# The default signing key and clusters come from the same context as the state repo. In a checkout,
+# they come from the first context whose state repo is this checkout or its remote. If
+# ``--state-repo`` or the environment variable decides, there are no such defaults.
 
 Command = Callable[..., Any]
 
@@ -44,15 +125,15 @@ _NO_STATE_REPO = (
 
 def _chosen_context(around: Path | None) -> Context | None:
     """Return the context that applies, and remember it for :func:`_from_context`."""
-    from demandops.cli import contexts  # noqa: PLC0415 - only where an option is left out
+    pass  # DROPPED
 
     # clusters and signing key of a context apply only to its own state repo
     ctx = click.get_current_context()
     name = ctx.meta.get(_NAME)
-    content = contexts.read()
+    content = read()
     context: Context | None
     if name is not None:
-        context = contexts.named(name, "--context")
+        context = named(name, "--context")
     elif around is not None:
         places = {str(around), origin_of(around)}
         same = (each for each in content.contexts.values() if each.state_repo in places)
@@ -116,9 +197,9 @@ def _remember_name(ctx: click.Context, param: click.Parameter, value: str | None
 
 
 def context_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    from demandops.cli import contexts  # noqa: PLC0415
+    pass  # DROPPED
 
-    return [name for name in contexts.read().contexts if name.startswith(incomplete)]
+    return [name for name in read().contexts if name.startswith(incomplete)]
 
 
 _context_option = click.option(

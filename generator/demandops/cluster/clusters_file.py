@@ -12,10 +12,9 @@ from typing import Any, Literal
 
 from pydantic import Field, model_validator
 
-from demandops.config.base_model import DnsLabel, FileModel, FrozenModel, parse_file
-from demandops.errors import InvalidInput, fault
-from demandops.field_lines import located_in, with_lines
-from demandops.input_file import read_input, read_secret
+from demandops.base.errors import InvalidInput, fault
+from demandops.base.strict_yaml import located_in, read_input, read_secret, with_lines
+from demandops.model.config.base_model import DnsLabel, FileModel, FrozenModel, parse_file
 
 
 class NoAccess(ValueError):

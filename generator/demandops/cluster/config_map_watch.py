@@ -7,10 +7,10 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
+from demandops.base.errors import InvalidInput
+from demandops.base.quoting import one_line
+from demandops.base.runtime import REAL, Runtime
 from demandops.cluster.clusters_file import ClusterAccess, own_cluster_api
-from demandops.errors import InvalidInput
-from demandops.quoting import one_line
-from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 

@@ -14,10 +14,10 @@ import re
 from collections.abc import Callable
 from typing import Any
 
+from demandops.base.errors import InvalidInput, Unsound
+from demandops.base.quoting import quoted
+from demandops.base.runtime import REAL, Runtime
 from demandops.cluster.clusters_file import own_cluster_api
-from demandops.errors import InvalidInput, Unsound
-from demandops.quoting import quoted
-from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 

@@ -7,10 +7,10 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any
 
+from demandops.base.runtime import REAL, Runtime
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import ClusterDomain, Health, Key, ObjectSelector
-from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 

@@ -1,39 +1,115 @@
-"""Wakes Flux or Argo CD after a push, so that it fetches at once and not at its next interval.
+"""Signed calls to a controller's webhook after a push.
 
-Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure
-and tries again for a minute. After that, the controller fetches at its next interval.
-
-While Flux is known to be busy, it is not woken, but for a minute at most. If kustomize-controller
-1.9 begins a second reconciliation right after the first, the second may read the status from before
-the first. Kustomize-controller then forgets which objects the first reconciliation created, and
-never removes them.
+A call to Flux goes to a Receiver of type ``generic-hmac``, or ``generic`` if there is no secret. A
+call to Argo CD is a push event in GitHub's format. Argo CD compares the repository of the event
+with the source of each Application.
 """
 
 from __future__ import annotations
 
+import hashlib
+import hmac
+import json
 import logging
-from collections.abc import Callable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from math import inf
 from typing import Any
+from urllib.parse import quote, urlsplit
 
-from demandops.cluster import controller_webhook
+from demandops.base import http_call
+from demandops.base.errors import InvalidInput
+from demandops.base.http_call import NoAnswer
+from demandops.base.runtime import REAL, Runtime
+from demandops.base.settings import MAIN_BRANCH
 from demandops.cluster.clusters_file import ClusterAccess, NoAccess
 from demandops.cluster.health.flux import REQUESTED_AT, Flux
 from demandops.cluster.health.release_health import ClusterDomain, ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
-from demandops.config.config import Config
-from demandops.config.policy import AccessDomain
-from demandops.errors import InvalidInput
-from demandops.http_call import NoAnswer
-from demandops.render.gitops.argocd import project_of
-from demandops.render.gitops.paths import domain_folder, domains_in_use
-from demandops.runtime import REAL, Runtime
+from demandops.model.config.config import Config
+from demandops.model.config.policy import AccessDomain
+from demandops.render.argocd import project_of
+from demandops.render.paths import domain_folder, domains_in_use
+
+_TIMEOUT_S = 5.0
+_SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
+_NO_COMMIT = "0" * 40
+
+
+def call_flux(url: str, secret: bytes | None) -> None:
+    # a Receiver ignores the body
+    _send(url, b"{}", secret, "X-Signature", {})
+
+
+def call_argocd(
+    url: str, secret: bytes | None, repo: str, before: str, after: str, paths: Iterable[str] | None
+) -> None:
+    """Report to Argo CD that a repository's main branch moved, or raise NoAnswer.
+
+    Argo CD fetches the state repo from ``repo``. ``before`` is the commit of the last call, if
+    there was one. With None as ``paths``, Argo CD refreshes all Applications of the repo.
+    """
+    event = {
+        "ref": f"refs/heads/{MAIN_BRANCH}",
+        "before": before or _NO_COMMIT,
+        "after": after,
+        "repository": {"html_url": web_address(repo), "default_branch": MAIN_BRANCH},
+        "commits": [] if paths is None else [{"id": after, "modified": sorted(paths)}],
+    }
+    body = json.dumps(event).encode()
+    _send(url, body, secret, "X-Hub-Signature-256", {"X-GitHub-Event": "push"})
+
+
+def web_address(repo: str) -> str:
+    """Return the address of a repository's web page; NoAccess is raised if it names no host."""
+    # Without user and password. Argo CD compares this address with each source's URL by host and
+    # path, not by scheme and port.
+    short = None if "://" in repo else _SCP.fullmatch(repo)
+    if short:
+        host, path = short["host"], quote(short["path"])
+    else:
+        parts = urlsplit(repo)
+        host, path = parts.hostname or "", parts.path.removeprefix("/")
+    if not host:
+        raise NoAccess(
+            "the state repo's URL names no host, but Argo CD needs a host to recognize the repo; "
+            "write https://HOST/PATH or ssh://USER@HOST/PATH in demandops.yaml: argocd.url"
+        )
+    return f"https://{host}/{path.removesuffix('.git')}"
+
+
+def signature(secret: bytes, body: bytes) -> str:
+    """Return the HMAC of a body, in the format that Flux and Argo CD expect."""
+    return f"sha256={hmac.new(secret, body, hashlib.sha256).hexdigest()}"
+
+
+def _send(
+    url: str, body: bytes, secret: bytes | None, signature_header: str, headers: dict[str, str]
+) -> None:
+    headers["Content-Type"] = "application/json"
+    if secret is not None:
+        headers[signature_header] = signature(secret, body)
+    answer = http_call.call("POST", url, headers, body, _TIMEOUT_S)
+    if not answer.is_success:
+        raise NoAnswer(f"it answered {answer.status}")
+
+
+# ---- reconcile trigger ----
+#
+# Wakes Flux or Argo CD after a push, so that it fetches at once and not at its next interval.
+#
+# Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure
+# and tries again for a minute. After that, the controller fetches at its next interval.
+#
+# While Flux is known to be busy, it is not woken, but for a minute at most. If kustomize-controller
+# 1.9 begins a second reconciliation right after the first, the second may read the status from
+# before the first. Kustomize-controller then forgets which objects the first reconciliation
+# created, and never removes them.
 
 log = logging.getLogger("demandops")
 
-_TIMEOUT_S = 5.0
 _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 # The next fetch begins at least so long after Flux has applied what the last fetch brought. Two
 # fetches within a second can make source-controller corrupt an artifact.
@@ -209,12 +285,10 @@ class ReconcileTrigger:
                 paths = [path for path in paths if _concerns(path, name)]
                 folders = [domain_folder(name, domain) for domain in wake.domains]
                 paths += [f"{folder}/_domain.yaml" for folder in folders]
-            controller_webhook.call_argocd(
-                access.webhook, access.secret(), argocd.url, before, commit, paths
-            )
+            call_argocd(access.webhook, access.secret(), argocd.url, before, commit, paths)
             self._reported[name] = commit
         elif access.receiver and not argocd:
-            controller_webhook.call_flux(access.receiver, access.secret())
+            call_flux(access.receiver, access.secret())
         elif access.kubeconfig:
             if name not in self._apis:
                 self._apis[name] = access.api()

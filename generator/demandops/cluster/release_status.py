@@ -1,8 +1,8 @@
-"""The status of releases as their clusters report it, for the command line and the page."""
+"""Finds the clusters whose bootstrap file is older than the one in the state repo."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from typing import Literal
@@ -14,8 +14,110 @@ from demandops.cluster.health.release_health import (
     History,
     State,
     Target,
+    name_of,
 )
 from demandops.cluster.object_cache import ObjectCache
+from demandops.render.bootstrap import digest_in, digest_of
+from demandops.render.paths import bootstrap_path
+
+
+@dataclass(frozen=True, slots=True)
+class OldBootstrap:
+    cluster: str
+    file: str
+    domains: tuple[str, ...]  # whose objects are old or missing
+    command: str
+
+    def __str__(self) -> str:
+        return (
+            f"cluster '{self.cluster}' does not have the current {self.file} (access domains: "
+            f"{', '.join(self.domains)}); an administrator of the cluster must apply it: "
+            f"{self.command}"
+        )
+
+
+def old_bootstraps(
+    domains: Collection[ClusterDomain],
+    caches: Mapping[str, ObjectCache],
+    read: Callable[[str], str | None],
+) -> list[OldBootstrap]:
+    """Return the clusters without the current bootstrap file; skip domains that cannot be read."""
+    clusters = []
+    for cluster in sorted({domain.cluster for domain in domains} & caches.keys()):
+        path = bootstrap_path(cluster)
+        digest = digest_in(read(path) or "")
+        store, objects = caches[cluster], caches[cluster].objects()
+        old = tuple(
+            domain.name
+            for domain in domains
+            if domain.cluster == cluster
+            and store.unknown_health(domain) is None
+            and digest_of(objects.get(health_reader(domain).follower(domain)) or {}) != digest
+        )
+        if digest and old:
+            command = f"git show main:{path} | kubectl apply -f -"
+            clusters.append(OldBootstrap(cluster, path, old, command))
+    return clusters
+
+
+# ---- objects that a GitOps controller created and no longer removes, because it forgot them ----
+
+
+@dataclass(frozen=True, slots=True)
+class Orphan:
+    cluster: str
+    kind: str
+    namespace: str
+    name: str
+
+    @property
+    def object(self) -> str:
+        return name_of((self.kind, self.namespace, self.name))
+
+    @property
+    def command(self) -> str:
+        """The command that deletes the object and, for a connection end, also its ConfigMap."""
+        names = [f"{self.kind.lower()}/{self.name}"]
+        names += [f"configmap/{self.name}"] if self.kind == "Deployment" else []
+        return f"kubectl -n {self.namespace} delete --ignore-not-found {' '.join(names)}"
+
+    def __str__(self) -> str:
+        return (
+            f"{self.object} on cluster '{self.cluster}' belongs to no release any more; an "
+            f"administrator of the cluster must delete it: {self.command}"
+        )
+
+
+def orphans(
+    domains: Collection[ClusterDomain],
+    targets: Iterable[Target],
+    commit: str,
+    caches: Mapping[str, ObjectCache],
+    history: History,
+) -> Iterator[Orphan]:
+    """Yield the objects that are left on clusters, sorted by cluster, domain and key."""
+    needed = {(target.domain, health_reader(target.domain).key(target)) for target in targets}
+    for domain in sorted(domains, key=lambda domain: (domain.cluster, domain.name)):
+        store = caches.get(domain.cluster)
+        if store is None or store.unknown_health(domain):
+            continue
+        reader, objects = health_reader(domain), store.objects()
+        # a controller that has not applied the newest commit may still remove objects
+        if not reader.domain_health(domain, commit, objects, history).reaches("reconciled"):
+            continue
+        for key, item in sorted(objects.items()):
+            kind, namespace, name = key
+            if (
+                namespace == domain.namespace
+                and kind in (reader.service_kind, "Deployment")
+                and (domain, key) not in needed
+                and not item["metadata"].get("deletionTimestamp")
+                and reader.applied_by(domain, item)
+            ):
+                yield Orphan(domain.cluster, kind, namespace, name)
+
+
+# ---- the status of releases as their clusters report it, for the command line and the page ----
 
 
 @dataclass(frozen=True, slots=True)

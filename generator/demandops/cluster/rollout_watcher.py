@@ -13,6 +13,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import partial
 
+from demandops.base.runtime import REAL, Runtime
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import (
@@ -26,7 +27,6 @@ from demandops.cluster.health.release_health import (
     worst,
 )
 from demandops.cluster.object_cache import ObjectCache
-from demandops.runtime import REAL, Runtime
 
 log = logging.getLogger("demandops")
 

@@ -2,7 +2,7 @@
 
 Each type has one module with a subclass of :class:`ConnectionType` and its clients. The subclass
 defines what the type supports and needs, and plans the clients of each connection as data.
-:mod:`demandops.render.connection_client` makes a client's file from that data and from
+:mod:`.manifests` makes a client's file from that data and from
 ``templates/connections/<type>/``. In that folder, ``client.yaml.j2`` is the template of a
 Deployment with the client's name, and ``schema.json`` lists the fields that the client's program
 reads.
@@ -15,16 +15,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
-from demandops import naming, strict_yaml
-from demandops.config.config import CLIENTS_FILE, Config
-from demandops.config.config_reader import ConfigReader
-from demandops.config.inventory import Node
-from demandops.config.override import UNSHAPED, Shaping, patched_settings
-from demandops.config.policy import AccessDomain
-from demandops.config.registry import ClientSettings
-from demandops.connections.connection import Connection
-from demandops.connections.route import Route
-from demandops.errors import Fault
+from demandops.base import naming, strict_yaml
+from demandops.base.errors import Fault
+from demandops.connections.connection import Connection, Route
+from demandops.model.config.config import CLIENTS_FILE, Config, ConfigReader
+from demandops.model.config.inventory import Node
+from demandops.model.config.override import UNSHAPED, Shaping, patched_settings
+from demandops.model.config.policy import AccessDomain
+from demandops.model.config.registry import ClientSettings
 
 Side = Literal["source", "target"]
 
@@ -181,7 +179,7 @@ class ConnectionType(ABC):
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         """Yield a fault for each reason why the type cannot link the two nodes of a connection.
 
-        Unknown nodes are no fault here, because :mod:`demandops.demand.admission` reports them.
+        Unknown nodes are no fault here, because :mod:`.admission` reports them.
         """
 
     def route_faults(

@@ -8,15 +8,14 @@ from typing import Literal
 from pydantic import PlainValidator
 from pydantic_core import PydanticKnownError
 
-from demandops.config.config import IMAGES_FILE, NODES_FILE, Config
-from demandops.connections.connection import Connection
+from demandops.base.errors import Fault, fault, sentences
+from demandops.base.naming import topic_problem
+from demandops.connections.connection import Connection, Route
 from demandops.connections.connection_type import UNSUPPORTED, ConnectionType
 from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
-from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
-from demandops.errors import Fault, fault, sentences
-from demandops.identifiers import topic_problem
+from demandops.model.config.config import IMAGES_FILE, NODES_FILE, Config
 
 # All connection types, in the order of the automatic choice. The ledger records the choice, so a
 # later change of the inventory does not change the type of a connection.
@@ -86,7 +85,7 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
     """Yield a fault for each reason why ``kind`` cannot carry a connection.
 
-    Unknown nodes are no fault here, because :mod:`demandops.demand.admission` reports them.
+    Unknown nodes are no fault here, because :mod:`.admission` reports them.
     """
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:

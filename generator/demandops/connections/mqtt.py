@@ -13,12 +13,10 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-from demandops import naming
-from demandops.config.config import BROKERS_FILE, CLIENTS_FILE, IMAGES_FILE, Config
-from demandops.config.config_reader import ConfigReader
-from demandops.config.inventory import Broker
-from demandops.config.registry import ClientSettings, MqttClientSettings
-from demandops.connections.connection import Connection
+from demandops.base import naming
+from demandops.base.errors import Fault, Refused, fault
+from demandops.base.quoting import quoted
+from demandops.connections.connection import Connection, Route
 from demandops.connections.connection_type import (
     UNSUPPORTED,
     ClientKey,
@@ -28,9 +26,15 @@ from demandops.connections.connection_type import (
     make_end,
     message_type,
 )
-from demandops.connections.route import Route
-from demandops.errors import Fault, Refused, fault
-from demandops.quoting import quoted
+from demandops.model.config.config import (
+    BROKERS_FILE,
+    CLIENTS_FILE,
+    IMAGES_FILE,
+    Config,
+    ConfigReader,
+)
+from demandops.model.config.inventory import Broker
+from demandops.model.config.registry import ClientSettings, MqttClientSettings
 
 # The path at which the certificate of the CA that signs for the broker is mounted
 CA_FILE = "/tls/ca.crt"

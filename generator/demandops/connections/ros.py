@@ -12,10 +12,9 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
-from demandops import naming
-from demandops.config.config import NODES_FILE, Config
-from demandops.config.inventory import Node, Wan
-from demandops.connections.connection import Connection
+from demandops.base import naming
+from demandops.base.errors import Fault, Refused, fault
+from demandops.connections.connection import Connection, Route
 from demandops.connections.connection_type import (
     UNSUPPORTED,
     ClientKey,
@@ -25,8 +24,8 @@ from demandops.connections.connection_type import (
     make_end,
     message_type,
 )
-from demandops.connections.route import Route
-from demandops.errors import Fault, Refused, fault
+from demandops.model.config.config import NODES_FILE, Config
+from demandops.model.config.inventory import Node, Wan
 
 _LOCAL, _WAN = "local", "wan"
 

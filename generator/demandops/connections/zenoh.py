@@ -13,9 +13,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from demandops import naming
-from demandops.config.config import NODES_FILE, Config
-from demandops.config.config_reader import ConfigReader
+from demandops.base import naming
+from demandops.base.errors import Fault, Refused, fault
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import (
     UNSUPPORTED,
@@ -24,7 +23,7 @@ from demandops.connections.connection_type import (
     Connections,
     ConnectionType,
 )
-from demandops.errors import Fault, Refused, fault
+from demandops.model.config.config import NODES_FILE, Config, ConfigReader
 
 
 class Zenoh(ConnectionType):

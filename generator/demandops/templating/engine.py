@@ -2,7 +2,7 @@
 
 ``{{ x }}`` writes one JSON value, so a value cannot change the structure of the YAML. An undefined
 name is an error. Templates of application definitions follow the same rules, in a sandbox and in
-another process (:mod:`demandops.templating.values`).
+another process (:mod:`.values`).
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from jinja2 import BytecodeCache, Environment, FileSystemLoader, StrictUndefined
 from jinja2.bccache import Bucket
 from jinja2.runtime import Undefined
 
-from demandops import naming, strict_yaml
-from demandops.settings import data_folder
+from demandops.base import naming, strict_yaml
+from demandops.base.settings import data_folder
 
 
 class _Verbatim(str):

@@ -1,32 +1,190 @@
-"""The Helm values of a service, from what people wrote: a values template, a chart, overrides.
-
-What people write may never end. So this module runs in another process, which can be killed
-(:mod:`demandops.evaluator`). That process starts quickly only because nothing here imports the
-configuration or pydantic. The core gets a function of the type :data:`Evaluate`, as it gets the
-time, and so does not know where the values are computed.
-"""
+"""Finds the line of a values template that produced a faulty line of the rendered text."""
 
 from __future__ import annotations
 
 import json
 import re
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, ItemsView, Iterable, Iterator, KeysView, Mapping, ValuesView
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, wraps
 from typing import Any
 
 import jsonschema_rs
-from jinja2 import FunctionLoader, TemplateError
-from jinja2.exceptions import TemplateNotFound, TemplateSyntaxError
+from jinja2 import FunctionLoader, TemplateError, nodes
+from jinja2.exceptions import SecurityError, TemplateNotFound, TemplateSyntaxError
+from jinja2.runtime import Context, Undefined
+from jinja2.sandbox import ImmutableSandboxedEnvironment
+from jinja2.visitor import NodeTransformer
 
-from demandops import strict_yaml
-from demandops.charts import chart_files
-from demandops.errors import Fault, InvalidInput, fault, field_path
-from demandops.quoting import quoted
+from demandops.base import strict_yaml
+from demandops.base.errors import Fault, InvalidInput, fault, field_path
+from demandops.base.quoting import quoted
+from demandops.base.strict_yaml import not_writable
+from demandops.templating import chart_files
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
-from demandops.templating.template_lines import with_template_lines
-from demandops.templating.template_sandbox import Sandbox
+
+_EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
+_PLACE = re.compile(r"line (\d+)")
+# The most characters that a searched line may have. The search for a longer line could take too
+# long.
+_LONGEST = 2_000
+
+
+def with_template_lines(faults: Iterable[Fault], template: str, rendered: str) -> Iterator[Fault]:
+    """Yield faults of a rendered text, each with the template's line if this line is known."""
+    template_lines, rendered_lines = template.splitlines(), rendered.splitlines()
+    fields: Mapping[str, int] | None = None
+    for fault in faults:
+        if place := _PLACE.match(fault.field):
+            number: int | None = int(place[1])
+        else:
+            fields = strict_yaml.lines(rendered) if fields is None else fields
+            number = strict_yaml.nearest(fault.field.removeprefix("values."), fields)
+        candidates: list[int] = []
+        if number and number <= len(rendered_lines):
+            written = rendered_lines[number - 1]
+            lines = [*enumerate(template_lines, 1)] if len(written) <= _LONGEST else []
+            candidates = [at for at, line in lines if line == written]
+            candidates = candidates or [at for at, line in lines if _may_write(line, written)]
+        # a wrong line would mislead, so of several none is named
+        line = candidates[0] if len(candidates) == 1 else None
+        yield replace(fault, line=fault.line or line)
+
+
+def _may_write(line: str, rendered: str) -> bool:
+    """Return whether ``rendered`` has all text around the expressions of a template's line."""
+    first, *others = _EXPRESSION.split(line)
+    if not others or not "".join((first, *others)).strip() or not rendered.startswith(first):
+        return False
+    at, end = len(first), len(rendered) - len(others[-1])
+    for part in others[:-1]:
+        at = rendered.find(part, at)
+        if at < 0:
+            return False
+        at += len(part)
+    return at <= end and rendered.endswith(others[-1])
+
+
+# ---- a Jinja sandbox in which a template gives the same text in every process ----
+#
+# Templates can use only the filters and methods listed here, and the engine's own filters. Many of
+# the others give random results or make HTML. Nothing that is no data becomes text, because the
+# text of a method, say, has an address of memory. How long a template runs and how large its values
+# become is not the sandbox's matter: it runs in a process with limits (:mod:`.evaluator`).
+
+_FILTERS = re.findall(
+    r"\w+",
+    "abs attr batch capitalize center count d default dictsort first float format groupby indent "
+    "int items join last length list lower map max min reject rejectattr replace reverse round "
+    "select selectattr slice sort string sum title trim truncate unique upper urlencode "
+    "wordcount",
+)
+_METHODS: dict[type, list[str]] = {
+    str: re.findall(
+        r"\w+",
+        "capitalize center count endswith find index isalnum isalpha isdigit islower isnumeric "
+        "isupper join ljust lower lstrip partition removeprefix removesuffix replace rfind rjust "
+        "rpartition rsplit rstrip split splitlines startswith strip title upper zfill",
+    ),
+    dict: ["get", "items", "keys", "values"],
+    list: ["count", "index"],
+    tuple: ["count", "index"],
+}
+_BUILT_IN = (str, int, float, bytes, dict, list, tuple, range)
+_VIEWS = (KeysView, ItemsView, ValuesView)
+# the text of StrictUndefined is an error of its own, which names what is missing
+_PLAIN = (str, int, float, type(None), range, Undefined)
+
+
+def _as_data(value: Any) -> Any:  # noqa: ANN401
+    """Return a value, an iterator or view as a list; raise SecurityError if a part is no data."""
+    if isinstance(value, (Iterator, *_VIEWS)):
+        value = list(value)
+    parts = [value]
+    while parts:
+        part = parts.pop()
+        if isinstance(part, (list, tuple, *_VIEWS)):
+            parts.extend(part)
+        elif isinstance(part, Mapping):
+            parts.extend(part)
+            parts.extend(part.values())
+        elif not isinstance(part, _PLAIN):
+            raise SecurityError(not_writable(part))
+    return value
+
+
+@lru_cache(maxsize=256)  # each rendering has a sandbox, but all have the same filters
+def _of_data(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Change a filter or format so that its arguments must be data."""
+    passed = 1 if hasattr(function, "jinja_pass_arg") else 0
+
+    @wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+        named = {name: _as_data(value) for name, value in kwargs.items()}
+        return function(*args[:passed], *map(_as_data, args[passed:]), **named)
+
+    return checked
+
+
+def _concatenated(parts: list[Any]) -> str:
+    return "".join(map(str, parts))
+
+
+class _Concatenations(NodeTransformer):
+    """Replaces each ``~`` of a template by a filter, so that its operands must be data."""
+
+    def __init__(self, environment: Sandbox) -> None:
+        self._environment = environment
+
+    def visit_Concat(self, node: nodes.Concat) -> nodes.Filter:
+        self.generic_visit(node)
+        operands = nodes.List(node.nodes, lineno=node.lineno)
+        place = {"lineno": node.lineno, "environment": self._environment}
+        return nodes.Filter(operands, "_concatenated", [], [], None, None, **place)
+
+
+class Sandbox(ImmutableSandboxedEnvironment):
+    intercepted_binops = frozenset({"%"})  # the format `%s` would write anything as text
+
+    def __init__(self, filters: Mapping[str, Callable[..., Any]], **options: Any) -> None:  # noqa: ANN401
+        super().__init__(**options)
+        finalize = self.finalize
+        assert finalize is not None  # noqa: S101 - our own options
+        self.finalize = lambda value: finalize(_as_data(value))
+        listed = {name: self.filters[name] for name in _FILTERS}
+        allowed = {**listed, **filters, "_concatenated": _concatenated}
+        self.filters = {name: _of_data(function) for name, function in allowed.items()}
+        del self.tests["sameas"]  # whether two values are one object is an accident
+        del self.globals["lipsum"]  # writes random text
+
+    def _parse(self, source: str, name: str | None, filename: str | None) -> nodes.Template:
+        tree: nodes.Template = _Concatenations(self).visit(super()._parse(source, name, filename))
+        return tree
+
+    def call_binop(self, context: Context, operator: str, left: Any, right: Any) -> Any:  # noqa: ANN401
+        return super().call_binop(context, operator, left, _as_data(right))
+
+    def call(__self, __context: Context, __obj: Any, *args: Any, **kwargs: Any) -> Any:  # noqa: ANN401
+        owner = getattr(__obj, "__self__", None)
+        for kind in _BUILT_IN:
+            if isinstance(owner, kind) and __obj.__name__ not in _METHODS.get(kind, ()):
+                raise SecurityError(f"a template may not call the method '{__obj.__name__}'")
+        return super().call(__context, __obj, *args, **kwargs)
+
+    def wrap_str_format(self, value: Any) -> Callable[..., str] | None:  # noqa: ANN401
+        wrapped = super().wrap_str_format(value)
+        return _of_data(wrapped) if wrapped else None
+
+
+# ---- values ----
+#
+# The Helm values of a service, from what people wrote: a values template, a chart, overrides.
+#
+# What people write may never end. So this module runs in another process, which can be killed
+# (:mod:`.evaluator`). That process starts quickly only because nothing here imports the
+# configuration or pydantic. The core gets a function of the type :data:`Evaluate`, as it gets the
+# time, and so does not know where the values are computed.
 
 _MAX_LENGTH = 100_000  # characters of a values template
 _MAX_RENDERED = 1_000_000  # characters that it writes; Kubernetes takes objects of 1.5 MB

@@ -1,9 +1,4 @@
-"""What the page shows: the state at a commit, the health of releases and the open proposals.
-
-A commit state is the state at one commit, with everything that the page derives from it. The newest
-situation is a commit state with the reports of the clusters and the open proposals. The situation
-at an earlier commit has only the commit state.
-"""
+"""The health of a release in one word, and the color of this word on the page."""
 
 from __future__ import annotations
 
@@ -13,29 +8,74 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any
 
-from demandops.cluster.bootstrap_status import OldBootstrap
+from demandops.base.errors import Fault
+from demandops.base.naming import Subject, SubjectKind
 from demandops.cluster.health.release_health import Health, Target
-from demandops.cluster.orphans import Orphan
-from demandops.cluster.release_status import ReleaseStatus
-from demandops.config.config import Config
-from demandops.config.override import Override
-from demandops.decision import State
-from demandops.demand.claim import Claim
-from demandops.errors import Fault
-from demandops.ledger.claim_changes import changes_on
-from demandops.ledger.world import World
-from demandops.plan.overrides.claim_overrides import without_suspended
-from demandops.plan.planner import denied_release, plan
-from demandops.plan.release import Release, ServiceKey, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey, affected_keys, all_keys, keys_of_claims
-from demandops.plan.views import release_causes
-from demandops.plan.views.override_report import Entry, override_report
-from demandops.service import rollout_targets
-from demandops.staterepo.history.commit_log import LogEntry
-from demandops.staterepo.load.problem_report import Problem
-from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.write.proposal_branch import PendingProposal
-from demandops.subject import Subject, SubjectKind
+from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.decide.planning.overrides import without_suspended
+from demandops.decide.planning.planner import denied_release, plan
+from demandops.decide.planning.release_keys import (
+    ReleaseKey,
+    affected_keys,
+    all_keys,
+    keys_of_claims,
+)
+from demandops.decide.state import State
+from demandops.model.config.config import Config
+from demandops.model.config.override import Override
+from demandops.model.demand.claim import Claim
+from demandops.model.ledger.ledger import World, changes_on
+from demandops.model.release import Release, ServiceKey, ServiceRelease
+from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.load.last_valid_config import Problem
+from demandops.repo.load.snapshot import Snapshot
+from demandops.repo.write.proposal_branch import PendingProposal
+from demandops.serve import rollout_targets
+from demandops.views import release_causes
+from demandops.views.override_report import Entry, override_report
+
+# The words for a health, each with its color on the page, from the worst to the best health.
+WORDS = {
+    "failing": "bad",
+    "waiting": "busy",
+    "starting": "busy",
+    "unknown": "none",
+    "healthy": "good",
+}
+
+# The index of each word in `WORDS`; a lower index means worse health.
+RANKS = {word: float(place) for place, word in enumerate(WORDS)}
+
+
+def word_of(status: ReleaseStatus) -> str:
+    if status.state == "unknown":
+        return "unknown"
+    if status.health.failing:
+        return "failing"
+    return {"healthy": "healthy", "reconciled": "starting", "waiting": "waiting"}[status.state]
+
+
+def since_of(status: ReleaseStatus) -> datetime | None:
+    """Return when a release's state last changed; None if the cluster reports no valid time."""
+    try:  # Python 3.10 reads no "Z"
+        since = datetime.fromisoformat(status.since.replace("Z", "+00:00"))
+    except ValueError:
+        return None
+    return since if since.tzinfo else None
+
+
+def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
+    """Return the word for the worst health of releases; ``unknown`` if there are no releases."""
+    return min(map(word_of, statuses), key=RANKS.__getitem__, default="unknown")
+
+
+# ---- situation ----
+#
+# What the page shows: the state at a commit, the health of releases and the open proposals.
+#
+# A commit state is the state at one commit, with everything that the page derives from it. The
+# newest situation is a commit state with the reports of the clusters and the open proposals. The
+# situation at an earlier commit has only the commit state.
 
 _UNKNOWN = ReleaseStatus(Health("waiting"))
 

@@ -10,20 +10,12 @@ from urllib.parse import urlencode
 
 from starlette.requests import Request
 
-from demandops.render.changes.override_state import override_state
+from demandops.views.override_report import override_state
+from demandops.web import filtered_table, fleet_map, not_ready, release_view, time_line
+from demandops.web.filtered_table import Filter, Link, Row
 from demandops.web.follower import MOST_COMMITS, Follower
+from demandops.web.lists import LISTS, rows_of
 from demandops.web.situation import Situation
-from demandops.web.views import (
-    demand_view,
-    filtered_table,
-    fleet_map,
-    not_ready,
-    rates,
-    release_view,
-    time_line,
-)
-from demandops.web.views.filtered_table import Filter, Link, Row
-from demandops.web.views.lists import LISTS, rows_of
 
 # The parameters that a link to another view keeps: the chosen commit or time, and the filter.
 _KEPT = ("at", "q")
@@ -103,7 +95,9 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _demand(asked: ViewRequest) -> tuple[str, Data]:
-    demand = demand_view.explained_demand(asked.situation, asked.follower.reader(), asked.get("id"))
+    demand = release_view.explained_demand(
+        asked.situation, asked.follower.reader(), asked.get("id")
+    )
     return "demand.html.j2", {"demand": demand}
 
 
@@ -161,9 +155,9 @@ def _rates(asked: ViewRequest) -> tuple[str, Data]:
         for commit in asked.follower.history
         if asked.filter.matches(time_line.of_commit(commit).row())
     ]
-    plots = rates.plots(commits, health, asked.situation.now, span)
+    plots = time_line.plots(commits, health, asked.situation.now, span)
     data = {"plots": plots, "span": span, "spans": time_line.SPANS}
-    return "rates.html.j2", data | {"width": rates.WIDTH, "height": rates.HEIGHT}
+    return "rates.html.j2", data | {"width": time_line.WIDTH, "height": time_line.HEIGHT}
 
 
 VIEWS: Mapping[str, View] = {

@@ -6,14 +6,13 @@ from collections.abc import Callable, Iterable, Mapping
 from math import inf
 
 from application_manager_interfaces.action import DeploymentRequest
-from demandops.detection.detector import Want
-from demandops.detection.events.detection_state import Key
-from demandops.detection.rules.rule_demand import Goal
-from demandops.detection.wanted_demands import Outcome, Sending, WantedDemands
-from demandops.quoting import one_line, quoted
-from demandops.runtime import REAL
+from demandops.base.quoting import one_line, quoted
+from demandops.base.runtime import REAL
+from demandops.detect.detection_state import Key
+from demandops.detect.detector import Outcome, Sending, Want, WantedDemands
+from demandops.detect.rule_demand import Goal
 
-from demandops_ros.action_endpoints import DemandError, GoalSender
+from demandops_ros.actions import DemandError, GoalSender
 from demandops_ros.client import DemandClient
 from demandops_ros.messages import fill_message
 

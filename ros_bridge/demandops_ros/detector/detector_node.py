@@ -1,36 +1,92 @@
-"""The node of the event detector, which watches topics and sends demands.
-
-The node's decisions depend only on events, not on which services are deployed. The node reads the
-latched bookkeeping only at its start, to find the demands of its earlier run. So a restart does not
-end these demands.
-"""
+"""The detector's status on ``/diagnostics``: its rules, its data and its demands."""
 
 from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from demandops.detection.booked_events import booked_events
-from demandops.detection.detector import Detector
-from demandops.detection.events.detection_state import Observation
-from demandops.detection.rules.rule_file import RuleFile, read
-from demandops.errors import InvalidInput
-from demandops.input_file import read_input
-from demandops.quoting import one_line
-from demandops.runtime import REAL
+from demandops.base.errors import InvalidInput
+from demandops.base.quoting import one_line
+from demandops.base.runtime import REAL
+from demandops.base.strict_yaml import read_input
+from demandops.detect.detection_state import Observation
+from demandops.detect.detector import Detector, booked_events
+from demandops.detect.rule_file import RuleFile, read
 from demandops_interfaces.msg import Bookkeeping
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
 from demandops_ros import ros_process
-from demandops_ros.detector import detector_parameters
+from demandops_ros.detector import detect_command
 from demandops_ros.detector.demand_sender import DemandSender
-from demandops_ros.detector.detector_diagnostics import DetectorDiagnostics
 from demandops_ros.detector.source_subscriptions import SourceSubscriptions, faults_of_types
+from demandops_ros.publications import status
+
+_MOST_REFUSALS = 20
+
+
+class DetectorDiagnostics:
+    def __init__(self, node: Node, rules: str) -> None:
+        self._node, self._rules = node, rules
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+
+    def publish(
+        self,
+        problems: Sequence[str],
+        detector: Detector,
+        topics: SourceSubscriptions,
+        sender: DemandSender,
+        is_started: bool,
+    ) -> None:
+        message = DiagnosticArray()
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        statuses = []
+
+        level, text = DiagnosticStatus.OK, "valid"
+        if problems:
+            level = DiagnosticStatus.WARN
+            text = "the file cannot be read or is invalid; the last valid rules are in effect"
+        values = {"rules": str(len(detector.file.rules))}
+        values |= {f"problem {at}": problem for at, problem in enumerate(problems, start=1)}
+        statuses.append(status("demandops_detector: rules", self._rules, level, text, values))
+
+        level, text = DiagnosticStatus.OK, "detecting"
+        if not is_started:
+            level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping or /clock"
+        values = {
+            "topics": str(topics.topics),
+            "entities": str(detector.entities),
+            "messages": str(topics.messages),
+            "messages left out": str(topics.unreadable),
+        }
+        statuses.append(status("demandops_detector: data", self._rules, level, text, values))
+
+        _, unanswered, refusals = sender.summary()
+        level, text = DiagnosticStatus.OK, "every demand is answered"
+        if unanswered:
+            text = f"{unanswered} demands have no answer yet"
+        if refusals:
+            level = DiagnosticStatus.WARN
+            text = f"{len(refusals)} demands failed and are tried again"
+        values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
+        for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
+            values[" ".join((rule, *subjects))] = why
+        statuses.append(status("demandops_detector: demands", self._rules, level, text, values))
+
+        message.status = statuses
+        self._publisher.publish(message)
+
+
+# ---- the node of the event detector, which watches topics and sends demands ----
+#
+# The node's decisions depend only on events, not on which services are deployed. The node reads the
+# latched bookkeeping only at its start, to find the demands of its earlier run. So a restart does
+# not end these demands.
 
 _DISCOVERY_S = 0.5
 _RELOAD_S = 1.0
@@ -46,7 +102,7 @@ _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 class DetectorNode(Node):  # type: ignore[misc]
     def __init__(self, rules: str | None) -> None:
         super().__init__("demandops_detector")
-        settings = detector_parameters.declare(self, rules)
+        settings = detect_command.declare(self, rules)
         ros_process.log_to(self.get_logger(), settings["log_level"])
         self._path, self._settle_s = Path(settings["rules"]), float(settings["settling_time"])
         file, self._text = _read_rules(self._path)

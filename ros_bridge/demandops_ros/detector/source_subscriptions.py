@@ -10,12 +10,12 @@ from functools import partial
 from importlib import import_module
 from typing import Any
 
-from demandops.detection.events.detection_state import Observation
-from demandops.detection.message_reader import MessageReader, Unreadable
-from demandops.detection.rules.rule_file import RuleFile
-from demandops.detection.rules.topic_pattern import entity_in
-from demandops.errors import Fault, fault
-from demandops.quoting import one_line
+from demandops.base.errors import Fault, fault
+from demandops.base.quoting import one_line
+from demandops.detect.condition import entity_in
+from demandops.detect.detection_state import Observation
+from demandops.detect.message_reader import MessageReader, Unreadable
+from demandops.detect.rule_file import RuleFile
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 

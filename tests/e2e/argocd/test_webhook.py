@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from demandops.cluster import controller_webhook
-from demandops.http_call import NoAnswer
+from demandops.base.http_call import NoAnswer
+from demandops.cluster import reconcile_trigger
 from demandops_ros import DemandClient
 
 from tests.e2e.common.access import access_file, documented_roles, limited
@@ -99,5 +99,5 @@ def test_a_call_with_another_signature_or_none_is_refused(
 ) -> None:
     url, pushed = f"{rig.url(SERVER)}/api/webhook", (rig.git_url(world.name), "", world.tip(), None)
     with pytest.raises(NoAnswer, match=r"^it answered 400$"):
-        controller_webhook.call_argocd(url, secret, *pushed)
-    controller_webhook.call_argocd(url, WEBHOOK_SECRET.encode(), *pushed)
+        reconcile_trigger.call_argocd(url, secret, *pushed)
+    reconcile_trigger.call_argocd(url, WEBHOOK_SECRET.encode(), *pushed)

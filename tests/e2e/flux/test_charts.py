@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.staterepo.pull_request.helm import HELM_BIN
+from demandops.repo.pull_request.helm import HELM_BIN
 
 from tests.e2e.common.expected import NAMESPACE
 from tests.e2e.common.golden import golden

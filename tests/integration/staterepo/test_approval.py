@@ -16,10 +16,10 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.demand.lease import Lease
-from demandops.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
-from demandops.service import Ticket
-from demandops.service.approvals import approvals
+from demandops.base.errors import Refused, ShuttingDown, StateRepoError, TurnedDown, Withdrawn
+from demandops.model.demand.claim import Lease
+from demandops.serve.approvals import approvals
+from demandops.serve.queue import Ticket
 
 from tests.kit import goals, rig
 from tests.kit.chance import IN_FULL
@@ -90,9 +90,9 @@ def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
 def assert_rendered(bare: Path) -> None:
     """Check that the files below clusters/ are those that ledger and configuration give."""
     import pygit2
-    from demandops.decision import rendered_files
-    from demandops.staterepo.git import tree as trees
-    from demandops.staterepo.load import snapshot as snapshots
+    from demandops.decide.state import rendered_files
+    from demandops.repo.git import tree as trees
+    from demandops.repo.load import snapshot as snapshots
 
     repo = pygit2.Repository(str(bare))
     state = snapshots.load(repo, repo.head.target).state

@@ -13,8 +13,8 @@ from typing import Any
 from urllib.parse import parse_qs, urlparse
 
 import pytest
-from demandops.errors import TurnedDown, Withdrawn
-from demandops.service.approvals import forge_worker
+from demandops.base.errors import TurnedDown, Withdrawn
+from demandops.serve.approvals import forge_worker
 
 from tests.kit import goals, rig
 from tests.kit.generator import Proposed

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from demandops.service import worker
+from demandops.serve import worker
 
 from tests.kit import rig
 from tests.kit.rig import Gate, goal, leave

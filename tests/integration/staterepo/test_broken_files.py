@@ -15,11 +15,11 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
-from demandops.errors import InvalidInput
-from demandops.service import Generator
-from demandops.settings import GENERATED_ROOTS, RENDER_VERSION
-from demandops.staterepo.history import authorship
-from demandops.staterepo.load import snapshot, state_in_effect
+from demandops.base.errors import InvalidInput
+from demandops.base.settings import GENERATED_ROOTS, RENDER_VERSION
+from demandops.repo.history import commit_message
+from demandops.repo.load import snapshot, state_in_effect
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.chance import IN_FULL
@@ -314,13 +314,13 @@ def test_with_many_broken_files_a_demand_reads_no_history(
     bare: Path, person: Person, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
-    origin_of = authorship.fault_origin
+    origin_of = commit_message.fault_origin
 
     def fault_origin(*args: Any) -> Callable[[str], tuple[str, str] | None]:
         origin = origin_of(*args)
         return lambda path: (asked.append(path), origin(path))[1]
 
-    monkeypatch.setattr(authorship, "fault_origin", fault_origin)
+    monkeypatch.setattr(commit_message, "fault_origin", fault_origin)
     with rig.running(bare) as generator:
         person.change({f"overrides/o{number:03}.yaml": "a: [" for number in range(150)})
         rig.book(generator, goal(1))

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.errors import Refused
-from demandops.service import worker
+from demandops.base.errors import Refused
+from demandops.serve import worker
 
 from tests.kit import rig
 from tests.kit.clock import Clock
@@ -124,7 +124,7 @@ def test_a_demand_that_comes_meanwhile_is_next(bare: Path, monkeypatch: pytest.M
 
 DIES = f"""
 import json, os, signal, sys
-from demandops.runtime import Runtime
+from demandops.base.runtime import Runtime
 from demandops.service import Generator
 
 class Dying(Runtime):

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from demandops.cli.main import run
-from demandops.service import Generator
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.cli import Run
@@ -198,7 +198,7 @@ def test_a_decommission_cut_off_before_it_was_published_is_taken_up_once(
     url: str, bare: Path, demandops: Run
 ) -> None:
     """A decommission waits in the journal like any demand, so the next start carries it out."""
-    from demandops.demand.demand_request import Decommission
+    from demandops.model.demand.demand_request import Decommission
 
     generator = Generator(url)
     rig.book(generator, goal(1))

@@ -14,22 +14,22 @@ from pathlib import Path
 import git as gitpython
 import pygit2
 import pytest
-from demandops import settings
-from demandops.errors import StateRepoError, Unsound
-from demandops.runtime import Runtime
-from demandops.service import Generator
-from demandops.staterepo import reader
-from demandops.staterepo.git.remote_repository import RemoteRepository
-from demandops.staterepo.git.repository import (
+from demandops.base import settings
+from demandops.base.errors import StateRepoError, Unsound
+from demandops.base.runtime import Runtime
+from demandops.repo import reader
+from demandops.repo.git.remote_repository import RemoteRepository
+from demandops.repo.git.repository import (
     DiskFull,
     PushDenied,
     RemoteAway,
     StateRepository,
     disk_error,
 )
-from demandops.staterepo.git.signing import create_commit
-from demandops.staterepo.git.tree import commit_of
-from demandops.staterepo.history.commit_message import generator_signature
+from demandops.repo.git.signing import create_commit
+from demandops.repo.git.tree import commit_of
+from demandops.repo.history.commit_message import generator_signature
+from demandops.serve.generator import Generator
 from pygit2 import Oid, Repository
 
 from tests.kit import rig

@@ -15,12 +15,12 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops import settings
+from demandops.base import settings
+from demandops.base.errors import QueueFull, Withdrawn
 from demandops.cli.main import run
-from demandops.errors import QueueFull, Withdrawn
-from demandops.service import Generator
-from demandops.staterepo.load import problem_report
-from demandops.staterepo.write.journal import Journal
+from demandops.repo.load import last_valid_config
+from demandops.repo.write.journal import Journal
+from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
@@ -59,7 +59,7 @@ def followed(bare: Path, made: str) -> rig.Commit:
 
 
 def problems(bare: Path) -> list[dict[str, str]]:
-    text = rig.git(bare, "show", f"main:{problem_report.PATH}", check=False)
+    text = rig.git(bare, "show", f"main:{last_valid_config.PATH}", check=False)
     data = yaml.safe_load(text) if "problems:" in text else {"problems": []}
     return list(data["problems"])
 
@@ -190,9 +190,9 @@ def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
         assert all(problem["file"].startswith(where) for problem in told), told
         rig.wait_until(lambda: generator.snapshot.problems, "diagnostics show the change")
         assert rig.git(bare, "rev-parse", "main:clusters") == standing
-        report = rig.git(bare, "rev-parse", f"main:{problem_report.PATH}")
+        report = rig.git(bare, "rev-parse", f"main:{last_valid_config.PATH}")
         rig.book(generator, goal(3), goal(6), leave(3))
-        assert rig.git(bare, "rev-parse", f"main:{problem_report.PATH}") == report, (
+        assert rig.git(bare, "rev-parse", f"main:{last_valid_config.PATH}") == report, (
             "a demand must not change the report"
         )
         assert [c.one("Operation") for c in rig.commits(bare)][-3:] == ["join", "join", "shutdown"]
@@ -225,11 +225,13 @@ def test_a_report_that_a_person_removes_or_edits_is_put_right(bare: Path, person
         rig.book(generator, goal(1))
         made = person.change(_node_on_no_cluster(bare), "A merge gone wrong")
         followed(bare, made)
-        report = file_of(bare, problem_report.PATH)
-        followed(bare, person.change({problem_report.PATH: None}, "No reports, please"))
-        assert file_of(bare, problem_report.PATH) == report
-        followed(bare, person.change({problem_report.PATH: "problems: [{file: x}, 3]\n"}, "Mine"))
-        assert file_of(bare, problem_report.PATH) == report
+        report = file_of(bare, last_valid_config.PATH)
+        followed(bare, person.change({last_valid_config.PATH: None}, "No reports, please"))
+        assert file_of(bare, last_valid_config.PATH) == report
+        followed(
+            bare, person.change({last_valid_config.PATH: "problems: [{file: x}, 3]\n"}, "Mine")
+        )
+        assert file_of(bare, last_valid_config.PATH) == report
     rig.assert_sound(bare)
 
 

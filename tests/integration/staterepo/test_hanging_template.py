@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from demandops.errors import OverLimit
-from demandops.service import Generator, evaluation, rollback_goal
+from demandops.base.errors import OverLimit
+from demandops.serve import evaluation, rollback_goal
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.config import skeleton

@@ -8,8 +8,8 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from demandops.staterepo import reader
-from demandops.staterepo.git.open_repository import connect
+from demandops.repo import reader
+from demandops.repo.git.open_repository import connect
 
 from tests.kit import rig
 from tests.kit.rig import Person

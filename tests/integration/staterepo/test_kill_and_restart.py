@@ -10,8 +10,8 @@ from pathlib import Path
 from random import Random
 
 import pytest
-from demandops.service import Generator
-from demandops.staterepo.write.journal import DamagedJournal
+from demandops.repo.write.journal import DamagedJournal
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.cli import Run

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops import settings
-from demandops.demand.claim import Claim
-from demandops.errors import Refused
-from demandops.service import Generator
-from demandops.staterepo.write.journal import JournalEntry
-from demandops.staterepo.write.slot import Slot
+from demandops.base import settings
+from demandops.base.errors import Refused
+from demandops.model.demand.claim import Claim
+from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock

@@ -8,9 +8,9 @@ import os
 from pathlib import Path
 
 import pytest
-from demandops.errors import StateRepoError, Unsound
-from demandops.staterepo.git.local_repository import LocalRepository
-from demandops.staterepo.write.journal import Journal, JournalEntry
+from demandops.base.errors import StateRepoError, Unsound
+from demandops.repo.git.local_repository import LocalRepository
+from demandops.repo.write.journal import Journal, JournalEntry
 
 from tests.kit import rig
 from tests.kit.repo import git, tip

@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops.errors import StateRepoError
-from demandops.service import Generator
+from demandops.base.errors import StateRepoError
+from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.git_over_http import Server

@@ -8,7 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from demandops.errors import InvalidInput, Refused, StateRepoError
+from demandops.base.errors import InvalidInput, Refused, StateRepoError
 
 from tests.kit import rig
 from tests.kit.rig import Person, goal, leave

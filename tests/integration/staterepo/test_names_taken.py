@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops import naming
+from demandops.base import naming
+from demandops.base.errors import Refused
+from demandops.base.naming import Subject, SubjectKind
 from demandops.cli.main import run
-from demandops.demand.claim import ClaimKey
-from demandops.errors import Refused
-from demandops.ledger import claim_file
-from demandops.service import Ticket
-from demandops.staterepo import reader
-from demandops.staterepo.load import problem_report
-from demandops.staterepo.pull_request import merge_check
-from demandops.staterepo.write.proposal_branch import branch_name
-from demandops.subject import Subject, SubjectKind
+from demandops.model.demand.claim import ClaimKey
+from demandops.model.ledger import claim_file
+from demandops.repo import reader
+from demandops.repo.load import last_valid_config
+from demandops.repo.pull_request import merge_check
+from demandops.repo.write.proposal_branch import branch_name
+from demandops.serve.queue import Ticket
 
 from tests.kit import rig
 from tests.kit.generator import Proposed
@@ -104,7 +104,7 @@ def test_a_claim_by_hand_whose_release_has_the_name_of_another_is_held_back(
         person.change(held_back)
         rig.book(generator, joining("edge/other"))
         assert claims(bare) == {PAIR[0], "edge/other"}
-        problems = yaml.safe_load(read(bare, problem_report.PATH))["problems"]
+        problems = yaml.safe_load(read(bare, last_valid_config.PATH))["problems"]
         assert {problem["file"] for problem in problems} == {*held_back}
     person.fetch()
     faults = merge_check.check(person.folder).faults
@@ -128,7 +128,7 @@ def test_a_claim_by_hand_in_the_file_of_another_is_held_back(bare: Path, person:
         person.change({path: text})
         rig.book(generator, joining("edge/b"))
         assert claims(bare) == {first, "edge/b"}
-        assert path in read(bare, problem_report.PATH)
+        assert path in read(bare, last_valid_config.PATH)
     with rig.running(bare) as generator:  # the same after a restart
         rig.book(generator, joining("edge/c"))
         assert claims(bare) == {first, "edge/b", "edge/c"}

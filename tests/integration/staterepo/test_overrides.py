@@ -14,8 +14,10 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.errors import InvalidInput, Refused
-from demandops.service import Generator, Receipt, rollback_goal
+from demandops.base.errors import InvalidInput, Refused
+from demandops.serve import rollback_goal
+from demandops.serve.generator import Generator
+from demandops.serve.queue import Receipt
 
 from tests.kit import rig
 from tests.kit.clock import Clock

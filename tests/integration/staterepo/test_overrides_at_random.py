@@ -11,8 +11,8 @@ from contextlib import suppress
 from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
-from demandops.demand.claim import OVERRIDE_PREFIX
-from demandops.errors import DemandOpsError
+from demandops.base.errors import DemandOpsError
+from demandops.model.demand.claim import OVERRIDE_PREFIX
 
 from tests.kit import config, rig
 from tests.kit.rig import Person

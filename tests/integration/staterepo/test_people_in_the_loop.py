@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.service import Generator
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.config import override

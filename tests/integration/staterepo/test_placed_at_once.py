@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from demandops.errors import Refused
-from demandops.staterepo import reader
+from demandops.base.errors import Refused
+from demandops.repo import reader
 
 from tests.kit import rig
 from tests.kit.repo import read as file_of

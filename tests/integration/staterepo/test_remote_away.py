@@ -6,8 +6,8 @@ import shutil
 from pathlib import Path
 
 import pytest
-from demandops.errors import Refused, ShuttingDown, StateRepoError
-from demandops.service import Generator
+from demandops.base.errors import Refused, ShuttingDown, StateRepoError
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.rig import Gate, Stages, goal

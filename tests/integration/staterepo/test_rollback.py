@@ -6,8 +6,9 @@ import threading
 from pathlib import Path
 
 import pytest
-from demandops.errors import Refused
-from demandops.service import Generator, rollback_goal
+from demandops.base.errors import Refused
+from demandops.serve import rollback_goal
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 

@@ -7,7 +7,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from demandops.service import Generator, Receipt, Ticket
+from demandops.serve.generator import Generator
+from demandops.serve.queue import Receipt, Ticket
 
 from tests.kit import rig
 from tests.kit.rig import Drivers, demand, goal, leave

@@ -6,8 +6,8 @@ import threading
 from pathlib import Path
 
 import pytest
-from demandops.errors import StateRepoError
-from demandops.service import Generator
+from demandops.base.errors import StateRepoError
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.clock import Clock

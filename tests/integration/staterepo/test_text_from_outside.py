@@ -11,13 +11,13 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.demand.claim import ClaimKey
-from demandops.ledger import claim_file
-from demandops.service import Generator
-from demandops.staterepo import reader
-from demandops.staterepo.load import problem_report
-from demandops.staterepo.pull_request import merge_check
-from demandops.subject import Subject, SubjectKind
+from demandops.base.naming import Subject, SubjectKind
+from demandops.model.demand.claim import ClaimKey
+from demandops.model.ledger import claim_file
+from demandops.repo import reader
+from demandops.repo.load import last_valid_config
+from demandops.repo.pull_request import merge_check
+from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.repo import FORGER, git, read
@@ -156,7 +156,7 @@ def test_a_claim_by_hand_that_a_demand_could_not_book_is_held_back(
         person.change(claim)
         rig.book(generator, released(demands[1]))
         assert held(bare) == {("user1",)}
-        (problem,) = yaml.safe_load(read(bare, problem_report.PATH))["problems"]
+        (problem,) = yaml.safe_load(read(bare, last_valid_config.PATH))["problems"]
         assert problem["file"] == next(iter(claim))
         assert why in problem["message"]
     assert all(holds for holds, _ in verdicts(bare))
@@ -165,7 +165,7 @@ def test_a_claim_by_hand_that_a_demand_could_not_book_is_held_back(
         assert held(bare) == {("user1",), ("user2",)}
         person.change(dict.fromkeys(claim))
         rig.book(generator, demands[2])
-    assert problem_report.PATH not in git(bare, "ls-tree", "-r", "--name-only", "main")
+    assert last_valid_config.PATH not in git(bare, "ls-tree", "-r", "--name-only", "main")
 
 
 def released(demand: Any) -> Any:

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.errors import (
+from demandops.base.errors import (
     DemandOpsError,
     QueueFull,
     ShuttingDown,
@@ -18,9 +18,10 @@ from demandops.errors import (
     Unsound,
     Withdrawn,
 )
-from demandops.runtime import Runtime
-from demandops.service import Generator, Ticket
-from demandops.staterepo.write.journal import JournalEntry
+from demandops.base.runtime import Runtime
+from demandops.repo.write.journal import JournalEntry
+from demandops.serve.generator import Generator
+from demandops.serve.queue import Ticket
 
 from tests.kit import rig
 from tests.kit.clock import Clock

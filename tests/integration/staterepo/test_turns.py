@@ -6,9 +6,8 @@ import shutil
 import threading
 from pathlib import Path
 
-from demandops.service import Generator
-from demandops.staterepo.write.journal import JournalEntry
-from demandops.staterepo.write.slot import Slot
+from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.turns import Turns

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from demandops.service import Generator, rollback_goal
-from demandops.staterepo import reader
-from demandops.staterepo.audit.verification import Verdict
+from demandops.repo import reader
+from demandops.repo.verification import Verdict
+from demandops.serve import rollback_goal
+from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.config import override

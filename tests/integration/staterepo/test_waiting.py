@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from demandops.evaluator.process import processor_time
-from demandops.ledger import waiting
-from demandops.service import Generator
-from demandops.service.timing.waiting_turns import WaitingTurns
-from demandops.staterepo.write.commit_batch import CommitBatch
-from demandops.staterepo.write.journal import JournalEntry
-from demandops.staterepo.write.slot import Slot
+from demandops.model.ledger import records
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.repo.write.journal import JournalEntry, Slot
+from demandops.serve.generator import Generator
+from demandops.serve.timing.own_work import WaitingTurns
+from demandops.templating.evaluator import processor_time
 
 from tests.integration.staterepo.test_hanging_template import ENDLESS, TEMPLATE
 from tests.kit import rig
@@ -80,8 +79,8 @@ def test_demands_wait_and_are_booked_in_turn_by_any_generator(
         assert (again.commit, again.lease_s) == (rig.tip(bare), 600)
         rig.book(second, _release("a"))
         assert _runs(bare) == ["of-c"]
-    assert rig.git(bare, "ls-tree", "-r", "--name-only", "main", waiting.WAITING_ROOT).split() == (
-        sorted(waiting.path_of(name) for name in ("b", "d"))
+    assert rig.git(bare, "ls-tree", "-r", "--name-only", "main", records.WAITING_ROOT).split() == (
+        sorted(records.waiting_path(name) for name in ("b", "d"))
     )
     with rig.running(bare.as_uri(), **options) as third:
         rig.book(third, _release("d"), _release("c"))
@@ -89,7 +88,7 @@ def test_demands_wait_and_are_booked_in_turn_by_any_generator(
         message = rig.git(bare, "log", "-1", "--format=%an%n%B", "main")
         assert message.startswith("vehicle00 (requester)\nPut b, derived/vehicle00/edge\n")
         assert "It waited for room." in message
-        person.change({waiting.path_of("nobody"): "not: valid\n"}, "A file that is none")
+        person.change({records.waiting_path("nobody"): "not: valid\n"}, "A file that is none")
         rig.book(third, _release("b"))
     assert _runs(bare) == []
     operations = [commit.one("Operation") for commit in rig.commits(bare)]

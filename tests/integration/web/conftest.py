@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops.service import Generator
-from demandops.staterepo.reader import Reader
+from demandops.repo.reader import Reader
+from demandops.serve.generator import Generator
+from demandops.web import not_ready
+from demandops.web.filtered_table import Filter
 from demandops.web.follower import Follower
-from demandops.web.site import Site
+from demandops.web.server import Site
 from demandops.web.situation import Situation
-from demandops.web.views import not_ready
-from demandops.web.views.filtered_table import Filter
 from starlette.testclient import TestClient
 
 from tests.kit import goals

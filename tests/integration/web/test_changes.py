@@ -14,15 +14,14 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.service import Generator
-from demandops.staterepo.reader import Reader
-from demandops.web import view_pages
+from demandops.repo.reader import Reader
+from demandops.serve.generator import Generator
+from demandops.web import fleet_map, view_pages
+from demandops.web.filtered_table import Filter
 from demandops.web.follower import Follower
-from demandops.web.site import Site
+from demandops.web.lists import LISTS, rows_of
+from demandops.web.server import Site
 from demandops.web.situation import CommitState
-from demandops.web.views import fleet_map, map_layout
-from demandops.web.views.filtered_table import Filter
-from demandops.web.views.lists import LISTS, rows_of
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import VIEWS, Look, causes
@@ -254,7 +253,7 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
     for layout in drawn.layouts:
         cards = fleet_map.picture(follower.newest, Filter(""), layout).nodes
         for one in cards:
-            assert one.x >= 0 and one.x + one.width <= map_layout.WIDTH
+            assert one.x >= 0 and one.x + one.width <= fleet_map.WIDTH
             assert not [o for o in cards if o is not one and _cover(one, o)]
     by_id = {card.id: card for card in drawn.nodes}
     ids = [node["id"] for node in nodes["nodes"]]
@@ -262,7 +261,7 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
     assert by_id[ids[-1]].y < by_id[ids[0]].y
 
 
-def _cover(one: map_layout.NodeCard, other: map_layout.NodeCard) -> bool:
+def _cover(one: fleet_map.NodeCard, other: fleet_map.NodeCard) -> bool:
     return not (
         one.x + one.width <= other.x
         or other.x + other.width <= one.x

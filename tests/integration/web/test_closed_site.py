@@ -5,11 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from demandops.errors import InvalidInput
-from demandops.staterepo.reader import Reader
+from demandops.base.errors import InvalidInput
+from demandops.repo.reader import Reader
 from demandops.web.follower import Follower
-from demandops.web.server import WebServer
-from demandops.web.site import Site
+from demandops.web.server import Site, WebServer
 from starlette.testclient import TestClient
 
 from tests.integration.web.conftest import VIEWS, Shown

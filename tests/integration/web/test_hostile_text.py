@@ -8,8 +8,8 @@ from __future__ import annotations
 import json
 import shlex
 
-from demandops.service import Generator
-from demandops.staterepo.history.commit_log import PROPOSAL
+from demandops.repo.history.commit_log import PROPOSAL
+from demandops.serve.generator import Generator
 from demandops.web.follower import Follower
 
 from tests.integration.web.conftest import VIEWS, Look

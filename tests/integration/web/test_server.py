@@ -11,9 +11,9 @@ from contextlib import ExitStack, contextmanager, suppress
 from urllib.parse import urlencode, urlsplit
 
 import pytest
-from demandops.service import http_server
-from demandops.staterepo.reader import Reader
-from demandops.web import server, site
+from demandops.repo.reader import Reader
+from demandops.serve import http_server
+from demandops.web import server
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 
@@ -58,7 +58,7 @@ STREAM = "GET /events HTTP/1.1\nHost: localhost\n\n"
 def test_streams_of_events_are_bounded_and_end_with_the_server(
     follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(site, "_MOST_LISTENERS", 3)
+    monkeypatch.setattr(server, "_MOST_LISTENERS", 3)
     page = WebServer("127.0.0.1:0", "--listen", follower)
     with ExitStack() as stack:
         streams = [stack.enter_context(asking(page, STREAM)) for _ in range(3)]
@@ -109,7 +109,7 @@ def test_however_many_clients_hold_connections_open_health_is_told(served: WebSe
 
 def test_a_stream_stays_open(follower: Follower, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http_server, "_STUCK_S", 0.05)
-    monkeypatch.setattr(site, "_HEARTBEAT_S", 0.3)
+    monkeypatch.setattr(server, "_HEARTBEAT_S", 0.3)
     page = WebServer("127.0.0.1:0", "--listen", follower)
     with asking(page, STREAM) as stream:
         got = b""
@@ -131,7 +131,7 @@ def test_whatever_is_asked_of_git_the_page_refuses_and_lives(served: WebServer, 
 def test_more_slow_requests_than_can_wait_are_refused(
     served: WebServer, follower: Follower, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(site, "_MOST_WAITING", 3)
+    monkeypatch.setattr(server, "_MOST_WAITING", 3)
     request = "GET /?at=HEAD~1 HTTP/1.1\nHost: localhost\n\n"
     with ExitStack() as stack:
         stack.enter_context(follower._loading)

@@ -7,20 +7,18 @@ from datetime import timedelta
 from pathlib import Path
 
 import pytest
-from demandops.cluster.bootstrap_status import OldBootstrap
+from demandops.base.errors import StateRepoError
 from demandops.cluster.health.release_health import Health
-from demandops.cluster.orphans import Orphan
-from demandops.cluster.release_status import ReleaseStatus
-from demandops.errors import StateRepoError
-from demandops.ledger.waiting import WaitingDemand
-from demandops.plan.release import ServiceRelease
+from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.model.ledger.records import WaitingDemand
+from demandops.model.release import ServiceRelease
+from demandops.web import fleet_map
+from demandops.web.filtered_table import Filter
 from demandops.web.follower import Follower
+from demandops.web.lists import rows_of
+from demandops.web.not_ready import remedy_of
+from demandops.web.release_view import explained_demand
 from demandops.web.situation import CommitState, Situation
-from demandops.web.views import fleet_map
-from demandops.web.views.demand_view import explained_demand
-from demandops.web.views.filtered_table import Filter
-from demandops.web.views.lists import rows_of
-from demandops.web.views.remedy import remedy_of
 from rpds import HashTrieMap
 
 from tests.integration.web.conftest import Look, Shown, causes

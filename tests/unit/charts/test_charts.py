@@ -15,10 +15,10 @@ from typing import Any
 import jsonschema_rs
 import pytest
 import yaml
-from demandops.charts import chart_files
-from demandops.charts.chart_files import merged
-from demandops.config.load import load
-from demandops.errors import InvalidInput
+from demandops.base.errors import InvalidInput
+from demandops.model.config.load import load
+from demandops.templating import chart_files
+from demandops.templating.chart_files import merged
 
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.goals import application, goal

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from demandops.staterepo.pull_request.helm import parsed_error, parsed_kinds, parsed_lint
+from demandops.repo.pull_request.helm import parsed_error, parsed_kinds, parsed_lint
 
 
 @pytest.mark.parametrize(

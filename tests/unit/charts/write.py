@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from demandops.charts import chart_schema, values_table
+from demandops.templating import chart_schema
 
 ROOT = Path(__file__).parents[3]
 LIBRARY = ROOT / "appdefs" / "charts" / "ros-service"
@@ -58,7 +58,7 @@ def readme(chart: Path) -> str:
     metadata = yaml.safe_load((chart / "Chart.yaml").read_text())
     assert text.startswith(f"# {metadata['name']}\n\n{metadata['description']}\n")
     return re.sub(
-        r"(?s)\| Key \| Type.*?\n(?=\n|\Z)", lambda _: values_table.table(values, root), text
+        r"(?s)\| Key \| Type.*?\n(?=\n|\Z)", lambda _: chart_schema.table(values, root), text
     )
 
 

@@ -9,8 +9,8 @@ from threading import Event
 from typing import Any
 
 import pytest
+from demandops.base.errors import InvalidInput
 from demandops.cluster.config_map_watch import ConfigMapWatch
-from demandops.errors import InvalidInput
 
 from tests.kit.http import Answer, Call, kubeconfig, serving
 from tests.kit.limits import PATIENCE_S

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from demandops.cluster import clusters_file, controller_webhook
+from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
 
 from tests.kit.generator import wait_until
@@ -43,7 +43,7 @@ def by_openssl(body: bytes) -> str:
 def test_the_signature_is_the_one_that_github_documents() -> None:
     """Flux and Argo CD use GitHub's scheme; the values come from GitHub's documentation."""
     documented = "757107ea0eb2509fc211221cce984b8a37570b6d7586c22c46f4379c8b043e17"
-    assert controller_webhook.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
+    assert reconcile_trigger.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
 
 
 def test_a_receiver_of_flux_is_called_with_a_signature(hook: Server, secret_file: Path) -> None:
@@ -142,11 +142,11 @@ def test_the_other_controller_s_webhook_is_not_called(
     ],
 )
 def test_a_repository_is_named_by_the_page_that_a_forge_would_name(repo: str, page: str) -> None:
-    assert controller_webhook.web_address(repo) == page
+    assert reconcile_trigger.web_address(repo) == page
 
 
 def test_a_repository_without_a_host_cannot_be_named() -> None:
     with pytest.raises(
         clusters_file.NoAccess, match=r"names no host, but .*; write https://HOST/PATH or "
     ):
-        controller_webhook.web_address("file:///srv/fleet.git")
+        reconcile_trigger.web_address("file:///srv/fleet.git")

@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from demandops.base.errors import InvalidInput
+from demandops.base.runtime import Runtime
 from demandops.cluster.leadership import Leadership
-from demandops.errors import InvalidInput
-from demandops.runtime import Runtime
 from kubernetes import client, config
 
 from tests.kit.chance import IN_FULL

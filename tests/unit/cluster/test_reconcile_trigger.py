@@ -8,10 +8,10 @@ from pathlib import Path
 from threading import Event, Timer
 
 import pytest
+from demandops.base.errors import InvalidInput
 from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.health.flux import REQUESTED_AT
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
-from demandops.errors import InvalidInput
 
 from tests.kit.clock import Clock
 from tests.kit.generator import wait_until

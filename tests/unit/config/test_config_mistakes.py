@@ -10,8 +10,8 @@ import json
 from collections.abc import Mapping
 
 import pytest
-from demandops.config.load import load
-from demandops.errors import Fault, InvalidInput
+from demandops.base.errors import Fault, InvalidInput
+from demandops.model.config.load import load
 
 from tests.kit.config import brokers, configuration, edited, skeleton
 

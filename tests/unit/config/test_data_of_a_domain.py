@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.load import load
-from demandops.errors import InvalidInput
-from demandops.plan.views import policy_warnings
+from demandops.base.errors import InvalidInput
+from demandops.decide import warnings
+from demandops.model.config.load import load
 
 from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.memory import MemoryRepo
@@ -101,7 +101,7 @@ def test_credentials_name_a_broker() -> None:
 
 
 def warned(files: dict[str, str]) -> list[str]:
-    return [str(found) for found in policy_warnings.warnings(MemoryRepo(files).state)]
+    return [str(found) for found in warnings.policy_warnings(MemoryRepo(files).state)]
 
 
 SHARED = (
@@ -119,9 +119,9 @@ CLOSED = (
 def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
     books = MemoryRepo(domains("ros: {domainId: 1}, " + BOTH))
     books.send(CONNECTION)
-    assert list(policy_warnings.warnings(books.state)) == []
+    assert list(warnings.policy_warnings(books.state)) == []
     config = load(configuration(domains("ros: {domainId: 1}")))
-    told = policy_warnings.warnings(state_of(config, books.state.ledger))
+    told = warnings.policy_warnings(state_of(config, books.state.ledger))
     assert list(map(str, told)) == [
         f"{DOMAINS}: no rule of access domain 'fleet' has 'city' among its 'peers', so nobody "
         "can demand a connection between the two domains; claims on such connections stay in "

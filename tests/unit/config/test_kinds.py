@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.load import load
-from demandops.config.policy import KINDS, AccessDomain
-from demandops.errors import InvalidInput
-from demandops.plan.views import policy_warnings
+from demandops.base.errors import InvalidInput
+from demandops.decide import warnings
+from demandops.model.config.load import load
+from demandops.model.config.policy import KINDS, AccessDomain
 
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
@@ -137,7 +137,7 @@ def test_the_schema_takes_a_word_or_a_kind() -> None:
 
 
 def warned(files: Mapping[str, str | None]) -> list[str]:
-    return [str(found) for found in policy_warnings.warnings(MemoryRepo(files).state)]
+    return [str(found) for found in warnings.policy_warnings(MemoryRepo(files).state)]
 
 
 def test_the_charts_that_come_with_it_need_no_more() -> None:

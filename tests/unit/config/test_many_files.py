@@ -13,15 +13,15 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.config import (
+from demandops.base.errors import InvalidInput
+from demandops.model.config.config import (
     CLIENTS_FILE,
     COLLECTIONS,
     DOMAINS_FILE,
     NODES_FILE,
     collection_of,
 )
-from demandops.config.load import load
-from demandops.errors import InvalidInput
+from demandops.model.config.load import load
 
 from tests.kit import plain_yaml, rich
 from tests.kit.config import configuration, edited, skeleton

@@ -6,9 +6,9 @@ from collections.abc import Callable
 from typing import Any
 
 import pytest
-from demandops import strict_yaml
-from demandops.config.load import load
-from demandops.errors import Fault, InvalidInput
+from demandops.base import strict_yaml
+from demandops.base.errors import Fault, InvalidInput
+from demandops.model.config.load import load
 
 from tests.kit import mutations, rich
 from tests.kit.mutations import Form

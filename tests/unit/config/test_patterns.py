@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+from demandops.base.naming import PATTERN_WORDS
 from demandops.cli.repo.schema import SCHEMAS
-from demandops.identifiers import PATTERN_WORDS
 
 
 def patterns_of(schema: Any) -> set[str]:

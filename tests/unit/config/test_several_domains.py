@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.errors import InvalidInput
-from demandops.plan.release_keys import ServiceKey
+from demandops.base.errors import InvalidInput
+from demandops.decide.planning.release_keys import ServiceKey
 
 from tests.kit.config import skeleton
 from tests.kit.goals import application, connection, goal, put

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 
 import pytest
-from demandops.config.load import load
-from demandops.decision import try_configuration
-from demandops.errors import InvalidInput
+from demandops.base.errors import InvalidInput
+from demandops.decide.state import try_configuration
+from demandops.model.config.load import load
 
 from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.goals import perception

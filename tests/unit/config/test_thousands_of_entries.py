@@ -13,14 +13,11 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.checks.override_conflicts import (
-    check_override_conflicts,
-    contested_effects,
-)
-from demandops.config.config_reader import ConfigReader
-from demandops.config.load import load
-from demandops.config.override import by_rank
-from demandops.errors import Fault, InvalidInput
+from demandops.base.errors import Fault, InvalidInput
+from demandops.model.config.config import ConfigReader
+from demandops.model.config.cross_check import check_override_conflicts, contested_effects
+from demandops.model.config.load import load
+from demandops.model.config.override import by_rank
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from demandops.config.load import load
-from demandops.plan.views import unmatched_patterns
+from demandops.decide import warnings
+from demandops.model.config.load import load
 
 from tests.kit.config import configuration
 
@@ -23,7 +23,7 @@ domains:
 def test_each_pattern_that_matches_nothing_is_told_with_the_nearest_name() -> None:
     config = load(configuration({"policy/access-domains.yaml": POLICY}))
     file = "policy/access-domains.yaml: access domain 'perception', "
-    told = [str(found) for found in unmatched_patterns.warnings(config)]
+    told = [str(found) for found in warnings.unmatched_pattern_warnings(config)]
     nodes = ", ".join(sorted(config.nodes))
     assert told == [
         f"{file}nodes: 'roadside*' matches no node; known: {nodes}",
@@ -35,4 +35,4 @@ def test_each_pattern_that_matches_nothing_is_told_with_the_nearest_name() -> No
 
 
 def test_the_configuration_as_it_is_has_none() -> None:
-    assert list(unmatched_patterns.warnings(load(configuration({})))) == []
+    assert list(warnings.unmatched_pattern_warnings(load(configuration({})))) == []

@@ -16,16 +16,16 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops import naming, settings
-from demandops.config.config import NODES_FILE, Config
+from demandops.base import naming, settings
+from demandops.base.errors import Fault, InvalidInput, fault
+from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.connections.connection_type import Client, ClientKey, Connections, ConnectionType
-from demandops.decision import Decision
-from demandops.errors import Fault, InvalidInput, fault
-from demandops.ledger import claim_file
-from demandops.plan.views import release_causes
-from demandops.subject import Subject, SubjectKind
+from demandops.decide.decision import Decision
+from demandops.model.config.config import NODES_FILE, Config
+from demandops.model.ledger import claim_file
+from demandops.views import release_causes
 
 from tests.kit.connections import ROS_IMAGE, demand, routes, state
 from tests.kit.goals import connection, goal

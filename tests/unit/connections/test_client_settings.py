@@ -6,8 +6,8 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.load import load
-from demandops.errors import InvalidInput
+from demandops.base.errors import InvalidInput
+from demandops.model.config.load import load
 
 from tests.kit.config import configuration, override, skeleton
 from tests.kit.goals import application, connection, goal

@@ -10,17 +10,18 @@ from typing import Any, ClassVar
 
 import pytest
 import yaml
-from demandops.config.load import load
+from demandops.base.errors import InvalidInput, Refused
+from demandops.base.naming import Subject, SubjectKind
+from demandops.connections.connection import Route
 from demandops.connections.connection_type import ClientKey
-from demandops.connections.route import Route
 from demandops.connections.zenoh import ZENOH
-from demandops.decision import Decision, State, rendered_files
-from demandops.errors import InvalidInput, Refused
-from demandops.ledger.claim_changes import changes_on
-from demandops.plan.release_keys import affected_keys
-from demandops.render.changes.changeset import ReleaseChange
-from demandops.render.connection_client import check_configuration
-from demandops.subject import Subject, SubjectKind
+from demandops.decide.changes.changeset import ReleaseChange
+from demandops.decide.decision import Decision
+from demandops.decide.planning.release_keys import affected_keys
+from demandops.decide.state import State, rendered_files
+from demandops.model.config.load import load
+from demandops.model.ledger.ledger import changes_on
+from demandops.render.manifests import check_configuration
 
 from tests.kit.config import skeleton, state_of
 from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, demand, routes, state

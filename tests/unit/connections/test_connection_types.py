@@ -12,8 +12,8 @@ from demandops.connections.connection_type import ConnectionType
 from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH
-from demandops.decision import State
-from demandops.ledger.ledger import Ledger
+from demandops.decide.state import State
+from demandops.model.ledger.ledger import Ledger
 
 from tests.kit.connections import (
     REACHABLE,

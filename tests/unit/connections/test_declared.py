@@ -13,12 +13,12 @@ from types import MappingProxyType
 from typing import Any
 
 import pytest
-from demandops.config.inventory import Tls
 from demandops.connections import connection_types
-from demandops.decision import State
-from demandops.ledger.world import World
-from demandops.plan.planner import plan
-from demandops.plan.release_keys import all_keys
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import all_keys
+from demandops.decide.state import State
+from demandops.model.config.inventory import Tls
+from demandops.model.ledger.ledger import World
 
 from tests.kit import plain_yaml
 from tests.kit.connections import REACHABLE, SPEAKS, TYPED, WAN, decided, demand, state

@@ -5,15 +5,15 @@ from __future__ import annotations
 from dataclasses import fields
 from typing import Any
 
-from demandops.config.base_model import parse
-from demandops.connections.connection_types import CONNECTION_TYPES
-from demandops.connections.route import (
+from demandops.connections.connection import (
     Route,
     RouteOptions,
     contradictions,
     faults,
     merged_routes,
 )
+from demandops.connections.connection_types import CONNECTION_TYPES
+from demandops.model.config.base_model import parse
 
 OPTIONS: dict[str, object] = {
     "type": "std_msgs/msg/String",

@@ -7,11 +7,11 @@ from typing import Any
 from unicodedata import category
 
 import yaml
-from demandops.decision import Decision, decide
-from demandops.demand import deployment_request_goal
-from demandops.errors import Fault, InvalidInput, Refused
-from demandops.staterepo.history import commit_message
-from demandops.staterepo.history.message_format import parse
+from demandops.base.errors import Fault, InvalidInput, Refused
+from demandops.decide.decision import Decision, decide
+from demandops.model.demand import deployment_request_goal
+from demandops.repo.history import commit_message
+from demandops.repo.history.commit_log import parse
 from hypothesis import example, given
 from hypothesis import strategies as st
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import pytest
-from demandops.errors import Refused
+from demandops.base.errors import Refused
 
 from tests.kit import mutations, rich
 from tests.kit.goals import Goal

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops import naming
-from demandops.demand import demand_goal
-from demandops.errors import MOST_FAULTS, Refused, suggestion
+from demandops.base import naming
+from demandops.base.errors import MOST_FAULTS, Refused, suggestion
+from demandops.model.demand import demand_goal
 
 from tests.kit.config import brokers, skeleton
 from tests.kit.goals import (

@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import rendered_files
-from demandops.errors import InvalidInput
-from demandops.plan.release import ServiceRelease
+from demandops.base.errors import InvalidInput
+from demandops.decide.state import rendered_files
+from demandops.model.release import ServiceRelease
 from hypothesis import given
 
 from tests.appdefs.test_recorder import ADDITIONS

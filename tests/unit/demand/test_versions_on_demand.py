@@ -7,9 +7,9 @@ from random import Random
 from typing import Any
 
 import pytest
-from demandops.config.registry import precedence
-from demandops.decision import rendered_files, try_configuration
-from demandops.errors import InvalidInput, Refused
+from demandops.base.errors import InvalidInput, Refused
+from demandops.decide.state import rendered_files, try_configuration
+from demandops.model.config.registry import precedence
 from hypothesis import given
 
 from tests.kit.chance import chances, examples

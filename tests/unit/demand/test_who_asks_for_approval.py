@@ -6,10 +6,10 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import decide
-from demandops.demand.lease import UNSTARTED
-from demandops.demand.permission import with_leases_from_approval
-from demandops.ledger import claim_file
+from demandops.decide.admission.permission import with_leases_from_approval
+from demandops.decide.decision import decide
+from demandops.model.demand.claim import UNSTARTED
+from demandops.model.ledger import claim_file
 
 from tests.kit.config import edited, skeleton
 from tests.kit.goals import APP, EGO, application, connection, goal, perception

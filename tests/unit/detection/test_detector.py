@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from demandops.detection.booked_events import booked_events
-from demandops.detection.detector import Detector
-from demandops.detection.events.detection_state import Key
+from demandops.detect.detection_state import Key
+from demandops.detect.detector import Detector, booked_events
 
 from tests.kit.detection import at, demand, file_of, rule
 

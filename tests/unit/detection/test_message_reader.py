@@ -6,10 +6,10 @@ from types import SimpleNamespace as Message
 from typing import Any
 
 import pytest
-from demandops.detection.message_reader import MessageReader, Unreadable
-from demandops.detection.rules import rule_file
-from demandops.detection.rules.rule_file import POSITIONS
-from demandops.detection.rules.topic_pattern import entity_in
+from demandops.detect import rule_file
+from demandops.detect.condition import entity_in
+from demandops.detect.message_reader import MessageReader, Unreadable
+from demandops.detect.rule_file import POSITIONS
 
 from tests.kit.detection import rule, text_of
 

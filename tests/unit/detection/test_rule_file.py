@@ -8,9 +8,9 @@ from typing import Any
 import jsonschema_rs
 import pytest
 import yaml
+from demandops.base.errors import InvalidInput
 from demandops.cli.repo import schema
-from demandops.detection.rules import rule_file
-from demandops.errors import InvalidInput
+from demandops.detect import rule_file
 
 from tests.kit.detection import demand, rule, text_of
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from demandops.detection.detector import Want
-from demandops.detection.rules.rule_demand import Goal
-from demandops.detection.wanted_demands import Outcome, Sending, WantedDemands
+from demandops.detect.detector import Outcome, Sending, Want, WantedDemands
+from demandops.detect.rule_demand import Goal
 
 KEY = ("rule", ("a",))
 PUT = Goal("demand", {"demand": "d", "requesters": ["a"], "applications": [1]})

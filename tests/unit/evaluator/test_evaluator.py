@@ -12,12 +12,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.config.load import load
-from demandops.decision import State, try_configuration
-from demandops.errors import InvalidInput, OverLimit
-from demandops.evaluator import process as process_module
-from demandops.evaluator.process import Evaluator, processor_time
-from demandops.ledger.ledger import Ledger
+from demandops.base.errors import InvalidInput, OverLimit
+from demandops.decide.state import State, try_configuration
+from demandops.model.config.load import load
+from demandops.model.ledger.ledger import Ledger
+from demandops.templating import evaluator as process_module
+from demandops.templating.evaluator import Evaluator, processor_time
 from demandops.templating.values import SchemaTask, ValuesTask, evaluate
 
 from tests.kit.config import configuration, skeleton

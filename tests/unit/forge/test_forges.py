@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
-from demandops.config.load import load
-from demandops.config.repo_settings import Proposals
-from demandops.errors import InvalidInput
-from demandops.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
-from demandops.service.approvals.forge_worker import ForgeWorker
+from demandops.base.errors import InvalidInput
+from demandops.model.config.load import load
+from demandops.model.config.repo_settings import Proposals
+from demandops.repo.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
+from demandops.serve.approvals.forge_worker import ForgeWorker
 
 from tests.kit.config import configuration
 from tests.kit.http import Answer, Call, serving

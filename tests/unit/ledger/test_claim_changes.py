@@ -5,22 +5,13 @@ from __future__ import annotations
 from datetime import datetime, timedelta, timezone
 
 import pytest
-from demandops.connections.connection import Connection
+from demandops.base.errors import Refused
+from demandops.connections.connection import Connection, Route
 from demandops.connections.mqtt import MQTT
-from demandops.connections.route import Route
-from demandops.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey
-from demandops.demand.demand_request import (
-    Demanded,
-    DemandRequest,
-    Join,
-    Release,
-    Shutdown,
-)
-from demandops.demand.lease import Term
-from demandops.errors import Refused
-from demandops.ledger.apply import apply
-from demandops.ledger.claim_changes import Changes
-from demandops.ledger.ledger import Ledger
+from demandops.decide.booking.apply import apply
+from demandops.model.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey, Term
+from demandops.model.demand.demand_request import Demanded, DemandRequest, Join, Release, Shutdown
+from demandops.model.ledger.ledger import Changes, Ledger
 
 NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))

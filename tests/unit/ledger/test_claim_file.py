@@ -8,18 +8,16 @@ from random import Random
 from types import MappingProxyType
 
 import pytest
-from demandops.connections.connection import Connection
+from demandops.base.errors import InvalidInput
+from demandops.base.naming import Subject, SubjectKind
+from demandops.connections.connection import Connection, Route, merged_routes
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.mqtt import MQTT
-from demandops.connections.route import Route, merged_routes
-from demandops.demand.application import Application, Delivery, InputTopic
-from demandops.demand.claim import Claim, ClaimKey, demand_id
-from demandops.demand.demand_request import id_problem
-from demandops.demand.lease import LONGEST_S, Lease
-from demandops.errors import InvalidInput
-from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
-from demandops.subject import Subject, SubjectKind
+from demandops.model.demand.application import Application, Delivery, InputTopic
+from demandops.model.demand.claim import LONGEST_S, Claim, ClaimKey, Lease, demand_id
+from demandops.model.demand.demand_request import id_problem
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import Ledger
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -13,24 +13,24 @@ from random import Random
 
 import pytest
 import yaml
-from demandops import naming
-from demandops.config.load import load
-from demandops.config.registry import Chart
+from demandops.base import naming
+from demandops.base.errors import InvalidInput, Refused
+from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import ros
-from demandops.decision import Decision, decide, rendered_files
-from demandops.demand.application import Requirement
-from demandops.demand.claim import ClaimKey, demand_id
-from demandops.errors import InvalidInput, Refused
-from demandops.ledger import claim_file, kept_replicas, waiting
-from demandops.ledger.claim_changes import Changes
-from demandops.ledger.operations.drain import Drain
-from demandops.ledger.recent_shutdowns import RecentShutdown, RecentShutdowns
-from demandops.ledger.waiting import Wait, WaitingDemand
-from demandops.plan import output_topics
-from demandops.plan.checks import name_clash
-from demandops.plan.nodes.relocation import following_overrides
-from demandops.plan.release import ServiceKey
-from demandops.subject import Subject, SubjectKind
+from demandops.decide.booking.leaving import Drain
+from demandops.decide.checks import collisions
+from demandops.decide.decision import Decision, decide
+from demandops.decide.placement.relocation import following_overrides
+from demandops.decide.planning import flows
+from demandops.decide.state import rendered_files
+from demandops.model.config.load import load
+from demandops.model.config.registry import Chart
+from demandops.model.demand.application import Requirement
+from demandops.model.demand.claim import ClaimKey, demand_id
+from demandops.model.ledger import claim_file, records
+from demandops.model.ledger.ledger import Changes
+from demandops.model.ledger.records import RecentShutdown, RecentShutdowns, Wait, WaitingDemand
+from demandops.model.release import ServiceKey
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -47,7 +47,7 @@ NODES = "inventory/nodes.yaml"
 
 @pytest.fixture
 def short_digests(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    caches = (naming.topic_part, output_topics.published_topic, ros._number)
+    caches = (naming.topic_part, flows.published_topic, ros._number)
     monkeypatch.setattr(naming, "MOST_DIGITS", 1)
     for cached in caches:
         cached.cache_clear()
@@ -197,19 +197,19 @@ def test_two_nodes_have_two_folders() -> None:
 @pytest.mark.usefixtures("short_digests")
 def test_two_waiting_demands_have_two_files() -> None:
     first = "Van"
-    other = rival(first, waiting.path_of)
+    other = rival(first, records.waiting_path)
     goals = [put(demand) for demand in (first, other)]
     (one, two) = (WaitingDemand(goal["demand"], "", ("vehicle00",), NOW, 0, goal) for goal in goals)
-    path = waiting.path_of(first)
+    path = records.waiting_path(first)
     changes = Changes(waiting=(other,))
     request = Wait(id="", demand=other, waiting=two)
 
     def faults(text: str | None) -> list[str]:
-        found = name_clash.faults_in_files(request, changes, {path: text}.get)
+        found = collisions.faults_in_files(request, changes, {path: text}.get)
         return [fault.code for fault in found]
 
-    assert faults(None) == faults(waiting.text_of(two)) == []
-    assert faults(waiting.text_of(one)) == ["conflict"]
+    assert faults(None) == faults(records.waiting_text(two)) == []
+    assert faults(records.waiting_text(one)) == ["conflict"]
 
 
 def test_a_shutdown_repeats_only_one_by_the_same_requesters() -> None:
@@ -225,7 +225,7 @@ def test_two_service_instances_keep_replicas_in_two_files() -> None:
     repo = books("{max: 9, per: {topics: 1}, downAfter: 10m}")
 
     def record(id: str) -> str:
-        return kept_replicas.path_of(ServiceKey("recorder", "edge", id).instance)
+        return records.replicas_path(ServiceKey("recorder", "edge", id).instance)
 
     def recording(id: str) -> Goal:
         item = demand()["applications"][0] | {"id": id}

@@ -10,11 +10,11 @@ from datetime import timedelta
 from random import Random
 from typing import Any
 
-from demandops.config.load import load
-from demandops.decision import Decision
-from demandops.ledger import claim_file
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.recent_shutdowns import RecentShutdowns
+from demandops.decide.decision import Decision
+from demandops.model.config.load import load
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.records import RecentShutdowns
 from hypothesis import given, note
 from hypothesis import strategies as st
 

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import MappingProxyType
 
-from demandops import naming
-from demandops.config.inventory import Node
-from demandops.decision import Decision
-from demandops.demand.demand_request import id_problem
-from demandops.errors import Refused
+from demandops.base import naming
+from demandops.base.errors import Refused
+from demandops.decide.decision import Decision
+from demandops.model.config.inventory import Node
+from demandops.model.demand.demand_request import id_problem
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -7,12 +7,12 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import faults_of_edit
-from demandops.demand.claim import Claim
-from demandops.ledger.claim_changes import ClaimChange
-from demandops.ledger.claim_file import path_of
-from demandops.ledger.operations.restoration import Restoration
-from demandops.plan.output_topics import with_booked_topics_marked
+from demandops.decide.booking.restoration import Restoration
+from demandops.decide.claim_edit import faults_of_edit
+from demandops.decide.planning.flows import with_booked_topics_marked
+from demandops.model.demand.claim import Claim
+from demandops.model.ledger.claim_file import path_of
+from demandops.model.ledger.ledger import ClaimChange
 
 from tests.kit.config import skeleton
 from tests.kit.goals import APP, CLOUD, Topic, application, connection, goal

@@ -11,10 +11,11 @@ from datetime import timedelta
 from random import Random
 
 import pytest
-from demandops.decision import Decision, rendered_files
-from demandops.demand.claim import ClaimKey, demand_id
-from demandops.ledger import claim_file
-from demandops.ledger.recent_shutdowns import SHUTDOWNS_ROOT
+from demandops.decide.decision import Decision
+from demandops.decide.state import rendered_files
+from demandops.model.demand.claim import ClaimKey, demand_id
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.records import SHUTDOWNS_ROOT
 from hypothesis import assume, given
 from hypothesis import strategies as st
 

@@ -14,12 +14,12 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from demandops.demand import deployment_request_goal
-from demandops.demand.claim import ClaimKey, demand_id
-from demandops.demand.demand_request import DemandRequest, Join
-from demandops.ledger.apply import apply
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.recent_shutdowns import REMEMBERED
+from demandops.decide.booking.apply import apply
+from demandops.model.demand import deployment_request_goal
+from demandops.model.demand.claim import ClaimKey, demand_id
+from demandops.model.demand.demand_request import DemandRequest, Join
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.records import REMEMBERED
 
 from tests.kit import plain_yaml
 from tests.kit.chance import IN_FULL, TIMES

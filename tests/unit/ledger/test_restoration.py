@@ -9,13 +9,13 @@ from random import Random
 from typing import Any
 
 import pytest
-from demandops.config.config import Config
-from demandops.decision import Decision, State, decide
-from demandops.demand.claim import Claim
-from demandops.demand.lease import Lease
-from demandops.errors import Refused
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.operations.restoration import Restoration
+from demandops.base.errors import Refused
+from demandops.decide.booking.restoration import Restoration
+from demandops.decide.decision import Decision, decide
+from demandops.decide.state import State
+from demandops.model.config.config import Config
+from demandops.model.demand.claim import Claim, Lease
+from demandops.model.ledger.ledger import Ledger
 
 from tests.kit.memory import NOW, MemoryRepo
 from tests.model.goals import Maker

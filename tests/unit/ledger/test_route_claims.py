@@ -8,18 +8,17 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.connections.connection import Connection
+from demandops.base.errors import InvalidInput, Refused
+from demandops.connections.connection import Connection, Route, merged_routes
 from demandops.connections.connection_type import ConnectionType
 from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
-from demandops.connections.route import Route, merged_routes
 from demandops.connections.zenoh import ZENOH
-from demandops.demand.claim import Claim, demand_id
-from demandops.demand.demand_request import Demanded, Join
-from demandops.errors import InvalidInput, Refused
-from demandops.ledger import claim_file
-from demandops.ledger.apply import apply
-from demandops.ledger.ledger import Ledger
+from demandops.decide.booking.apply import apply
+from demandops.model.demand.claim import Claim, demand_id
+from demandops.model.demand.demand_request import Demanded, Join
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import Ledger
 
 NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
 STRING = "std_msgs/msg/String"

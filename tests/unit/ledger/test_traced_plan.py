@@ -5,15 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from random import Random
 
-from demandops.config.config import Config
-from demandops.decision import Decision
-from demandops.ledger.claim_changes import ClaimChange
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.world import World
-from demandops.plan.planner import plan
-from demandops.plan.release import Release
-from demandops.plan.release_keys import ReleaseKey, all_keys
-from demandops.plan.views.traced_plan import TracedPlan
+from demandops.decide.decision import Decision
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import ReleaseKey, all_keys
+from demandops.decide.planning.traced_plan import TracedPlan
+from demandops.model.config.config import Config
+from demandops.model.ledger.ledger import ClaimChange, Ledger, World
+from demandops.model.release import Release
 from hypothesis import given
 from hypothesis import strategies as st
 

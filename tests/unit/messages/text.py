@@ -7,8 +7,8 @@ import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 
-from demandops.decision import State
-from demandops.errors import Fault, Refused
+from demandops.base.errors import Fault, Refused
+from demandops.decide.state import State
 
 from tests.kit.connections import routes
 from tests.kit.goals import perception

@@ -15,12 +15,13 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import decide, rendered_files
-from demandops.demand.claim import OVERRIDE_PREFIX
-from demandops.demand.demand_request import Expire
-from demandops.errors import InvalidInput, Refused
-from demandops.plan.views.bookkeeping import bookkeeping
-from demandops.subject import Subject, SubjectKind
+from demandops.base.errors import InvalidInput, Refused
+from demandops.base.naming import Subject, SubjectKind
+from demandops.decide.decision import decide
+from demandops.decide.state import rendered_files
+from demandops.model.demand.claim import OVERRIDE_PREFIX
+from demandops.model.demand.demand_request import Expire
+from demandops.views.bookkeeping import bookkeeping
 from hypothesis import given
 from hypothesis import strategies as st
 

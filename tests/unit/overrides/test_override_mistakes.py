@@ -6,10 +6,9 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.load import load
-from demandops.errors import Fault, InvalidInput
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.world import World
+from demandops.base.errors import Fault, InvalidInput
+from demandops.model.config.load import load
+from demandops.model.ledger.ledger import Ledger, World
 
 from tests.kit.config import configuration, edited
 

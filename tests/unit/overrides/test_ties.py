@@ -9,19 +9,14 @@ from functools import lru_cache
 from itertools import product
 from typing import Any
 
-from demandops.config.checks.override_conflicts import (
-    contested_effects,
-    patches_commute,
-    patterns_overlap,
-)
-from demandops.config.config import Config
-from demandops.config.load import load
-from demandops.config.override import Override, OverrideFile, Selector, merge_patch
-from demandops.config.policy import matches
-from demandops.plan.overrides.claim_overrides import Traits, fits
-from demandops.plan.overrides.release_overrides import apply_effects, effects_on
-from demandops.plan.release import ServiceRelease
-from demandops.render.trial_render import trial_releases
+from demandops.decide.changes.trial_render import trial_releases
+from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
+from demandops.model.config.config import Config
+from demandops.model.config.cross_check import contested_effects, patches_commute, patterns_overlap
+from demandops.model.config.load import load
+from demandops.model.config.override import Override, OverrideFile, Selector, merge_patch
+from demandops.model.config.policy import matches
+from demandops.model.release import ServiceRelease
 from hypothesis import example, given
 from hypothesis import strategies as st
 

@@ -13,9 +13,8 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import decide
-from demandops.decision.decision import MOST_TRIALS
-from demandops.errors import OverBudget, Refused
+from demandops.base.errors import OverBudget, Refused
+from demandops.decide.decision import MOST_TRIALS, decide
 
 from tests.kit.config import override, skeleton
 from tests.kit.goals import Goal, application, connection, goal

@@ -9,13 +9,14 @@ from random import Random
 from typing import Any
 
 import pytest
-from demandops.config.inventory import Node, amount_of, amount_text
-from demandops.config.load import load
-from demandops.decision import Decision, State
-from demandops.demand.demand_request import Expire
-from demandops.errors import Refused
-from demandops.ledger.claim_changes import ClaimChange
-from demandops.plan.nodes.capacity import whole_usage
+from demandops.base.errors import Refused
+from demandops.decide.decision import Decision
+from demandops.decide.placement.capacity import whole_usage
+from demandops.decide.state import State
+from demandops.model.config.inventory import Node, amount_of, amount_text
+from demandops.model.config.load import load
+from demandops.model.demand.demand_request import Expire
+from demandops.model.ledger.ledger import ClaimChange
 from hypothesis import given
 from hypothesis import strategies as st
 

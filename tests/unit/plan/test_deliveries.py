@@ -5,7 +5,7 @@ The output may have lost its inputs because a node was decommissioned.
 
 from __future__ import annotations
 
-from demandops.demand.demand_request import Decommission
+from demandops.model.demand.demand_request import Decommission
 
 from tests.kit.memory import MemoryRepo
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import timedelta
 
-from demandops.ledger.waiting import WaitingDemand
-from demandops.plan.views.demand_list import demands
+from demandops.model.ledger.records import WaitingDemand
+from demandops.views.demand_lists import demands
 
 from tests.kit.goals import perception
 from tests.kit.memory import NOW, MemoryRepo

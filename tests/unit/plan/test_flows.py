@@ -13,11 +13,11 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import yaml
-from demandops.decision import rendered_files
-from demandops.plan.planner import plan
-from demandops.plan.release import Release, ServiceKey, ServiceRelease
-from demandops.plan.release_keys import ReleaseKey, all_keys
-from demandops.plan.views.traced_plan import TracedPlan
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import ReleaseKey, all_keys
+from demandops.decide.planning.traced_plan import TracedPlan
+from demandops.decide.state import rendered_files
+from demandops.model.release import Release, ServiceKey, ServiceRelease
 from hypothesis import given
 from hypothesis import strategies as st
 

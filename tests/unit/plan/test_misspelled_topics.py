@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from demandops.plan.views import misspelled_topics
+from demandops.decide import warnings
 
 from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
@@ -64,6 +64,6 @@ def test_check_tells_of_it_with_the_file_of_the_claim() -> None:
     link = {"id": "own/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
     link |= {"topics": [{"source": USUAL.replace("vehicles", "vehicle")}]}
     books.send(put("own", "own", applications=[], connections=[link]))
-    (found,) = misspelled_topics.warnings(books.state)
+    (found,) = warnings.misspelled_topic_warnings(books.state)
     assert found.file.startswith("ledger/connections/")
     assert f"did you mean '{USUAL}'?" in found.message

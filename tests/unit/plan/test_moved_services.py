@@ -12,17 +12,17 @@ from random import Random
 from typing import Any
 
 import yaml
-from demandops.config.config import Config
-from demandops.config.load import load
-from demandops.config.override import Override, OverrideFile, Selector
-from demandops.decision import rendered_files
-from demandops.errors import Refused
-from demandops.plan.nodes.relocation import following_overrides
-from demandops.plan.override_lifecycle import changed_claim_files
-from demandops.plan.release import ServiceKey
-from demandops.plan.release_keys import all_keys
-from demandops.plan.views.policy_warnings import warnings
-from demandops.plan.views.release_causes import releases
+from demandops.base.errors import Refused
+from demandops.decide.override_lifecycle import changed_claim_files
+from demandops.decide.placement.relocation import following_overrides
+from demandops.decide.planning.release_keys import all_keys
+from demandops.decide.state import rendered_files
+from demandops.decide.warnings import policy_warnings
+from demandops.model.config.config import Config
+from demandops.model.config.load import load
+from demandops.model.config.override import Override, OverrideFile, Selector
+from demandops.model.release import ServiceKey
+from demandops.views.release_causes import releases
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -138,7 +138,7 @@ def test_what_a_quota_does_not_let_move_stays_and_check_says_so() -> None:
     ((path, why),) = stays
     assert path == "overrides/away.yaml"
     assert why.startswith("does not move object-fusion of application 'b' to 'cloud': 'cloud' ")
-    assert [f.message for f in warnings(repo.state) if f.file == path] == [why]
+    assert [f.message for f in policy_warnings(repo.state) if f.file == path] == [why]
     booked = (repo.state.ledger.application(id) for id in ("a", "b"))
     assert [app and dict(app.moved) for app in booked] == [{"object-fusion": "cloud"}, {}]
     repo.send(goal([application("b", ego=[("/more", "vehicle00")], clouds=[])], id="b"))

@@ -11,15 +11,15 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.config import Config
-from demandops.config.load import load
-from demandops.decision import rendered_files
-from demandops.errors import Refused
-from demandops.ledger.operations.drain import Drain
-from demandops.plan.planner import plan
-from demandops.plan.release import ServiceKey, ServiceRelease
-from demandops.plan.release_keys import all_keys
-from demandops.staterepo.history import commit_message
+from demandops.base.errors import Refused
+from demandops.decide.booking.leaving import Drain
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import all_keys
+from demandops.decide.state import rendered_files
+from demandops.model.config.config import Config
+from demandops.model.config.load import load
+from demandops.model.release import ServiceKey, ServiceRelease
+from demandops.repo.history import commit_message
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -10,19 +10,18 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.config import Config
-from demandops.config.inventory import Node, Position
-from demandops.config.load import load
-from demandops.config.policy import AccessDomain, Rule
-from demandops.decision import Decision
-from demandops.demand.application import Application, InputTopic, Requirement
-from demandops.demand.demand_request import Demanded, Put
-from demandops.ledger.ledger import Ledger
-from demandops.ledger.operations.put import put as book
-from demandops.ledger.world import World
-from demandops.plan.nodes.capacity import Usage
-from demandops.plan.nodes.placement import with_chosen_nodes
-from demandops.staterepo.history import commit_message
+from demandops.decide.booking.joining import put as book
+from demandops.decide.decision import Decision
+from demandops.decide.placement.capacity import Usage
+from demandops.decide.placement.placement import with_chosen_nodes
+from demandops.model.config.config import Config
+from demandops.model.config.inventory import Node, Position
+from demandops.model.config.load import load
+from demandops.model.config.policy import AccessDomain, Rule
+from demandops.model.demand.application import Application, InputTopic, Requirement
+from demandops.model.demand.demand_request import Demanded, Put
+from demandops.model.ledger.ledger import Ledger, World
+from demandops.repo.history import commit_message
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops.config.appdef import Scaling
-from demandops.decision import rendered_files
-from demandops.ledger.kept_replicas import extended, path_of, read, text_of
+from demandops.decide.state import rendered_files
+from demandops.model.config.appdef import Scaling
+from demandops.model.ledger.records import extended, read_replicas, replicas_path, replicas_text
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -111,9 +111,9 @@ def test_a_clock_that_was_set_back_gives_a_valid_record() -> None:
     steps = extended(steps, 1, 3, early, early + WINDOW)
     assert [one.replicas for one in steps] == [5]
     instance = ("replicas", "service", "edge", "app", "", "", "", "")
-    text = text_of(instance, steps)
-    assert read(text, path_of(instance)) == (instance, steps)
-    assert read(text, path_of((*instance[:-1], "other"))) is None
+    text = replicas_text(instance, steps)
+    assert read_replicas(text, replicas_path(instance)) == (instance, steps)
+    assert read_replicas(text, replicas_path((*instance[:-1], "other"))) is None
 
 
 @pytest.mark.parametrize(

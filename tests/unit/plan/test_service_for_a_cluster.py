@@ -11,9 +11,9 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import rendered_files
-from demandops.errors import InvalidInput
-from demandops.plan.release import ServiceKey
+from demandops.base.errors import InvalidInput
+from demandops.decide.state import rendered_files
+from demandops.model.release import ServiceKey
 from hypothesis import given
 
 from tests.kit.chance import chances, examples

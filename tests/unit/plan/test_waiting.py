@@ -9,12 +9,12 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decision import Decision
-from demandops.demand.demand_request import Decommission
-from demandops.errors import Refused
-from demandops.ledger import waiting
-from demandops.ledger.operations.restoration import Restoration
-from demandops.ledger.waiting import in_turn
+from demandops.base.errors import Refused
+from demandops.decide.booking.restoration import Restoration
+from demandops.decide.decision import Decision
+from demandops.model.demand.demand_request import Decommission
+from demandops.model.ledger import records
+from demandops.model.ledger.records import in_turn
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -110,7 +110,7 @@ def test_a_decommissioned_requester_waits_no_longer() -> None:
     repo = full_repo()
     decision = repo.send(Decommission("w", kinds=frozenset({"requester"})))
     assert (decision.outcome, waits(repo)) == ("released", ["a"])
-    assert waiting.path_of("b") not in repo.files
+    assert records.waiting_path("b") not in repo.files
 
 
 def test_a_rollback_leaves_what_waits() -> None:
@@ -150,7 +150,7 @@ def test_a_demand_that_holds_something_does_not_wait_for_more() -> None:
 )
 def test_a_file_that_a_person_broke_holds_nothing(change: dict[str, Any]) -> None:
     repo = full_repo()
-    path = waiting.path_of("a")
-    assert waiting.read(repo.files[path], path) == repo.state.ledger.waiting["a"]
+    path = records.waiting_path("a")
+    assert records.read_waiting(repo.files[path], path) == repo.state.ledger.waiting["a"]
     broken = yaml.safe_dump(yaml.safe_load(repo.files[path]) | change)
-    assert waiting.read(broken, path) is None
+    assert records.read_waiting(broken, path) is None

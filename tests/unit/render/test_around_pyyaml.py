@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from demandops import strict_yaml
-from demandops.errors import InvalidInput
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput
 from hypothesis import given
 from hypothesis import strategies as st
 

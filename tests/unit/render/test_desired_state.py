@@ -8,8 +8,8 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
-from demandops.errors import InvalidInput
-from demandops.render.output_check import check_files
+from demandops.base.errors import InvalidInput
+from demandops.render.release_file import check_files
 
 from tests.kit.goals import application, connection, goal, perception
 from tests.kit.golden import CASES, rendered

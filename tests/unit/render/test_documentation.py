@@ -7,8 +7,8 @@ import re
 from pathlib import Path
 
 import yaml
+from demandops.connections.connection import RouteOptions
 from demandops.connections.connection_types import CONNECTION_TYPES
-from demandops.connections.route import RouteOptions
 
 from tests.kit.config import skeleton
 from tests.kit.memory import MemoryRepo

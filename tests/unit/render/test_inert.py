@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops import strict_yaml
-from demandops.config.load import load
-from demandops.errors import InvalidInput
-from demandops.identifiers import control_character
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput
+from demandops.base.naming import control_character
+from demandops.model.config.load import load
 
 from tests.kit.config import configuration, override, skeleton
 from tests.kit.goals import application, connection, goal

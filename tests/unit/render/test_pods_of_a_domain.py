@@ -15,12 +15,12 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.config.load import load
-from demandops.config.policy import matches
-from demandops.decision import rendered_files
-from demandops.errors import InvalidInput
-from demandops.render.gitops.node_rule import expression_of, node_rule
-from demandops.render.output_check import check_files
+from demandops.base.errors import InvalidInput
+from demandops.decide.state import rendered_files
+from demandops.model.config.load import load
+from demandops.model.config.policy import matches
+from demandops.render.bootstrap import expression_of, node_rule
+from demandops.render.release_file import check_files
 
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from demandops.runtime import REAL
-from demandops.service.timing.backoff import FIRST_PAUSE_S, LONGEST_AWAY_S, LONGEST_TURN_S, Backoff
+from demandops.base.runtime import REAL
+from demandops.serve.timing.timers import FIRST_PAUSE_S, LONGEST_AWAY_S, LONGEST_TURN_S, Backoff
 
 
 def test_waits_grow_to_their_bounds_and_never_beyond() -> None:

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from demandops.errors import QueueFull
-from demandops.runtime import REAL
-from demandops.service.demand_lifecycle import Demands
-from demandops.service.ticket import Ticket
-from demandops.staterepo.write.journal import Journal
+from demandops.base.errors import QueueFull
+from demandops.base.runtime import REAL
+from demandops.repo.write.journal import Journal
+from demandops.serve.demand_lifecycle import Demands
+from demandops.serve.queue import Ticket
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,7 @@ from random import Random
 from typing import Any
 
 import pytest
-from demandops.service.fair_queue import FairQueue, requester_of, subjects_of
-from demandops.service.ticket import Ticket
+from demandops.serve.queue import FairQueue, Ticket, requester_of, subjects_of
 
 from tests.kit.memory import NOW
 

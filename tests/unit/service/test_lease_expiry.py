@@ -7,13 +7,11 @@ from dataclasses import replace
 from datetime import timedelta
 
 import pytest
-from demandops.connections.connection import Connection
+from demandops.connections.connection import Connection, Route
 from demandops.connections.mqtt import MQTT
-from demandops.connections.route import Route
-from demandops.demand.claim import Claim
-from demandops.demand.lease import Lease
-from demandops.ledger.ledger import Ledger
-from demandops.service.timing.expiry import LeaseExpiry
+from demandops.model.demand.claim import Claim, Lease
+from demandops.model.ledger.ledger import Ledger
+from demandops.serve.timing.own_work import LeaseExpiry
 
 from tests.kit.clock import Clock
 from tests.kit.memory import NOW as START

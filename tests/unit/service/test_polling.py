@@ -5,9 +5,9 @@ from __future__ import annotations
 import logging
 
 import pytest
-from demandops.runtime import REAL
-from demandops.service.remote_status import RemoteMonitor
-from demandops.service.timing.polling import PollTimer, parse_interval
+from demandops.base.runtime import REAL
+from demandops.serve.status import RemoteMonitor
+from demandops.serve.timing.timers import PollTimer, parse_interval
 
 from tests.kit.clock import Clock
 from tests.kit.memory import NOW

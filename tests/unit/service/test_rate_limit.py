@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from datetime import datetime, timedelta, timezone
 
-from demandops.config.config import Config
-from demandops.config.load import load
-from demandops.demand.application import Application
-from demandops.demand.demand_request import Demanded, Join
-from demandops.service.timing.rate_limit import RateLimit
+from demandops.model.config.config import Config
+from demandops.model.config.load import load
+from demandops.model.demand.application import Application
+from demandops.model.demand.demand_request import Demanded, Join
+from demandops.serve.timing.limits import RateLimit
 
 from tests.kit.config import configuration, edited
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import pytest
-from demandops import strict_yaml
+from demandops.base import strict_yaml
 from demandops.cluster.health.release_health import ObjectName
-from demandops.decision import decide
-from demandops.service import rollout_targets
+from demandops.decide.decision import decide
+from demandops.serve import rollout_targets
 
 from tests.kit import goals
 from tests.kit.golden import requests_of, start

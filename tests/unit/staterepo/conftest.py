@@ -8,7 +8,7 @@ from typing import Any
 
 import pygit2
 import pytest
-from demandops.decision import Decision
+from demandops.decide.decision import Decision
 
 from tests.kit import goals
 from tests.kit.memory import MemoryRepo

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pygit2
-from demandops.staterepo.history import commit_log
+from demandops.repo.history import commit_log
 from pygit2 import Oid
 
 

@@ -7,13 +7,13 @@ from typing import Any
 
 import pygit2
 import pytest
-from demandops.decision import Decision
-from demandops.demand.demand_request import Decommission
-from demandops.errors import fault
-from demandops.identifiers import id_problem
-from demandops.render.changes.changeset import ReleaseChange
-from demandops.staterepo.history import commit_log, commit_message
-from demandops.staterepo.history.message_format import compose
+from demandops.base.errors import fault
+from demandops.base.naming import id_problem
+from demandops.decide.changes.changeset import ReleaseChange
+from demandops.decide.decision import Decision
+from demandops.model.demand.demand_request import Decommission
+from demandops.repo.history import commit_log, commit_message
+from demandops.repo.history.commit_log import compose
 
 from tests.kit import goals
 from tests.kit.repo import git, write_tree

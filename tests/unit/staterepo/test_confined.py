@@ -8,9 +8,9 @@ import textwrap
 from pathlib import Path
 
 import pytest
-from demandops.staterepo.pull_request import confined
-from demandops.staterepo.pull_request import helm as helm_runs
-from demandops.staterepo.pull_request.helm import HELM_BIN, Helm, Report
+from demandops.repo.pull_request import confined
+from demandops.repo.pull_request import helm as helm_runs
+from demandops.repo.pull_request.helm import HELM_BIN, Helm, Report
 
 from tests.kit.http import serving
 

@@ -8,16 +8,16 @@ import stat
 from pathlib import Path
 
 import pytest
-from demandops.errors import StateRepoError
-from demandops.staterepo.write.journal import (
+from demandops.base.errors import StateRepoError
+from demandops.repo.write.journal import (
     DamagedJournal,
     Journal,
     JournalEntry,
     ProposalRecord,
+    Slot,
     parse,
     read,
 )
-from demandops.staterepo.write.slot import Slot
 
 from tests.kit.limits import files_end_at
 

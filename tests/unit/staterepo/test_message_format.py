@@ -5,8 +5,8 @@ from __future__ import annotations
 import re
 
 import pygit2
-from demandops.quoting import harmless, is_visible, one_line
-from demandops.staterepo.history.message_format import compose, parse
+from demandops.base.quoting import harmless, is_visible, one_line
+from demandops.repo.history.commit_log import compose, parse
 from hypothesis import example, given
 from hypothesis import strategies as st
 

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pygit2
 import pytest
-from demandops.errors import StateRepoError
-from demandops.staterepo.git.open_repository import connect, is_url
-from demandops.staterepo.git.remote_repository import without_secrets
-from demandops.staterepo.git.repository import RemoteAway
+from demandops.base.errors import StateRepoError
+from demandops.repo.git.open_repository import connect, is_url
+from demandops.repo.git.remote_repository import without_secrets
+from demandops.repo.git.repository import RemoteAway
 
 from tests.kit.repo import git
 

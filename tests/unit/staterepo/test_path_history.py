@@ -7,8 +7,8 @@ from random import Random
 
 import pygit2
 import pytest
-from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history import commit_log
+from demandops.repo.git import tree as trees
+from demandops.repo.history import commit_log
 
 from tests.kit.repo import git, write_tree
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import pytest
-from demandops.render.trial_render import trial_releases
-from demandops.staterepo.pull_request.helm import Report
-from demandops.staterepo.pull_request.rendered_charts import _Run
+from demandops.decide.changes.trial_render import trial_releases
+from demandops.repo.pull_request.helm import Report
+from demandops.repo.pull_request.rendered_charts import _Run
 
 from tests.kit.config import edited
 from tests.kit.memory import MemoryRepo

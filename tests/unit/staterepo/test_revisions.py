@@ -10,9 +10,9 @@ from pathlib import Path
 import demandops
 import pygit2
 import pytest
-from demandops.errors import StateRepoError
-from demandops.staterepo.git import tree as trees
-from demandops.staterepo.history import revisions
+from demandops.base.errors import StateRepoError
+from demandops.repo.git import tree as trees
+from demandops.repo.history import revisions
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from pygit2.enums import ObjectType

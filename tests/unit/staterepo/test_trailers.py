@@ -6,10 +6,9 @@ from typing import Any
 
 import pygit2
 import pytest
-from demandops.identifiers import id_problem
-from demandops.staterepo.history import commit_log, commit_message
-from demandops.staterepo.history.commit_log import operations_since
-from demandops.staterepo.history.message_format import compose, parse
+from demandops.base.naming import id_problem
+from demandops.repo.history import commit_log, commit_message
+from demandops.repo.history.commit_log import compose, operations_since, parse
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -14,9 +14,8 @@ from pathlib import Path
 
 import pygit2
 import pytest
-from demandops.staterepo.git import tree as trees
-from demandops.staterepo.git.new_objects import NewObjects
-from demandops.staterepo.git.pack_file import Packed, index_of
+from demandops.repo.git import tree as trees
+from demandops.repo.git.objects import NewObjects, Packed, index_of
 from hypothesis import given
 from hypothesis import strategies as st
 

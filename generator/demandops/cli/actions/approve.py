@@ -6,6 +6,9 @@ from pathlib import Path
 
 import click
 
+from demandops.base.errors import InvalidInput, suggestion
+from demandops.base.quoting import one_line
+from demandops.base.runtime import REAL
 from demandops.cli.actions.person_change import (
     confirm,
     is_asked,
@@ -19,13 +22,14 @@ from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors
 from demandops.cli.target import signing_option, writable_repo_option
 from demandops.cli.views.diff import differences, entry_lines, release_lines
-from demandops.errors import InvalidInput, suggestion
-from demandops.quoting import one_line
-from demandops.runtime import REAL
-from demandops.staterepo.reader import Reader
-from demandops.staterepo.write import person_commit
-from demandops.staterepo.write.person_commit import CommitDetails
-from demandops.staterepo.write.proposal_branch import PendingProposal, pending_proposals
+from demandops.repo.reader import Reader
+from demandops.repo.write import person_commit
+from demandops.repo.write.person_commit import CommitDetails
+from demandops.repo.write.proposal_branch import (
+    PendingProposal,
+    ProposalBranches,
+    pending_proposals,
+)
 
 commit_option = click.option(
     "--commit",
@@ -129,3 +133,34 @@ def approve(
         merged = person_commit.merge(repo.repository, proposal, details)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
     show(output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"])
+
+
+# ---- ``demandops reject``: refuse a proposal ----
+
+
+@click.command()
+@click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
+@commit_option
+@yes_option
+@writable_repo_option
+@output_option
+def reject(name: str, commit: str, yes: bool, state_repo: str, output: str) -> None:
+    """Turn a proposed demand down: delete its branch.
+
+    The generator then aborts the goal with `turned-down`. If the branch has changed since the
+    command read it, the command deletes nothing.
+
+    \b
+    Examples:
+      demandops reject demand/visit-3f2a9c1b04de
+      demandops reject visit --yes
+    """
+    with writable(state_repo, None) as repo:
+        proposal = proposal_named(repo, name)
+        if commit:
+            proposal.require(commit)
+        print_proposal(proposal, output)
+        confirm("Turn it down?", yes, output)
+        ProposalBranches(repo.repository).remove(proposal.branch, proposal.commit)
+    data = {"outcome": "rejected", "branch": proposal.branch, "commit": proposal.commit}
+    show(output, data, [f"turned down: {proposal.branch} is deleted"])

@@ -7,7 +7,12 @@ from typing import Any
 
 import click
 
-from demandops import strict_yaml
+from demandops.base import naming, strict_yaml
+from demandops.base.errors import InvalidInput, suggestion
+from demandops.base.naming import id_problem
+from demandops.base.quoting import quoted
+from demandops.base.runtime import REAL
+from demandops.base.strict_yaml import read_input
 from demandops.cli.actions.person_change import (
     Edit,
     EditOptions,
@@ -24,17 +29,12 @@ from demandops.cli.actions.person_change import (
 )
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors
-from demandops.config.durations import seconds_of
-from demandops.config.load import is_override_name
-from demandops.config.override import OVERRIDES_ROOT, format_time, parse_time
-from demandops.errors import InvalidInput, suggestion
-from demandops.identifiers import id_problem
-from demandops.input_file import read_input
-from demandops.plan.views.override_report import Entry
-from demandops.quoting import quoted
-from demandops.runtime import REAL
-from demandops.scaffold.yaml_document import document
-from demandops.staterepo.reader import Reader
+from demandops.cli.repo.scaffold import document
+from demandops.model.config.base_model import seconds_of
+from demandops.model.config.load import is_override_name
+from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time, parse_time
+from demandops.repo.reader import Reader
+from demandops.views.override_report import Entry
 
 
 @click.group()
@@ -237,3 +237,93 @@ def ends_at(text: str | None) -> str | None:
         raise click.BadParameter(
             f"{error}, or a duration like 2h", param_hint="--expires"
         ) from None
+
+
+# ---- ``demandops suspend``: stop applications and connections by an override that denies them ----
+
+
+def name_of(selected: dict[str, tuple[str, ...]]) -> str:
+    """Return the name of the override for a selection; equal selections get the same name."""
+    chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
+    words = "-".join(value for _, values in chosen for value in values)
+    return "suspend-" + naming.slug_with_hash(words, repr(chosen), 6)
+
+
+def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
+    """Return whether an override has this selection, and not another one with the same name."""
+    selectors = [each.model_dump(exclude_none=True) for each in override.select]
+    return [{kind: {*values} for kind, values in each.items()} for each in selectors] == [
+        {kind: {*values} for kind, values in selector(selected).items()}
+    ]
+
+
+@click.command()
+@selecting
+@click.option(
+    "--expires",
+    metavar="TIME",
+    help="When the suspension ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
+)
+@editing
+def suspend(expires: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
+    """Stop applications and connections; their claims stay booked.
+
+    Nothing runs for these claims, and new demands that match the options are refused. To end the
+    suspension, give `demandops resume` the same selection, such as --requester vehicle00. The
+    command creates an override with `deny` in your own name.
+
+    \b
+    Examples:
+      demandops suspend --requester vehicle00 -m "In the workshop"
+      demandops suspend --application 'edge/*' --expires 2h -m "Service"
+      demandops suspend --connection vehicle00/edge -m "Too much data" --propose
+    """
+    effect = {"expires": ends_at(expires), "deny": True}
+    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+        name = name_of(selected)
+        text = new_override(repo, name, options, selected, effect)
+        edit = Edit(name, text, f"Suspend {described(selected)}", options.reason)
+        create_override(repo, edit, options)
+
+
+def described(selected: dict[str, tuple[str, ...]]) -> str:
+    """Return a selection as text, such as ``node edge, requester vehicle00``."""
+    return ", ".join(
+        f"{kind.removesuffix('s')} {value}"
+        for kind, values in selector(selected).items()
+        for value in values
+    )
+
+
+# ---- ``demandops resume``: end an override that ``demandops suspend`` made ----
+
+
+@click.command()
+@click.argument("name", required=False, metavar="[NAME]", shell_complete=names_of("overrides"))
+@selecting
+@editing
+def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
+    """Run suspended applications and connections again.
+
+    Give the same selection as for `demandops suspend`, such as --requester vehicle00, or NAME, the
+    override's name. The command ends this override.
+
+    \b
+    Examples:
+      demandops resume --requester vehicle00
+      demandops resume suspend-vehicle00-1c2f3a
+    """
+    if bool(name) == bool(selector(selected)):
+        raise click.UsageError(
+            "give either the options of `demandops suspend`, or the override's name"
+        )
+    summary = f"Resume {name or described(selected)}"
+    edit = Edit(name or name_of(selected), None, summary, options.reason)
+    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+        overrides = repo.last_valid_snapshot(repo.commit()).state.config.overrides
+        override = overrides.get(edit.name)
+        # a person may have changed what the file selects since it was suspended
+        if override and not name and not selects(override, selected):
+            message = f"selects something else; to end it, run: demandops resume {edit.name}"
+            raise InvalidInput.at("select", message, file=edit.path)
+        end_override(repo, edit, options)

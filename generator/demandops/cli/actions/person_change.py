@@ -12,7 +12,10 @@ from typing import Any
 
 import click
 
-from demandops import settings
+from demandops.base import settings
+from demandops.base.quoting import harmless, one_line
+from demandops.base.runtime import REAL
+from demandops.base.settings import MAIN_BRANCH
 from demandops.cli.json_output import (
     Json,
     claim_data,
@@ -24,20 +27,17 @@ from demandops.cli.json_output import (
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
-from demandops.config.base_model import parse_file
-from demandops.config.override import Override, OverrideFile
-from demandops.forge import ForgeError, forge_for
-from demandops.ledger.world import World
-from demandops.plan.views.override_report import Entry, override_report
-from demandops.quoting import harmless, one_line
-from demandops.runtime import REAL
-from demandops.settings import MAIN_BRANCH
-from demandops.staterepo import reader
-from demandops.staterepo.git.signing import Signer
-from demandops.staterepo.history.authorship import Person
-from demandops.staterepo.reader import Reader
-from demandops.staterepo.write import person_commit
-from demandops.staterepo.write.person_commit import CommitDetails, Published
+from demandops.model.config.base_model import parse_file
+from demandops.model.config.override import Override, OverrideFile
+from demandops.model.ledger.ledger import World
+from demandops.repo import reader
+from demandops.repo.forge import ForgeError, forge_for
+from demandops.repo.git.signing import Signer
+from demandops.repo.history.commit_message import Person
+from demandops.repo.reader import Reader
+from demandops.repo.write import person_commit
+from demandops.repo.write.person_commit import CommitDetails, Published
+from demandops.views.override_report import Entry, override_report
 
 Command = Callable[..., Any]
 

@@ -9,7 +9,18 @@ from typing import Any
 
 import click
 
-from demandops import field_lines, strict_yaml
+from demandops.base import strict_yaml
+from demandops.base.errors import (
+    DemandOpsError,
+    InvalidInput,
+    ShuttingDown,
+    Unsound,
+    Withdrawn,
+    fault,
+)
+from demandops.base.quoting import one_line
+from demandops.base.runtime import REAL
+from demandops.base.strict_yaml import read_input
 from demandops.cli.actions.ledger_change import (
     await_answer,
     print_consequences,
@@ -19,15 +30,13 @@ from demandops.cli.actions.ledger_change import (
 from demandops.cli.json_output import Json, faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
-from demandops.decision import admit, decide, form_faults
-from demandops.demand.demand_goal import is_demand_goal
-from demandops.errors import DemandOpsError, InvalidInput, ShuttingDown, Unsound, Withdrawn, fault
-from demandops.input_file import read_input
-from demandops.quoting import one_line
-from demandops.runtime import REAL
-from demandops.service import Generator, Receipt
-from demandops.service.approvals.proposal import parse_waiting_text
-from demandops.staterepo import reader
+from demandops.decide.admission.admitted_request import admit, form_faults
+from demandops.decide.decision import decide
+from demandops.model.demand.demand_goal import is_demand_goal
+from demandops.repo import reader
+from demandops.serve.approvals.proposal import parse_waiting_text
+from demandops.serve.generator import Generator
+from demandops.serve.queue import Receipt
 
 
 @dataclass(frozen=True, slots=True)
@@ -160,9 +169,9 @@ def _unbooked(documents: list[Document], state_repo: str) -> list[Json]:
 
 
 def _refused(index: int, document: Document, error: DemandOpsError) -> Json:
-    lines = field_lines.lines(document.text, document.number)
+    lines = strict_yaml.lines(document.text, document.number)
     faults = [
-        each | {"line": field_lines.nearest(each["field"], lines)} if not each["file"] else each
+        each | {"line": strict_yaml.nearest(each["field"], lines)} if not each["file"] else each
         for each in faults_of(error)
     ]
     return _row(index, document.request_id, "refused", faults=faults)

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import click
 
+from demandops.base.errors import StateRepoError
+from demandops.base.runtime import REAL
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import busy
 from demandops.cli.repo import schema
 from demandops.cli.target import signing_option
-from demandops.errors import StateRepoError
-from demandops.runtime import REAL
-from demandops.staterepo import new_repo
-from demandops.staterepo.git.signing import Signer
+from demandops.repo import new_repo
+from demandops.repo.git.signing import Signer
 
 
 @click.command()

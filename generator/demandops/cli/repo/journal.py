@@ -6,13 +6,13 @@ from dataclasses import asdict
 
 import click
 
-from demandops import settings
+from demandops.base import settings
+from demandops.base.errors import fault
+from demandops.base.runtime import REAL
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import errors
 from demandops.cli.target import writable_repo_option
-from demandops.errors import fault
-from demandops.runtime import REAL
-from demandops.staterepo.write.slot import find_journals
+from demandops.repo.write.journal import find_journals
 
 
 @click.command()

@@ -9,21 +9,20 @@ from pathlib import Path
 
 import click
 
+from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.settings import data_folder
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import busy
-from demandops.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
-from demandops.config.load import load
-from demandops.config.registry import Image
-from demandops.decision import State, try_configuration
-from demandops.errors import InvalidInput, StateRepoError
-from demandops.evaluator.process import EVALUATE
-from demandops.ledger.ledger import Ledger
-from demandops.scaffold import new_application, new_image
-from demandops.scaffold.new_application import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
-from demandops.scaffold.yaml_document import document
-from demandops.settings import data_folder
-from demandops.staterepo import skeleton
-from demandops.staterepo.pull_request import edited_checkout
+from demandops.cli.repo import scaffold
+from demandops.cli.repo.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan, document
+from demandops.decide.state import State, try_configuration
+from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
+from demandops.model.config.load import load
+from demandops.model.config.registry import Image
+from demandops.model.ledger.ledger import Ledger
+from demandops.repo import new_repo
+from demandops.repo.pull_request import edited_checkout
+from demandops.templating.evaluator import EVALUATE
 
 _IMAGE = re.compile(r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:.*))?")
 _INPUT = re.compile(r"(?P<role>[^=]+)=(?P<type>.+)")
@@ -107,7 +106,7 @@ def application(  # noqa: PLR0913 - as many as options
     given = {"--input": inputs, "--service": services, "--image": (image,) if image else ()}
     existing, config = _read_configuration(directory)
     # before the questions, so that nobody answers them in vain
-    new_application.refuse_name(name, config)
+    scaffold.refuse_name(name, config)
     missing = [option for option, values in given.items() if not values]
     if missing and not sys.stdin.isatty():
         options = ", ".join(f"'{option}'" for option in missing)
@@ -135,14 +134,14 @@ def application(  # noqa: PLR0913 - as many as options
         "when the files are on main, try the application: demandops request --dry-run "
         f"{directory / 'appdefs' / name / 'demand.yaml'}"
     ]
-    if domain := new_application.closed_domain(plan, config):
+    if domain := scaffold.closed_domain(plan, config):
         then.insert(
             0,
             f"no rule of access domain '{domain.name}' allows demands for this application on "
             f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
             f"{config.file_of(DOMAINS_FILE, domain.name)}",
         )
-    files = new_application.files(plan, config, skeleton.files_of_library(LIBRARY_FOLDER))
+    files = scaffold.application_files(plan, config, new_repo.files_of_library(LIBRARY_FOLDER))
     _lay_down(directory, existing, files, output, then)
 
 
@@ -243,7 +242,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
     folder = data_folder("templates") / "scaffold" / "image"
     texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
     then = ["keep .github/workflows/image.yml or .gitlab-ci.yml, whichever you need"]
-    _write_files(directory, new_image.files(name, repository, url, texts), output, then)
+    _write_files(directory, scaffold.image_files(name, repository, url, texts), output, then)
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:

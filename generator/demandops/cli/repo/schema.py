@@ -1,27 +1,76 @@
-"""``demandops schema``: JSON Schemas of the files that people write."""
+"""A description and an example of each property of a JSON Schema, for editors and the docs."""
 
 from __future__ import annotations
 
 import json
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import click
 from pydantic import BaseModel
 
-from demandops.cli.contexts import ContextsFile
+from demandops.base import strict_yaml
+from demandops.base.settings import API_VERSION, data_folder
 from demandops.cli.output import console
-from demandops.cli.repo.schema_properties import describe
+from demandops.cli.target import ContextsFile
 from demandops.cluster.clusters_file import AccessFile
-from demandops.config.appdef import ApplicationDefinition, ServiceDefinition
-from demandops.config.inventory import BrokersFile, ClustersFile, NodesFile
-from demandops.config.override import OverrideFile
-from demandops.config.policy import AccessDomainsFile
-from demandops.config.registry import ChartsFile, ClientsFile, ImagesFile, VersionsFile
-from demandops.config.repo_settings import RepoSettings
-from demandops.demand.demand_goal import DemandGoal
-from demandops.demand.deployment_request_goal import WireGoal
-from demandops.detection.rules.rule_file import RuleFile
+from demandops.detect.rule_file import RuleFile
+from demandops.model.config.appdef import ApplicationDefinition, ServiceDefinition
+from demandops.model.config.inventory import BrokersFile, ClustersFile, NodesFile
+from demandops.model.config.override import OverrideFile
+from demandops.model.config.policy import AccessDomainsFile
+from demandops.model.config.registry import ChartsFile, ClientsFile, ImagesFile, VersionsFile
+from demandops.model.config.repo_settings import RepoSettings
+from demandops.model.demand.demand_goal import DemandGoal
+from demandops.model.demand.deployment_request_goal import WireGoal
+
+_INHERITS = "inherits"
+_COMMON = {
+    "apiVersion": ["Version of the format", API_VERSION],
+    "kind": ["Type of the file's content"],
+}
+
+
+def describe(schema: dict[str, Any], root: str) -> None:
+    """Add descriptions and examples to the properties of a schema and its definitions.
+
+    They come from ``templates/schemas/properties.yaml``. Other properties stay as they are.
+    ``root`` is the name of the model whose JSON Schema is changed.
+    """
+    properties = _properties()
+    for model, part in {root: schema, **schema.get("$defs", {})}.items():
+        for name, field in part.get("properties", {}).items():
+            # for the model in this schema, else for the model, else for the one it inherits from
+            places = (f"{root}/{model}", model, properties[_INHERITS].get(model, ""))
+            models = (*(properties.get(place) or {} for place in places), _COMMON)
+            entry = next((each[name] for each in models if name in each), None)
+            if entry:
+                description, *example = entry
+                field["description"] = description
+                field["examples"] = example or _fixed(field)
+
+
+def _fixed(field: dict[str, Any]) -> list[Any]:
+    """Return a list with one example if only certain values are valid; otherwise an empty list."""
+    for part in (field, *field.get("anyOf", ())):
+        if "const" in part:
+            return [part["const"]]
+        if "enum" in part:
+            return [part["enum"][-1]]
+        if part.get("type") == "boolean":
+            return [True]
+    return []
+
+
+@lru_cache(maxsize=1)
+def _properties() -> dict[str, Any]:
+    file = data_folder("templates") / "schemas" / "properties.yaml"
+    properties: dict[str, Any] = strict_yaml.load(file.read_text(encoding="utf-8"), file.name)
+    return properties
+
+
+# ---- ``demandops schema``: JSON Schemas of the files that people write ----
 
 SCHEMAS: dict[str, tuple[type[BaseModel], str]] = {
     "access-domains": (

@@ -5,18 +5,28 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import asdict
 from pathlib import Path
 
 import click
 
+from demandops.base.errors import fault
+from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, output_option, show
-from demandops.cli.output import Progress, busy
-from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
-from demandops.render.gitops.paths import bootstrap_path, domains_by_cluster
-from demandops.runtime import REAL
-from demandops.staterepo import upgrade as upgrading
-from demandops.staterepo.git.signing import Signer
-from demandops.staterepo.upgrade import Upgrade, UpgradeRequest
+from demandops.cli.output import Progress, busy, progress
+from demandops.cli.target import (
+    dry_run_option,
+    signing_option,
+    state_repo_option,
+    writable_repo_option,
+)
+from demandops.render.paths import bootstrap_path, domains_by_cluster
+from demandops.repo import reader
+from demandops.repo import upgrade as upgrading
+from demandops.repo.git.signing import Signer
+from demandops.repo.upgrade import Upgrade, UpgradeRequest
+from demandops.repo.verification import Verdict
+from demandops.templating.evaluator import processor_time
 
 _MOST_PATHS = 50
 _SWITCH = (
@@ -93,7 +103,7 @@ def upgrade(
         "removed": [path for path, text in result.files.items() if text is None],
         "after": _steps_after(result),
     }
-    show(output, data, _lines(result, dry_run))
+    show(output, data, _upgrade_lines(result, dry_run))
 
 
 @contextmanager
@@ -119,7 +129,7 @@ def _steps_after(result: Upgrade) -> list[Json]:
     ]
 
 
-def _lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
+def _upgrade_lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
     old, new = result.old.repo_settings, result.new.repo_settings
     if not result.files:
         yield (
@@ -149,3 +159,72 @@ def _lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
     for step in steps:
         yield f"- {step['cluster']}: {step['what']}"
         yield from (f"      {command}" for command in step["commands"])
+
+
+# ---- ``demandops verify``: a proof that commits match their ledger and configuration ----
+
+
+@click.command()
+@click.argument("revisions", required=False, metavar="[REV|A..B]")
+@state_repo_option
+@click.option(
+    "--whole",
+    is_flag=True,
+    help="Load and render each commit completely. Without this option, each commit between the "
+    "first and the last is verified by its differences from the commit before it.",
+)
+@output_option
+def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> None:
+    """Render commits again from their ledger and compare the bytes.
+
+    REV names one commit, A..B the commits after A up to B; default: the newest commit. REV, A and B
+    are commits or times. Once the state repo has policy/allowed-signers, each further commit of the
+    generator must have a good signature. The version of this file in the commit's parent must list
+    the signing key (docs/audit.md).
+
+    \b
+    Examples:
+      demandops verify
+      demandops verify main~50..main
+      demandops verify main --whole
+    """
+    # what was rendered once must not fail here because this machine is slower
+    with (
+        processor_time(each=60),
+        reader.opened(state_repo) as repo,
+        progress("rendering again") as report,
+    ):
+        verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
+    rows: list[Json] = []
+    for verdict in verdicts:
+        row = {name: None if value == "" else value for name, value in asdict(verdict).items()}
+        message = row.pop("fault")
+        rows.append(row | {"faults": [asdict(fault("", message))] if message else []})
+    show(output, rows, _verify_lines(verdicts))
+    if not all(verdict.holds for verdict in verdicts):
+        raise click.exceptions.Exit(1)
+
+
+def _verify_lines(verdicts: list[Verdict]) -> Iterator[str]:
+    for verdict in verdicts:
+        word = "skipped" if verdict.skipped else "verified"
+        if not verdict.holds:
+            differs = verdict.fault or verdict.differing or verdict.touched
+            word = "DIFFERS" if differs else "UNSIGNED"
+        note = f" ({verdict.skipped})" if verdict.skipped else ""
+        yield f"{verdict.commit[:10]} {word}{note}  {verdict.summary}"
+        if verdict.fault:
+            yield f"    the ledger of this commit can no longer be rendered: {verdict.fault}"
+        yield from (f"    {path}" for path in verdict.differing)
+        yield from (f"    {path} (this commit must not change it)" for path in verdict.touched)
+        if verdict.signature:
+            yield f"    it {verdict.signature}"
+    skipped = sum(bool(verdict.skipped and verdict.holds) for verdict in verdicts)
+    verified = sum(verdict.holds for verdict in verdicts) - skipped
+    note = f", {skipped} skipped" if skipped else ""
+    yield f"{verified} of {len(verdicts)} commits are verified{note}"
+    signed = sum(verdict.signed for verdict in verdicts)
+    if signed:
+        good = sum(bool(verdict.signer) for verdict in verdicts)
+        listed = f", {good} by keys that policy/allowed-signers lists" if good else ""
+        yield f"{signed} of {len(verdicts)} are signed{listed}"

@@ -11,9 +11,9 @@ from demandops.cli.json_output import output_option, show, time_text
 from demandops.cli.output import at_option, progress, version_lines, warn_of
 from demandops.cli.table import Column, Table
 from demandops.cli.target import state_repo_option
-from demandops.plan.views.bookkeeping import ConnectionEntry, ServiceEntry, as_data
-from demandops.plan.views.bookkeeping import bookkeeping as derive
-from demandops.staterepo import reader
+from demandops.repo import reader
+from demandops.views.bookkeeping import ConnectionEntry, ServiceEntry, as_data
+from demandops.views.bookkeeping import bookkeeping as derive
 
 
 @click.command()

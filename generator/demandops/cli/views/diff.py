@@ -10,13 +10,13 @@ import click
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import SIGNS, progress, warn_of
 from demandops.cli.target import state_repo_option
-from demandops.plan.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
-from demandops.render.changes.changeset import ReleaseChange
-from demandops.render.changes.merge_preview import MergePreview, planned_releases, preview
-from demandops.render.gitops.paths import CLUSTERS_ROOT
-from demandops.staterepo import reader
-from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.reader import Reader
+from demandops.decide.changes.changeset import ReleaseChange
+from demandops.decide.changes.merge_preview import MergePreview, planned_releases, preview
+from demandops.render.paths import CLUSTERS_ROOT
+from demandops.repo import reader
+from demandops.repo.load.snapshot import Snapshot
+from demandops.repo.reader import Reader
+from demandops.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 
 
 @click.command()

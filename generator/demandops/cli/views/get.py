@@ -9,21 +9,21 @@ from typing import Any
 
 import click
 
-from demandops import strict_yaml
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput, fault, suggestion
+from demandops.base.naming import SubjectKind
+from demandops.base.quoting import json_escaped, quoted
+from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, output_formats, print_json, show
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import at_option, errors, painted, progress, warn_of, warn_of_not_rendered
 from demandops.cli.target import state_repo_option
 from demandops.cli.views.kinds import KINDS, Kind, Source
-from demandops.config.policy import matches
-from demandops.errors import InvalidInput, fault, suggestion
-from demandops.ledger.world import World
-from demandops.quoting import json_escaped, quoted
-from demandops.runtime import REAL
-from demandops.staterepo import reader
-from demandops.staterepo.git.repository import RemoteAway
-from demandops.staterepo.reader import Reader
-from demandops.subject import SubjectKind
+from demandops.model.config.policy import matches
+from demandops.model.ledger.ledger import World
+from demandops.repo import reader
+from demandops.repo.git.repository import RemoteAway
+from demandops.repo.reader import Reader
 
 FILTERS = ("node", "requester", "application", "domain")
 _POLL_S = 1.0

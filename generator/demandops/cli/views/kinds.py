@@ -1,4 +1,4 @@
-"""The kinds of things that ``demandops get`` lists: their data, columns and filters."""
+"""The proposals that await a person's approval, with links to their pull requests."""
 
 from __future__ import annotations
 
@@ -7,6 +7,9 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from datetime import datetime, timedelta
 
+from demandops.base import settings
+from demandops.base.errors import InvalidInput
+from demandops.base.settings import MAIN_BRANCH
 from demandops.cli.json_output import (
     Json,
     claim_data,
@@ -16,18 +19,53 @@ from demandops.cli.json_output import (
     time_data,
     time_text,
 )
-from demandops.cli.output import version_lines
+from demandops.cli.output import errors, version_lines
 from demandops.cli.table import Cell, Column, Table
-from demandops.cli.views.proposal_list import proposals
-from demandops.config.durations import duration_text, relative
-from demandops.config.override import parse_time
-from demandops.demand.lease import Lease
-from demandops.plan.views import demand_list, node_list, release_causes
-from demandops.plan.views.bookkeeping import bookkeeping
-from demandops.plan.views.override_report import override_report
-from demandops.render.changes.override_state import override_state
-from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.reader import Reader
+from demandops.model.config.base_model import duration_text, relative
+from demandops.model.config.override import parse_time
+from demandops.model.config.repo_settings import Proposals
+from demandops.model.demand.claim import Lease
+from demandops.repo.forge import ForgeError, forge_for
+from demandops.repo.load.snapshot import Snapshot
+from demandops.repo.reader import Reader
+from demandops.repo.write.proposal_branch import pending_proposals
+from demandops.views import demand_lists, release_causes
+from demandops.views.bookkeeping import bookkeeping
+from demandops.views.override_report import override_report, override_state
+
+
+def proposals(repo: Reader) -> list[Json]:
+    """Return the proposals as JSON data.
+
+    The links to the pull requests come from the GitHub or Gitea that demandops.yaml names, with the
+    token in the file that DEMANDOPS_FORGE_TOKEN_FILE names. If one of these is missing, or there is
+    no answer or no pull request, a link is None.
+    """
+    pending = list(pending_proposals(repo.repository))
+    token_file, forge = settings.forge_token_file(), None
+    if pending and token_file is not None:
+        try:
+            configured = repo.config().repo_settings.proposals
+        except InvalidInput:
+            configured = Proposals()  # if a file is invalid, list the proposals without links
+        try:
+            forge = forge_for(configured, token_file)
+        except ForgeError as error:
+            errors.print(f"warning: {error}")
+    rows = []
+    for proposal in pending:
+        link = None
+        try:
+            request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
+            link = request.link if request else None
+        except ForgeError as error:
+            errors.print(f"warning: {error}")
+        since = time_data(proposal.since)
+        rows.append({"name": proposal.branch, **asdict(proposal), "since": since, "link": link})
+    return rows
+
+
+# ---- the kinds of things that ``demandops get`` lists: their data, columns and filters ----
 
 Values = Callable[[Json], Iterable[str]]
 CellOf = Callable[[Json, datetime], Cell]
@@ -76,7 +114,7 @@ def _demands(source: Source) -> list[Json]:
             "since": time_data(demand.since),
             "lease": lease_data(demand.lease),
         }
-        for demand in demand_list.demands(source.snapshot.state)
+        for demand in demand_lists.demands(source.snapshot.state)
     ]
 
 
@@ -94,7 +132,7 @@ def _nodes(source: Source) -> list[Json]:
     world = source.snapshot.state
     return [
         {**asdict(node), "position": node.position.model_dump() if node.position else None}
-        for node in node_list.nodes(world, release_causes.releases(world))
+        for node in demand_lists.nodes(world, release_causes.releases(world))
     ]
 
 
@@ -103,7 +141,7 @@ def _services(source: Source) -> list[Json]:
     return [
         {
             "name": name,
-            "domains": demand_list.domains_of([service.node], world.config),
+            "domains": demand_lists.domains_of([service.node], world.config),
             **asdict(service),
         }
         for name, service in bookkeeping(world).services.items()
@@ -115,7 +153,7 @@ def _connections(source: Source) -> list[Json]:
     return [
         {
             "name": name,
-            "domains": demand_list.domains_of([each.source, each.target], world.config),
+            "domains": demand_lists.domains_of([each.source, each.target], world.config),
             **asdict(each),
         }
         for name, each in bookkeeping(world).connections.items()
@@ -128,9 +166,9 @@ def _claims(source: Source) -> list[Json]:
     return [
         {
             "name": (data := claim_data(claim))["file"],
-            "state": _state_now(demand_list.state_of(claim, world), claim.lease, source.now),
-            "nodes": (nodes := demand_list.nodes_of(claim)),
-            "domains": demand_list.domains_of(nodes, world.config),
+            "state": _state_now(demand_lists.state_of(claim, world), claim.lease, source.now),
+            "nodes": (nodes := demand_lists.nodes_of(claim)),
+            "domains": demand_lists.domains_of(nodes, world.config),
             **data,
         }
         for claim in claims

@@ -9,20 +9,20 @@ from typing import Any
 
 import click
 
+from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestion
+from demandops.base.quoting import quoted
+from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
 from demandops.cli.name_completion import names_of
 from demandops.cli.output import busy
 from demandops.cli.table import Column, Table
 from demandops.cli.target import state_repo_option
-from demandops.config.durations import relative
-from demandops.config.override import parse_time
-from demandops.errors import InvalidInput, StateRepoError, fault, suggestion
-from demandops.quoting import quoted
-from demandops.runtime import REAL
-from demandops.staterepo import reader
-from demandops.staterepo.history import revisions
-from demandops.staterepo.history.commit_log import LogEntry
-from demandops.staterepo.reader import Reader
+from demandops.model.config.base_model import relative
+from demandops.model.config.override import parse_time
+from demandops.repo import reader
+from demandops.repo.history import revisions
+from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.reader import Reader
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (

@@ -5,19 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from demandops.config.config import NODES_FILE
-from demandops.errors import StateRepoError, closest, suggestion
-from demandops.ledger import claim_file
-from demandops.ledger.world import World
-from demandops.plan.release import Release
-from demandops.plan.views import release_causes
-from demandops.quoting import quoted
-from demandops.render.gitops.paths import path_of
-from demandops.staterepo.history.commit_log import LogEntry
-from demandops.staterepo.load import ledger_files
-from demandops.staterepo.load.snapshot import Snapshot
-from demandops.staterepo.reader import Reader
-from demandops.subject import Subject, SubjectKind
+from demandops.base.errors import StateRepoError, closest, suggestion
+from demandops.base.naming import Subject, SubjectKind
+from demandops.base.quoting import quoted
+from demandops.model.config.config import NODES_FILE
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import World
+from demandops.model.release import Release
+from demandops.render.paths import path_of
+from demandops.repo.history.commit_log import LogEntry
+from demandops.repo.load import ledger_files
+from demandops.repo.load.snapshot import Snapshot
+from demandops.repo.reader import Reader
+from demandops.views import release_causes
 
 KINDS = (
     "release",

@@ -9,6 +9,8 @@ from pathlib import Path
 
 import click
 
+from demandops.base.errors import suggestion
+from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, output_option, release_data, show, version_data
 from demandops.cli.output import (
     busy,
@@ -21,22 +23,18 @@ from demandops.cli.output import (
 from demandops.cli.table import Column, Table
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
-from demandops.cluster.bootstrap_status import OldBootstrap, old_bootstraps
 from demandops.cluster.health import health_reader
 from demandops.cluster.health.release_health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
-from demandops.cluster.orphans import Orphan, orphans
-from demandops.cluster.release_status import statuses
-from demandops.config.durations import duration_text
-from demandops.errors import suggestion
-from demandops.plan.overrides.claim_overrides import without_suspended
-from demandops.plan.views.missing_inputs import MissingInput, missing_inputs
-from demandops.runtime import REAL
-from demandops.service import rollout_targets
-from demandops.staterepo import reader
-from demandops.staterepo.git.repository import RemoteAway
-from demandops.staterepo.load.problem_report import Problem
-from demandops.staterepo.reader import Reader
+from demandops.cluster.release_status import OldBootstrap, Orphan, old_bootstraps, orphans, statuses
+from demandops.decide.planning.overrides import without_suspended
+from demandops.decide.warnings import MissingInput, missing_inputs
+from demandops.model.config.base_model import duration_text
+from demandops.repo import reader
+from demandops.repo.git.repository import RemoteAway
+from demandops.repo.load.last_valid_config import Problem
+from demandops.repo.reader import Reader
+from demandops.serve import rollout_targets
 
 _SHORT = 10
 _POLL_S = 2.0

@@ -10,6 +10,9 @@ from pathlib import Path
 
 import click
 
+from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.quoting import one_line
+from demandops.base.runtime import REAL
 from demandops.cli.json_output import commit_data
 from demandops.cli.output import painted
 from demandops.cli.table import Table
@@ -18,11 +21,8 @@ from demandops.cli.views.kinds import KINDS, Source
 from demandops.cli.views.log import log_table
 from demandops.cli.views.status import Status, releases_table
 from demandops.cluster import clusters_file
-from demandops.errors import InvalidInput, StateRepoError
-from demandops.quoting import one_line
-from demandops.runtime import REAL
-from demandops.staterepo import reader
-from demandops.staterepo.reader import Reader
+from demandops.repo import reader
+from demandops.repo.reader import Reader
 
 _PAUSE_S = 2.0
 _COMMITS = 6

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import click
 
+from demandops.base.runtime import REAL
 from demandops.cli.output import errors, progress
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
-from demandops.runtime import REAL
-from demandops.service.timing.polling import parse_interval
-from demandops.staterepo.reader import Reader
+from demandops.repo.reader import Reader
+from demandops.serve.timing.timers import parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 

@@ -21,7 +21,7 @@ from demandops.cluster.health.release_health import (
     deployment_health,
     name_of,
 )
-from demandops.render.gitops.paths import bootstrap_path
+from demandops.render.paths import bootstrap_path
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
 # A reason lists at most this many objects on which a sync failed.

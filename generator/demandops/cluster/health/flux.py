@@ -21,7 +21,7 @@ from demandops.cluster.health.release_health import (
     name_of,
     worst,
 )
-from demandops.render.gitops.paths import bootstrap_path
+from demandops.render.paths import bootstrap_path
 
 # The annotation that makes a controller reconcile an object now.
 REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"

@@ -1,0 +1,1 @@
+"""What everything stands on: errors, strict YAML, names, time and threads, HTTP."""

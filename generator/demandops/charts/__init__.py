@@ -1,1 +1,0 @@
-"""Charts in the state repo: their files, libraries, values, schemas and tables."""

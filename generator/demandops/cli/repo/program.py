@@ -1,0 +1,214 @@
+"""``demandops version``: the versions of the program and of the formats that it writes."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import subprocess
+from pathlib import Path
+
+import click
+from click.shell_completion import get_completion_class
+
+from demandops import __version__
+from demandops.base import settings
+from demandops.cli import target
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import print_lines
+from demandops.cli.table import Column, Table
+from demandops.cli.target import context_names
+from demandops.model.config.base_model import parse
+
+
+@click.command()
+@output_option
+def version(output: str) -> None:
+    """Print the versions of the program and of its formats.
+
+    The render version says how the program renders the files in `clusters/`. A generator refuses a
+    state repo of another render version. If the repo's version is older, run `demandops upgrade`;
+    if it is newer, update the generator.
+
+    \b
+    Examples:
+      demandops version
+      demandops version -o json
+    """
+    git = None
+    if shutil.which("git"):
+        told = subprocess.run(["git", "--version"], capture_output=True, text=True, check=False)
+        git = told.stdout.strip().removeprefix("git version ") or None
+    data = {
+        "version": __version__,
+        "render_version": settings.RENDER_VERSION,
+        "api_version": settings.API_VERSION,
+        "ledger_api_version": settings.LEDGER_API_VERSION,
+        "python": platform.python_version(),
+        "git": git,
+    }
+    names = {"version": "demandops"}
+    lines = [
+        f"{names.get(name, name.replace('_', ' ')):18} {value}" for name, value in data.items()
+    ]
+    show(output, data, lines)
+
+
+# ---- completion ----
+#
+# ``demandops completion``: a script with which a shell completes commands, options and names.
+
+VARIABLE = "_DEMANDOPS_COMPLETE"
+
+
+@click.command()
+@click.argument("shell", type=click.Choice(["bash", "zsh", "fish"]), metavar="bash|zsh|fish")
+def completion(shell: str) -> None:
+    """Print the completion script for a shell.
+
+    The script completes commands, options, and names in the state repo, such as those of demands,
+    nodes, releases, requesters, proposals and overrides. The names come from the state repo on
+    which the completed command would work. If this state repo is behind a URL, the script fetches
+    nothing, but reads the commit that was fetched last.
+
+    \b
+    Examples:
+      demandops completion bash > /etc/bash_completion.d/demandops
+      demandops completion zsh > ~/.zfunc/_demandops
+      demandops completion fish > ~/.config/fish/completions/demandops.fish
+    """
+    root = click.get_current_context().find_root().command
+    completion_class = get_completion_class(shell)
+    assert completion_class is not None  # noqa: S101 - click has these three
+    maker = completion_class(root, {}, "demandops", VARIABLE)
+    code = maker.source_template % maker.source_vars()  # source() would start bash
+    print_lines(code.rstrip("\n").split("\n"))
+
+
+# ---- ``demandops config``: the contexts in the user's config folder ----
+
+_name = click.argument("name", metavar="NAME", shell_complete=context_names)
+
+
+@click.group()
+def config() -> None:
+    """List, set and choose contexts: the fleets that you work with.
+
+    A context names a state repo, the access to its clusters and a signing key, so that commands
+    need no options. The contexts are in ~/.config/demandops/contexts.yaml. $XDG_CONFIG_HOME
+    replaces ~/.config.
+
+    \b
+    Examples:
+      demandops config set fleet --state-repo https://git.example/fleet.git
+      demandops config use fleet
+      demandops config list
+    """
+
+
+@config.command("list")
+@output_option
+def list_contexts(output: str) -> None:
+    """List the contexts.
+
+    \b
+    Examples:
+      demandops config list
+    """
+    content = target.read()
+    rows = [
+        (
+            "*" if name == content.current else "",
+            name,
+            context.state_repo,
+            context.clusters or "",
+            context.signing_key or "",
+        )
+        for name, context in content.contexts.items()
+    ]
+    columns = (
+        Column(""),
+        Column("Context"),
+        Column("State repo"),
+        Column("Clusters", 1),
+        Column("Signing key", 2),
+    )
+    data = content.model_dump(by_alias=True, include={"current", "contexts"})
+    show(output, data, [Table(columns, rows, empty="no contexts; see demandops config set")])
+
+
+@config.command("set")
+@_name
+@click.option("--state-repo", metavar="URL_OR_DIR", help="The state repo.")
+@click.option(
+    "--clusters",
+    metavar="FILE",
+    help="The file that says how to reach the clusters (docs/status.md).",
+)
+@click.option("--signing-key", metavar="FILE", help="The key that signs commits (docs/audit.md).")
+def set_context(
+    name: str, state_repo: str | None, clusters: str | None, signing_key: str | None
+) -> None:
+    """Add or change a context.
+
+    If there is no current context, this one becomes the current context. Options that you leave out
+    keep their values. Paths that exist become absolute.
+
+    \b
+    Examples:
+      demandops config set fleet --state-repo ssh://git@git.example/fleet.git
+      demandops config set fleet --clusters clusters.yaml
+    """
+    content = target.read()
+    options = {
+        "stateRepo": _absolute(state_repo),
+        "clusters": _absolute(clusters),
+        "signingKey": _absolute(signing_key),
+    }
+    data = content.model_dump(by_alias=True, exclude_none=True)
+    given = {field: value for field, value in options.items() if value is not None}
+    data["contexts"][name] = {**data["contexts"].get(name, {}), **given}
+    if "stateRepo" not in data["contexts"][name]:
+        raise click.UsageError(f"the context '{name}' is new, so give --state-repo")
+    data.setdefault("current", name)
+    target.write(parse(target.ContextsFile, data, str(target.path())))
+    show("text", None, [f"context '{name}' set in {target.path()}"])
+
+
+def _absolute(place: str | None) -> str | None:
+    """Return the absolute form of a path that exists; return other text, such as a URL, as is."""
+    if place is None or not Path(place).expanduser().exists():
+        return place
+    return str(Path(place).expanduser().resolve())
+
+
+@config.command("use")
+@_name
+def use_context(name: str) -> None:
+    """Choose the current context.
+
+    \b
+    Examples:
+      demandops config use fleet
+    """
+    target.named(name)
+    target.write(target.read().model_copy(update={"current": name}))
+    show("text", None, [f"the current context is '{name}'"])
+
+
+@config.command("delete")
+@_name
+def delete_context(name: str) -> None:
+    """Delete a context; nothing happens to its state repo.
+
+    If it is the current context, there is no current context afterwards.
+
+    \b
+    Examples:
+      demandops config delete old-fleet
+    """
+    target.named(name)
+    content = target.read()
+    others = {key: context for key, context in content.contexts.items() if key != name}
+    current = None if content.current == name else content.current
+    target.write(content.model_copy(update={"contexts": others, "current": current}))
+    show("text", None, [f"context '{name}' deleted"])

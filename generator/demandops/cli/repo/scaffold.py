@@ -1,0 +1,369 @@
+"""The text of YAML files that people edit. Pure."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput
+from demandops.base.naming import PATTERN_WORDS
+from demandops.base.quoting import quoted
+from demandops.base.settings import API_VERSION, modeline
+from demandops.connections.connection_types import CONNECTION_TYPES
+from demandops.model.config.config import Config
+from demandops.model.config.policy import AccessDomain, Rule, matches
+from demandops.model.config.registry import Image
+from demandops.model.config.repo_settings import as_git_url
+from demandops.templating import chart_schema
+
+
+def document(path: str, schema: str, kind: str, fields: Mapping[str, Any], note: str = "") -> str:
+    """Return the text of a file for people to edit.
+
+    ``schema`` names the JSON Schema with which editors check the file; ``note`` becomes a comment
+    at its start.
+    """
+    text = strict_yaml.dump({"apiVersion": API_VERSION, "kind": kind, **fields})
+    comment = "".join(f"# {line}\n" for line in note.splitlines())
+    return modeline(path, schema) + comment + text
+
+
+# ---- a new container file and new pipelines for the repository of a ROS package ----
+#
+# The pipelines test the package, build its image, and propose the image to the state repo, pinned
+# by its digest. Pure.
+
+_PATHS = {
+    "Containerfile": "Containerfile",
+    "github-workflow.yml": ".github/workflows/image.yml",
+    "gitlab-ci.yml": ".gitlab-ci.yml",
+    "propose-image": "ci/propose-image",
+}
+# The templates put these values into YAML and shell scripts as they are, so no character of them
+# may need quotes.
+_IMAGE_NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
+_REPOSITORY = re.compile(r"(?P<host>[a-z0-9.-]+(:[0-9]+)?)(/[a-z0-9._-]+)+")
+_URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A-Za-z0-9._~/-]+")
+
+
+def image_files(
+    name: str, repository: str, state_repo: str, texts: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the container file and the pipelines, as a map from path to text.
+
+    ``name`` is the image's name in the registry of the state repo, ``repository`` has a host, and
+    ``texts`` has the files in ``templates/scaffold/image`` by name.
+    """
+    url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
+    if not _IMAGE_NAME.fullmatch(name):
+        message = (
+            f"{quoted(name)} is no valid name; use at most 63 of a-z, 0-9 and -, and no - at its "
+            "ends"
+        )
+        raise InvalidInput.at("NAME", message)
+    if image is None:
+        message = (
+            f"{quoted(repository)} is no valid repository; write HOST/PATH in lower case, without "
+            "a tag"
+        )
+        raise InvalidInput.at("--repository", message)
+    if not _URL.fullmatch(url):
+        message = f"{quoted(state_repo)} is no valid URL; write https://HOST/PATH or git@HOST:PATH"
+        raise InvalidInput.at("--state-repo", message)
+    given = {"NAME": name, "REPOSITORY": repository, "HOST": image["host"], "STATE_REPO": url}
+    return {
+        _PATHS[file]: re.sub("@([A-Z_]+)@", lambda match: given[match[1]], text)
+        for file, text in texts.items()
+    }
+
+
+# ---- new application ----
+#
+# A new application: its definition, values, chart, registry entries, README and example demand.
+#
+# The application's services form a chain: the first service reads the application's inputs, and
+# each further service reads the outputs of the service before it. One image contains the launch
+# files of all services. Pure.
+
+LIBRARY_FOLDER = f"appdefs/charts/{chart_schema.LIBRARY}"
+_NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
+_RESULT = "result"
+_REQUESTER = "operator"
+_VERSION = "0.1.0"
+
+
+@dataclass(frozen=True, slots=True)
+class ServicePlan:
+    name: str
+    package: str
+    launch_file: str
+
+
+@dataclass(frozen=True, slots=True)
+class ApplicationPlan:
+    """The application to write; ``node`` is the node of the example demand."""
+
+    name: str
+    description: str
+    inputs: Mapping[str, str]  # the message type of each input
+    services: tuple[ServicePlan, ...]
+    image: Image
+    node: str
+
+
+def refuse_name(name: str, config: Config) -> None:
+    """Refuse a name that is not valid, or that an application, a chart or an image has already."""
+    if not _NAME.fullmatch(name):
+        raise InvalidInput.at(
+            "NAME", f"{quoted(name)} cannot be used here; write {PATTERN_WORDS[_NAME.pattern]}"
+        )
+    if name in config.appdefs or name in config.charts or name in config.images:
+        raise InvalidInput.at("NAME", f"'{name}' exists already; choose another name")
+
+
+def application_files(
+    plan: ApplicationPlan, config: Config, library: Mapping[str, str]
+) -> dict[str, str]:
+    """Return the files of a new application, as a map from path to text.
+
+    ``library`` has the files of the library chart. They are part of the result if the state repo
+    lacks the library chart.
+    """
+    refuse_name(plan.name, config)
+    has_library = f"{LIBRARY_FOLDER}/Chart.yaml" in config.files
+    root = f"appdefs/{plan.name}"
+    files = {f"{root}/appdef.yaml": _appdef(plan, config)}
+    for service, inputs in _chain(plan):
+        files[f"{root}/values/{service.name}.yaml.j2"] = _values_template(plan, service, inputs)
+    files |= _chart(plan, f"{root}/charts/{plan.name}", config.files if has_library else library)
+    files[f"{root}/README.md"] = _readme(plan)
+    files[f"{root}/demand.yaml"] = _demand(plan, config)
+    for kind, content in (
+        ("charts", {"folder": f"{root}/charts/{plan.name}", "version": _VERSION}),
+        ("images", plan.image.model_dump(exclude_none=True)),
+    ):
+        path = f"registry/{kind}/{plan.name}.yaml"
+        files[path] = document(path, kind, kind.title(), {kind: {plan.name: content}})
+    return files if has_library else files | dict(library)
+
+
+def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
+    """Yield each service with its inputs, as a map from the input's name to its source."""
+    inputs = {role: role for role in plan.inputs}
+    for service in plan.services:
+        yield service, inputs
+        inputs = {_role(service.name): f"{service.name}.{_RESULT}"}
+
+
+def _role(name: str) -> str:
+    return name.replace("-", "_")
+
+
+def _appdef(plan: ApplicationPlan, config: Config) -> str:
+    # Names of releases begin with the prefix of their service, so each service needs its own.
+    taken = {kind.word for kind in CONNECTION_TYPES}
+    taken |= {service.prefix for each in config.services.values() for service in each.values()}
+    taken |= {definition.prefix for definition in config.definitions.values()}
+    services: dict[str, Any] = {}
+    for service, inputs in _chain(plan):
+        letters = re.sub("[^a-z0-9]", "", service.name)[:8]
+        prefixes = (letters, *(f"{letters}{number}" for number in range(2, 100)))
+        prefix = next(each for each in prefixes if each not in taken)
+        taken.add(prefix)
+        services[service.name] = {
+            "prefix": prefix,
+            "inputs": inputs,
+            "outputs": {_RESULT: f"/{{instance}}_{_role(service.name)}"},
+            "chart": plan.name,
+            "images": [plan.name],
+            "values": f"values/{service.name}.yaml.j2",
+        }
+    fields = {
+        "name": plan.name,
+        "description": plan.description,
+        "inputs": {role: {"type": type} for role, type in plan.inputs.items()},
+        "services": services,
+    }
+    note = (
+        "docs/appdef.md of DemandOps explains each field. To run a service once for each topic of\n"
+        "an input instead of once for each application, add `each: <input>` to it."
+    )
+    path = f"appdefs/{plan.name}/appdef.yaml"
+    return document(path, "application", "ApplicationDefinition", fields, note)
+
+
+def _values_template(plan: ApplicationPlan, service: ServicePlan, inputs: Iterable[str]) -> str:
+    topics = "".join(f'    {role}_topics: {{{{ topics.{role} | join(",") }}}}\n' for role in inputs)
+    return f"""\
+{{# Values of {service.name}. Each expression is written as a JSON value, so none needs quotes. The
+   arguments are those of its launch file. #}}
+replicas: {{{{ replicas }}}}
+image: {{{{ images["{plan.name}"] }}}}
+{{% if node.image_pull_secrets %}}
+imagePullSecrets:
+{{% for name in node.image_pull_secrets %}}
+  - name: {{{{ name }}}}
+{{% endfor %}}
+{{% endif %}}
+nodeSelector: {{{{ node.selector }}}}
+tolerations: {{{{ node.tolerations }}}}
+hostNetwork: {{{{ node.host_network }}}}
+ros:
+  domainId: {{{{ node.ros.domain_id }}}}
+  rmwImplementation: {{{{ node.ros.rmw }}}}
+launch:
+  package: {service.package}
+  file: {service.launch_file}
+  arguments:
+    node_name: {{{{ release | ros_name }}}}
+{topics}    {_RESULT}_topic: {{{{ outputs.{_RESULT} }}}}
+"""
+
+
+_LAUNCH: dict[str, Any] = {
+    "type": "object",
+    "additionalProperties": False,
+    "required": ["package", "file", "arguments"],
+    "properties": {
+        "package": {"type": "string", "pattern": "^[A-Za-z][A-Za-z0-9_]*$"},
+        "file": {"type": "string", "pattern": "^[A-Za-z0-9_][A-Za-z0-9_.-]*$"},
+        "arguments": {
+            "type": "object",
+            "propertyNames": {"pattern": "^[a-z][a-z0-9_]*$"},
+            "additionalProperties": {"type": "string"},
+        },
+    },
+}
+
+
+def _chart(plan: ApplicationPlan, folder: str, library: Mapping[str, str]) -> dict[str, str]:
+    shared = library[f"{LIBRARY_FOLDER}/values.yaml"]
+    schema = json.loads(library[f"{LIBRARY_FOLDER}/values.schema.json"])
+    title = f"Values of the chart {plan.name}"
+    first = plan.services[0]
+    values = f"""\
+# Values of this chart, besides those of {LIBRARY_FOLDER}: probes, resources, rights and more.
+# The templates in ../../values/ write the values of each release.
+
+image:
+  # -- Name of the image, with its registry, without tag or digest.
+  repository: {plan.image.repository}
+
+launch:
+  # -- Package of the launch file.
+  package: {first.package}
+  # -- Name of the launch file.
+  file: {first.launch_file}
+  # -- Arguments of the launch file: name → value.
+  arguments: {{}}
+
+# -- Labels of all objects, but not of the pods.
+commonLabels:
+  app.kubernetes.io/part-of: {plan.name}
+"""
+    composed = chart_schema.composed(title, {"launch": _LAUNCH}, values, schema, shared)
+    version = re.search(r"(?m)^version: (\S+)$", library[f"{LIBRARY_FOLDER}/Chart.yaml"])
+    return {
+        f"{folder}/Chart.yaml": f"""\
+apiVersion: v2
+name: {plan.name}
+description: Runs the launch files of {plan.name}.
+type: application
+version: {_VERSION}
+dependencies:
+  - name: {chart_schema.LIBRARY}
+    version: {version[1] if version else _VERSION}
+    repository: file://../../../charts/{chart_schema.LIBRARY}
+    import-values: [{chart_schema.EXPORT}]
+""",
+        f"{folder}/values.yaml": values,
+        f"{folder}/values.schema.json": json.dumps(composed, indent=2, ensure_ascii=False) + "\n",
+        f"{folder}/README.md": f"# {plan.name}\n\nRuns the launch files of {plan.name}.\n\n"
+        f"## Values\n\nBesides those of the library "
+        f"[{chart_schema.LIBRARY}](../../../charts/{chart_schema.LIBRARY}/README.md#values):\n\n"
+        + chart_schema.table(values),
+        f"{folder}/templates/service.yaml": f"""\
+{{{{- $run := list "ros2" "launch" .Values.launch.package .Values.launch.file }}}}
+{{{{- range $name, $value := .Values.launch.arguments }}}}
+{{{{- $run = append $run (printf "%s:=%s" $name $value) }}}}
+{{{{- end }}}}
+{{{{- include "ros-service.service" (dict "root" . "name" "{plan.name}" "run" $run) }}}}
+""",
+    }
+
+
+def _readme(plan: ApplicationPlan) -> str:
+    rows = "".join(
+        f"| `{service.name}` | `ros2 launch {service.package} {service.launch_file}` "
+        f"| {', '.join(f'`{source}`' for source in inputs.values())} |\n"
+        for service, inputs in _chain(plan)
+    )
+    return f"""\
+# {plan.name}
+
+{plan.description}
+
+| service | runs | reads |
+| --- | --- | --- |
+{rows}
+A launch file gets the arguments `node_name`, `<input>_topics` (joined by commas) and
+`{_RESULT}_topic`. The templates in `values/` set these arguments. So if you rename an argument,
+change the launch file and the template.
+
+    demandops check .                                            # after each edit
+    demandops request --dry-run appdefs/{plan.name}/demand.yaml   # what the example would do
+"""
+
+
+def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
+    domain = config.domain_of.get(plan.node)
+    return tuple(
+        rule
+        for rule in (domain.rules if domain else ())
+        if matches(plan.name, rule.applications) and matches(plan.node, rule.nodes)
+    )
+
+
+def closed_domain(plan: ApplicationPlan, config: Config) -> AccessDomain | None:
+    """Return the access domain whose rules refuse the example demand; None if none does."""
+    domain = config.domain_of.get(plan.node)
+    return domain if domain and domain.rules and not _rules_for(plan, config) else None
+
+
+def _demand(plan: ApplicationPlan, config: Config) -> str:
+    node, domain = config.nodes.get(plan.node), config.domain_of.get(plan.node)
+    topics = node.topics if node else {}
+    # The requester matches a rule that allows the application. If there is none, it matches the
+    # first rule, and a person must widen the rules (`closed_domain`).
+    rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
+    requester = _REQUESTER
+    if rules:
+        pattern = rules[0].requesters[0]
+        matching = next((id for id in sorted(config.nodes) if matches(id, (pattern,))), "")
+        if pattern.strip("*"):
+            requester = matching or pattern.replace("?", "1").replace("*", "")
+    fields = {
+        "demand": f"{plan.name}-example",
+        "requesters": [requester],
+        "applications": [
+            {
+                "id": f"{plan.node}/{plan.name}",
+                "type": plan.name,
+                "node": plan.node,
+                "inputs": {
+                    role: [{"topic": topics.get(role, f"/{role}"), "source": plan.node}]
+                    for role in plan.inputs
+                },
+            }
+        ],
+    }
+    path = f"appdefs/{plan.name}/demand.yaml"
+    note = (
+        f"An example: demandops request {path}\n"
+        "`requesters` lists who demands this, by names that the rules of the access domain allow."
+    )
+    return document(path, "demand", "Demand", fields, note)

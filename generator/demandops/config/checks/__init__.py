@@ -1,1 +1,0 @@
-"""Checks across files: each file is valid alone, but they may contradict each other."""

@@ -1,0 +1,1 @@
+"""The decision on one demand, from its goal to rendered files. Pure."""

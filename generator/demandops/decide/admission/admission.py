@@ -1,0 +1,396 @@
+"""Admission checks whether what is demanded can run with the configuration.
+
+The check reads appdefs, registry, inventory and access domains, but not the ledger. It does not
+check what the policy allows (:mod:`.permission`).
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Collection, Iterator
+from dataclasses import replace
+from itertools import chain
+
+from demandops.base.errors import Fault, fault, suggestion
+from demandops.base.naming import id_problem, topic_problem
+from demandops.base.quoting import quoted
+from demandops.connections import connection as routes
+from demandops.connections import connection_types
+from demandops.connections.connection import Connection
+from demandops.model.config.appdef import ApplicationDefinition, Services
+from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
+from demandops.model.config.repo_settings import ROOT_FILE, Limits
+from demandops.model.demand.application import Application, Delivery
+from demandops.model.demand.claim import LONGEST_S, OVERRIDE_PREFIX
+from demandops.model.demand.demand_request import (
+    AnyRequest,
+    Demanded,
+    DemandRequest,
+    Put,
+    Release,
+    Renew,
+)
+
+
+def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
+    """Yield a fault for everything in ``request`` that cannot run, whatever the ledger contains."""
+    # if the goal gives no request id, the request has the demand's id, which is checked below
+    if request.id and request.id != request.demand:
+        yield from _id_faults("id" if request.is_reference else "request", request.id)
+    if not request.is_reference:
+        yield from _id_faults("demand", request.demand)
+        if request.demand.startswith(OVERRIDE_PREFIX):
+            message = (
+                f"starts with '{OVERRIDE_PREFIX}', which only overrides may use; choose another "
+                "demand id"
+            )
+            yield fault("demand", message)
+        if not request.demanded:  # otherwise the requesters of each item are checked
+            yield from _requester_faults(request.own_requesters)
+        lease_s = request.lease_s if isinstance(request, Put) else None
+        if lease_s is not None and not 0 < lease_s <= LONGEST_S:
+            yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
+    for index, node in enumerate(request.positions if isinstance(request, Put) else ()):
+        yield from _id_faults(f"positions[{index}].node", node)
+        yield from _node_faults(f"positions[{index}].node", node, config)
+    if not request.demanded and not isinstance(request, Release | Renew):
+        yield fault(
+            "id" if request.is_reference else "applications",
+            "the request lists no application and no connection; list at least one",
+            code="empty",
+        )
+    for item in request.demanded:
+        held = item.held
+        # the placement itself reports that it found no node, so an empty node is no fault then
+        unplaced = isinstance(held, Application) and held.place and not held.node
+        of_held = (
+            _application_faults(held, config, request.adds_claims)
+            if isinstance(held, Application)
+            else _connection_faults(held, config, request.adds_claims)
+        )
+        for each in chain(_id_faults("id", held.id), _requester_faults(item.requesters), of_held):
+            if not (unplaced and each.field == "node"):
+                yield replace(each, field=item.place(each.field))
+
+
+# The lists in these fields have no items of their own (items_of). The size of parameters is limited
+# in bytes instead, and each target topic belongs to a source topic, which counts.
+_NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
+# About ten fields describe any item. Unknown fields are bounded too, because each would cost a
+# fault when the goal is parsed.
+_FIELDS_OF_ITEM = 10
+_ITEMS = (
+    "items (applications, connections, topics, requesters and so on, also of the connections that "
+    "it needs)"
+)
+
+
+def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
+    """Yield a fault if a goal, as plain data, is far too large to be parsed at all."""
+    length = items = fields = 0
+    most_fields = max(1_000, _FIELDS_OF_ITEM * limits.demand_items)
+    # The walk ends as soon as a limit is passed, so that a huge goal costs no more than the limit.
+    # It keeps a list instead of calling itself, because a goal may be nested to any depth.
+    unread: list[tuple[object, bool]] = [(goal, True)]
+    while (
+        unread
+        and length <= limits.demand_characters
+        and items <= limits.demand_items
+        and fields <= most_fields
+    ):
+        value, counts = unread.pop()
+        if isinstance(value, str):
+            length += len(value)
+        elif isinstance(value, list):
+            length += 2 * len(value)  # each part is at least a character and a comma
+            items += len(value) if counts else 0
+            unread += [(part, counts) for part in value]
+        elif isinstance(value, dict):
+            fields += len(value)
+            length += sum(1 + len(key) if isinstance(key, str) else 1 for key in value)
+            unread += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
+        elif isinstance(value, int):
+            length += value.bit_length() // 4
+    if length > limits.demand_characters:
+        size = f"has more than {limits.demand_characters} characters"
+        message = _too_large(size, "demandCharacters", limits.demand_characters)
+        yield fault("", message, code="too-large")
+    if fields > most_fields:
+        message = _too_large(f"has more than {most_fields} fields", "demandItems", most_fields)
+        yield fault("", message, code="too-large")
+    if items > limits.demand_items:
+        size = f"lists more than {limits.demand_items} {_ITEMS}"
+        message = _too_large(size, "demandItems", limits.demand_items)
+        yield fault("", message, code="too-large")
+
+
+def items_of(request: DemandRequest) -> int:
+    """Return how many things a request lists in total."""
+    items = len(request.own_requesters)
+    items += len(request.positions) if isinstance(request, Put) else 0
+    for item in request.demanded:
+        held = item.held
+        if isinstance(held, Application):
+            topics = sum(map(len, held.inputs.values()))
+            items += len(held.deliver) + len(held.named) + (held.place.size if held.place else 0)
+        else:
+            topics = len(held.topics)
+        items += len(item.requesters) if request.is_reference else 0
+        # each requester holds each topic of its item, so a topic counts once for each of them
+        items += (1 + topics) * max(1, len(item.requesters))
+    return items
+
+
+def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
+    """Yield a fault for each limit on items and parameters that the request exceeds."""
+    for item in request.demanded:
+        held = item.held
+        if isinstance(held, Application) and held.parameters:
+            size = len(json.dumps(dict(held.parameters), default=str))
+            if size > limits.parameter_bytes:
+                message = _too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
+                yield item.fault("parameters", message, code="too-large")
+    items = items_of(request)
+    if items > limits.demand_items:
+        listed = f"lists {items} {_ITEMS}"
+        message = _too_large(listed, "demandItems", limits.demand_items)
+        yield fault("id" if request.is_reference else "demand", message, code="too-large")
+
+
+def _too_large(size: str, limit: str, most: int) -> str:
+    return (
+        f"{size}, but at most {most} are allowed; a platform engineer may raise limits.{limit} in "
+        f"{ROOT_FILE}"
+    )
+
+
+def _application_faults(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:
+    inputs = [
+        (f"inputs.{role}[{position}]", topic)
+        for role, topics in app.inputs.items()
+        for position, topic in enumerate(topics)
+    ]
+    # a shutdown may leave out nodes and sources, because it lists what is booked already
+    if claiming or app.node:
+        yield from _id_faults("node", app.node)
+    for where, topic in inputs:
+        problem = topic_problem(topic.topic)
+        if problem:
+            yield fault(f"{where}.topic", problem)
+        if claiming or topic.source:
+            yield from _id_faults(f"{where}.source", topic.source)
+        if topic.type:
+            yield from _id_faults(f"{where}.type", topic.type)
+    appdef = config.appdefs.get(app.appdef)
+    if appdef is None:
+        yield _unknown_application(app.appdef, config)
+    else:
+        yield from _definition_faults(app, appdef, config)
+    # what is given up may name nodes that the inventory no longer has, or it could not be released
+    if not claiming:
+        return
+    yield from _node_faults("node", app.node, config)
+    sources = [(f"{where}.source", topic.source) for where, topic in inputs]
+    services = sorted({**app.services, **app.moved}.items())
+    for where, node in (*((f"services.{name}", node) for name, node in services), *sources):
+        yield from _node_faults(where, node, config)
+    for index, delivery in enumerate(app.deliver):
+        where = f"deliver[{index}]"
+        yield from _id_faults(f"{where}.node", delivery.node)
+        yield from _node_faults(f"{where}.node", delivery.node, config)
+        if appdef is not None:
+            yield from _delivery_faults(where, delivery, config.services[appdef.name])
+    if appdef is not None and not any(app.inputs.values()):
+        roles = " or ".join(sorted(appdef.inputs))
+        yield fault("inputs", f"is empty; list at least one topic of {roles}")
+
+
+def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iterator[Fault]:
+    name, _, output = delivery.output.partition(".")
+    service = services.get(name)
+    if service is None or output not in service.outputs:
+        outputs = [f"{each.name}.{output}" for each in services.values() for output in each.outputs]
+        close = suggestion(delivery.output, outputs)
+        yield fault(f"{where}.output", f"{quoted(delivery.output)} is not an output{close}")
+    elif delivery.topic and service.roots:
+        message = (
+            f"{name} may make several topics, so a delivery cannot rename them; leave 'topic' out"
+        )
+        yield fault(f"{where}.topic", message)
+    problem = topic_problem(delivery.topic) if delivery.topic else ""
+    if problem:
+        yield fault(f"{where}.topic", problem)
+
+
+def _definition_faults(
+    app: Application, appdef: ApplicationDefinition, config: Config
+) -> Iterator[Fault]:
+    """Yield a fault for each field of an application that contradicts its definition."""
+    for role, topics in app.inputs.items():
+        if role not in appdef.inputs and topics:
+            message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
+            yield fault(f"inputs.{role}", message)
+    parameters = config.parameters_of(appdef.name) if app.parameters else set()
+    for name in app.parameters:
+        if name not in parameters:
+            close = suggestion(name, parameters)
+            yield fault(f"parameters.{name}", f"{appdef.name} has no such parameter{close}")
+    services = config.services[appdef.name]
+    for service in services.values():
+        if service.nodes and app.node in config.nodes and app.node not in service.runs_at:
+            cluster = config.nodes[app.node].cluster
+            yield fault(
+                "node",
+                f"'{app.node}' is in cluster '{cluster}', where the application's service "
+                f"{service.name} has no node; choose a node in cluster "
+                f"{' or '.join(service.nodes)}, or ask for an entry for cluster '{cluster}' in the "
+                f"field nodes of {service.file}",
+                code="no-node",
+            )
+    for name in app.named:
+        if name not in services:
+            close = suggestion(name, [each.name for each in services.values() if each.is_placeable])
+            yield fault(f"services.{name}", f"{appdef.name} has no such service{close}")
+        elif not services[name].is_placeable:
+            message = (
+                f"{name} runs at its sources, or serves applications of several types, so a "
+                f"demand cannot name the node of {name}; leave {name} out of 'services'"
+            )
+            yield fault(f"services.{name}", message)
+        elif not app.services.get(name):
+            yield from _id_faults(f"services.{name}", "")
+    versions = config.versions_of(appdef.name)
+    yield from _instance_faults(app, appdef, versions)
+    if app.version and app.version not in versions:
+        yield fault(
+            "version",
+            f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
+            f"{config.versions_file(appdef.name)}{suggestion(app.version, versions)}",
+        )
+
+
+def _instance_faults(
+    app: Application, appdef: ApplicationDefinition, versions: Collection[str]
+) -> Iterator[Fault]:
+    # An id that ends in '@<version>' belongs to a separate instance, which the generator names. A
+    # claim that a person wrote, or an id that only looks like this, would share its names.
+    id, _, version = app.id.rpartition("@")
+    if app.separate and (not id or version != app.version):
+        message = f"{quoted(app.id)} is a separate instance, but does not end in '@{app.version}'"
+        yield fault("id", f"{message}; remove the claim, and demand the version instead")
+    elif not app.separate and appdef.versions == "separate" and id and version in versions:
+        yield fault(
+            "id",
+            f"{quoted(app.id)} is the instance of version {version}; demand {quoted(id)} with "
+            f"version '{version}' instead, or choose an id that does not end in '@{version}'",
+        )
+
+
+def _unknown_application(name: str, config: Config) -> Fault:
+    if name.startswith("#"):  # the number of a DeploymentRequest
+        types = [
+            f"{appdef.deployment_request.type} ({appdef.name})"
+            for appdef in config.appdefs.values()
+            if appdef.deployment_request
+        ]
+        none = "; no appdef.yaml has a deploymentRequest.type: add one, commit and push it"
+        remedy = f"; known: {', '.join(types)}" if types else none
+    else:
+        none = (
+            "; appdefs/ on main has no application definition: add one (demandops new "
+            "application), commit and push it"
+        )
+        remedy = suggestion(name, config.appdefs) or none
+    shown = name.removeprefix("#") if name.startswith("#") else quoted(name)
+    message = f"{shown} is not a known application type{remedy}"
+    return fault("appdef", message, code="unknown-application")
+
+
+def _connection_faults(connection: Connection, config: Config, claiming: bool) -> Iterator[Fault]:
+    ends = {"source": connection.source, "target": connection.target}
+    for end, node in ends.items():
+        if claiming or node:
+            yield from _id_faults(end, node)
+    if connection.broker:
+        yield from _id_faults("broker", connection.broker)
+    if claiming and not connection.topics:
+        yield fault("topics", "is empty; list at least one topic")
+    yield from routes.faults("topics", connection.topics)
+    same_place = connection.source and connection.source == connection.target
+    for index, route in enumerate(connection.topics):
+        if claiming and same_place and route.source == route.target:
+            yield fault(
+                f"topics[{index}].target",
+                f"{quoted(route.target)} would feed itself, because source and target are both "
+                f"{quoted(connection.source)}; name another target node or topic",
+            )
+    if not claiming:
+        return
+    for end, node in ends.items():
+        yield from _node_faults(end, node, config)
+    if connection.type is not None:
+        yield from connection_types.type_faults(connection.type, connection, config)
+    elif {*connection.nodes} <= config.nodes.keys() and connection_types.choose_type(
+        connection, config
+    ) is None:
+        yield connection_types.no_type_fault(connection, config)
+
+
+def _node_faults(where: str, node: str, config: Config) -> Iterator[Fault]:
+    # an empty node is reported as an empty id
+    if node and node not in config.nodes:
+        yield fault(
+            where,
+            f"{quoted(node)} is not in {config.place_of(NODES_FILE)}"
+            + suggestion(node, config.nodes),
+            code="unknown-node",
+        )
+    elif node and node not in config.domain_of:
+        yield fault(
+            where,
+            f"{quoted(node)} is not in any access domain; a platform engineer adds it to "
+            f"{config.place_of(DOMAINS_FILE)}",
+            code="no-access-domain",
+        )
+
+
+def _id_faults(where: str, value: str) -> Iterator[Fault]:
+    problem = id_problem(value)
+    if problem:
+        yield fault(where, problem)
+
+
+def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
+    for index, requester in enumerate(requesters):
+        yield from _id_faults(f"requesters[{index}]", requester)
+    if not requesters:
+        yield fault("requesters", "is empty; list at least one requester")
+
+
+def with_chosen_types(
+    request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
+) -> AnyRequest:
+    """Return ``request`` with the type that each connection gets, if any type can carry it.
+
+    ``current`` takes an id and returns the claimed connection that has it, or ``None``.
+    """
+    if not request.adds_claims:
+        return request
+
+    def with_type(item: Demanded) -> Demanded:
+        connection = item.held
+        if not isinstance(connection, Connection):
+            return item
+        if connection.type is None:
+            # A claimed connection keeps its type. Else a new broker or node property would change
+            # the type that is chosen, and the request would contradict the other claims.
+            claimed = current(connection.id)
+            chosen = claimed.type if claimed else connection_types.choose_type(connection, config)
+            connection = replace(connection, type=chosen)
+        if connection.type is None or id_problem(connection.broker or "none"):
+            return replace(item, held=connection)
+        # the type may use another broker than the request names; the note says so
+        connection, note = connection.type.settled(connection, config)
+        return replace(item, held=connection, note=note or item.note)
+
+    return replace(request, demanded=tuple(map(with_type, request.demanded)))

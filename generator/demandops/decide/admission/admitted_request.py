@@ -1,0 +1,367 @@
+"""The choice of an access domain if a demand names a node that is in several domains.
+
+In each further domain the node has the name ``<node>@<domain>``, which a demand may give wherever
+it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
+
+A demand may name a node without a domain: as the node of an application or of a service, or as an
+end of a connection. If the application or connection is booked already, its domain stays. If it is
+not booked yet, the domain is the only one in which the rules let the requesters use the node. If
+there is no such domain, the node's first domain is meant. If there are several, the demand is
+refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
+from datetime import datetime
+from types import MappingProxyType
+from typing import TypeVar
+
+from demandops.base.errors import Fault, Refused
+from demandops.base.naming import Subject
+from demandops.connections.connection import Connection
+from demandops.decide.admission import admission, permission
+from demandops.decide.admission.permission import may_place
+from demandops.decide.placement import placement
+from demandops.decide.placement.choice import NO_ROOM
+from demandops.decide.planning import flows, implied_connections
+from demandops.decide.state import State
+from demandops.model.config.config import Config
+from demandops.model.config.inventory import id_in_domain
+from demandops.model.demand import demand_goal, deployment_request_goal
+from demandops.model.demand.application import Application
+from demandops.model.demand.demand_request import (
+    AnyRequest,
+    Decommission,
+    Demanded,
+    DemandRequest,
+    Put,
+)
+from demandops.model.ledger.records import Wait, WaitingDemand
+
+Held = Application | Connection
+# returns the application or connection that a subject's first claim holds
+Booked = Callable[[Subject], "Held | None"]
+
+
+def with_chosen_domains(
+    request: AnyRequest, config: Config, booked: Booked
+) -> tuple[AnyRequest, list[Fault]]:
+    """Return the request with a chosen access domain for each node.
+
+    There is a fault for each node for which several access domains are possible. In a request that
+    adds no claims, such a node stays as it is named.
+    """
+    if not config.hosts:
+        return request, []
+    faults: list[Fault] = []
+    demanded = []
+    for item in request.demanded:
+        held = _with_short_names(item.held, config)
+        booked_nodes = dict(_named(at)) if (at := booked(held.subject)) else {}
+        chosen = dict(_chosen(item, booked_nodes, config, request.adds_claims, faults))
+        if isinstance(held, Application):
+            services = {name: chosen.get(_field(name), n) for name, n in held.services.items()}
+            node = chosen.get("node", held.node)
+            held = replace(held, node=node, services=MappingProxyType(services))
+        else:
+            source, target = chosen.get("source", held.source), chosen.get("target", held.target)
+            held = replace(held, source=source, target=target)
+        demanded.append(replace(item, held=held))
+    return replace(request, demanded=tuple(demanded)), faults
+
+
+def _with_short_names(held: Held, config: Config) -> Held:
+    # <node>@<first domain> is the same node as <node>, which is the name in the configuration
+    def short(name: str) -> str:
+        node, _, domain = name.rpartition("@")
+        own = config.domain_of.get(node)
+        return node if own and name not in config.nodes and own.name == domain else name
+
+    if isinstance(held, Connection):
+        source, target, broker = map(short, (held.source, held.target, held.broker))
+        return replace(held, source=source, target=target, broker=broker)
+    inputs = {
+        role: tuple(topic._replace(source=short(topic.source)) for topic in topics)
+        for role, topics in held.inputs.items()
+    }
+    deliver = tuple(each._replace(node=short(each.node)) for each in held.deliver)
+    services = MappingProxyType({name: short(node) for name, node in held.services.items()})
+    held = replace(held, node=short(held.node), services=services, deliver=deliver)
+    return held.with_inputs(inputs)
+
+
+def _named(held: Held) -> Iterator[tuple[str, str]]:
+    """Yield (field, node) for both ends of a connection, or for an application and its services."""
+    if isinstance(held, Connection):
+        yield from (("source", held.source), ("target", held.target))
+    else:
+        yield "node", held.node
+        yield from ((_field(name), node) for name, node in held.services.items())
+
+
+def _field(service: str) -> str:
+    return f"services.{service}"
+
+
+def _chosen(
+    item: Demanded,
+    booked_nodes: Mapping[str, str],
+    config: Config,
+    adds: bool,
+    faults: list[Fault],
+) -> Iterator[tuple[str, str]]:
+    """Yield (field, the node's name in the chosen domain) for each node in several domains."""
+    held = item.held
+    for field, node in _named(held):
+        choices = config.nodes_of(node)
+        if len(choices) < 2:
+            continue
+        # A demand that is sent again must mean what is booked, even if the rules changed since
+        if booked_nodes.get(field) in choices:
+            yield field, booked_nodes[field]
+            continue
+        appdef = held.appdef if isinstance(held, Application) else ""
+        allowed = [choice for choice in choices if may_place(item, appdef, choice, config)]
+        if len(allowed) == 1:
+            yield field, allowed[0]
+        elif allowed and adds and item.requesters:
+            domains = [config.domain_of[choice].name for choice in allowed]
+            named = " or ".join(id_in_domain(node, domain) for domain in domains)
+            message = (
+                f"'{node}' is in the access domains {' and '.join(domains)}, and their rules let "
+                f"the requesters use the node in each; name it as {named}"
+            )
+            faults.append(item.fault(field, message, code="several-access-domains"))
+
+
+# ---- separate instances: applications that run another version beside the default version ----
+#
+# With ``versions: separate`` in the appdef, a demand for a version other than the default gets an
+# application of its own. This application has the version in its id (``edge/fusion@1.1.0``), so its
+# services, topics and connections have names of their own. It is removed with its last claim. A
+# service that several appdefs share still runs only once, for all versions.
+#
+# With ``versions: separate``, a claim records the version, not the channel that the demand named.
+# It does so for the default version too. If claims recorded the channel, a channel that moves to
+# another version would change an application that others share.
+
+
+def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
+    """Return the request with separate instances for versions other than the default."""
+    demanded = (
+        replace(item, held=_separated(item.held, config))
+        if isinstance(item.held, Application) and item.held.version
+        else item
+        for item in request.demanded
+    )
+    return replace(request, demanded=tuple(demanded))
+
+
+def _separated(app: Application, config: Config) -> Application:
+    appdef = config.appdefs.get(app.appdef)
+    versions = config.application_versions.get(app.appdef, {})
+    version = versions.get(app.version)
+    if appdef is None or appdef.versions != "separate" or version is None:
+        return app
+    # two names of one version have the same rank
+    if version.rank == versions[""].rank:
+        return replace(app, version=version.name)
+    suffix = f"@{version.name}"
+    id = app.id if app.id.endswith(suffix) else f"{app.id}{suffix}"
+    return replace(app, id=id, version=version.name, separate=True)
+
+
+def notes(request: DemandRequest) -> Iterator[str]:
+    """Yield a note for each separate instance that a request lists."""
+    for item in request.demanded:
+        if isinstance(item.held, Application) and item.held.separate:
+            id, _, version = item.held.id.rpartition("@")
+            yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"
+
+
+# ---- admitted request ----
+#
+# The request that a goal becomes: parsed, completed, and checked against the configuration.
+
+_ITEM = re.compile(r"(apps|applications|connections)\[(\d+)\]")
+
+
+# yields faults if a request comes too soon after others of its requesters
+Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
+# is called often during a decision, and raises OverBudget to end it
+Checkpoint = Callable[[], None]
+
+
+def admitted(
+    state: State,
+    goal: object,
+    now: datetime,
+    throttle: Throttle,
+    checkpoint: Checkpoint,
+) -> DemandRequest:
+    """Return the request that a goal becomes: to wait, if it lacks only room and may wait.
+
+    Raises:
+        Refused: if the goal does not pass all checks of :func:`admit` and the demand cannot wait.
+    """
+    try:
+        return admit(state, goal, throttle, None, checkpoint)
+    except Refused as refused:
+        if any(each.code != NO_ROOM for each in refused.faults):
+            raise
+        # the reference's action names no demand that could wait
+        if not isinstance(goal, dict) or not demand_goal.is_demand_goal(goal):
+            raise
+        parsed = with_separate_instances(demand_goal.parse(goal)[0], state.config)
+        before = state.ledger.waiting.get(parsed.demand)
+        mine = before is None or {*before.requesters} & {*parsed.requesters()}
+        # a demand that holds claims keeps them when it is refused, so it cannot wait as well
+        holds = state.ledger.claims_of_demand(parsed.demand)
+        if not isinstance(parsed, Put) or holds or not mine:
+            raise
+        if not placement.may_wait(parsed, state, checkpoint):
+            raise
+        if faults := list(throttle(parsed, state.config)):
+            raise Refused(faults) from None
+        # a demand that is sent again keeps its place among those that wait
+        since = before.since if before else now
+        who = tuple(sorted({*parsed.requesters()}))
+        waiting = WaitingDemand(parsed.demand, parsed.id, who, since, parsed.priority, goal)
+        reasons = tuple(each.message for each in refused.faults)
+        return Wait(parsed.id, (), parsed.demand, who, waiting, reasons)
+
+
+def admit(
+    state: State,
+    goal: object,
+    throttle: Throttle = lambda request, config: (),
+    trial: placement.Trial | None = None,
+    checkpoint: Checkpoint = lambda: None,
+) -> DemandRequest:
+    """Return the request that a goal becomes, if the goal passes all checks.
+
+    If ``trial`` is given, a node is chosen only if ``trial`` accepts the request with this node.
+
+    Raises:
+        Refused: with the limits that the goal exceeds, if it is too large. Otherwise with every
+            fault in the form and in the content of the goal. If there is none, with every fault
+            that ``throttle`` yields.
+    """
+    config, ledger = state.config, state.ledger
+    limits = config.repo_settings.limits
+    if isinstance(goal, dict) and Decommission.is_goal(goal):
+        decommission = Decommission.parse(goal)
+        return replace(decommission, nodes=config.nodes_of(decommission.id))
+    # before anything is parsed, because the parser's work grows with the goal
+    _refuse(admission.length_faults(goal, limits))
+    if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
+        parsed, faults = demand_goal.parse(goal)
+        _refuse(admission.size_faults(parsed, limits))
+        if parsed.adds_claims:
+            checkpoint()
+        # the id of a separate instance comes first, because the placement looks for claims on it
+        parsed = with_separate_instances(parsed, config)
+        parsed, unclear = with_chosen_domains(parsed, config, ledger.held)
+        request = flows.with_further_topics(parsed, ledger, config)
+    else:
+        wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
+        if wired is None:
+            raise Refused(faults)
+        _refuse(admission.size_faults(wired, limits))
+        request, unclear = with_chosen_domains(wired, config, ledger.held)
+    request, not_placed = placement.with_chosen_nodes(
+        request, state, state.usage(), trial, checkpoint
+    )
+    # what was booked must be released, however long that takes
+    checkpoint = checkpoint if request.adds_claims else lambda: None
+    checkpoint()
+    request = completed(request, state)
+    _refuse(admission.size_faults(request, limits))  # derived connections count as well
+    checkpoint()
+    # A field that is malformed was left out, so faults of its content would be wrong. The faults of
+    # form and of content that remain are reported together, to be mended in one go.
+    malformed = {each.field for each in faults}
+    around_malformed = {parent for field in malformed for parent in _with_parents(field)}
+    content = [
+        *unclear,
+        *not_placed,
+        *paced(admission.faults(request, config), checkpoint),
+        *permission_faults(request, config, checkpoint),
+    ]
+    # a list that could not be read must not be reported as empty
+    unread = bool(malformed & {"apps", "applications", "connections"})
+    faults += [
+        each
+        for each in content
+        if each.field not in around_malformed
+        and malformed.isdisjoint(_with_parents(each.field))
+        and not (unread and each.code == "empty")
+    ]
+    # last, because a goal with faults does not count against the limits of its requesters
+    faults = faults or list(throttle(request, config))
+    if faults:
+        # the faults of one application or connection are reported together
+        raise Refused(sorted(dict.fromkeys(faults), key=lambda each: _item_of(each.field)))
+    return request
+
+
+def completed(request: DemandRequest, state: State) -> DemandRequest:
+    """Return a request, whose nodes are chosen, with all else that the generator adds."""
+    config, ledger = state.config, state.ledger
+    request = permission.with_lease_terms(request, config)
+    if request.is_reference:  # its clients list their connections and shut down what they listed
+        request = flows.with_further_topics(request, ledger, config)
+    else:
+        request = implied_connections.with_implied_connections(request, ledger, config)
+    return admission.with_chosen_types(request, config, ledger.connection)
+
+
+def leaves_nodes_open(state: State, goal: object) -> bool:
+    """Return whether the generator chooses or checks nodes for the applications of a goal."""
+    if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
+        request: DemandRequest | None = demand_goal.parse(goal)[0]
+    else:
+        request = deployment_request_goal.parse(goal, state.config.appdef_by_wire_type)[0]
+    return request is not None and request.adds_claims and placement.needs_placement(request, state)
+
+
+_Item = TypeVar("_Item")
+
+
+def paced(items: Iterable[_Item], checkpoint: Checkpoint) -> Iterator[_Item]:
+    for item in items:
+        checkpoint()
+        yield item
+
+
+def permission_faults(
+    request: DemandRequest, config: Config, checkpoint: Checkpoint
+) -> Iterator[Fault]:
+    for item in paced(request.demanded, checkpoint):  # an access domain may have many rules
+        yield from permission.faults(replace(request, demanded=(item,)), config)
+
+
+def _refuse(faults: Iterable[Fault]) -> None:
+    if listed := list(faults):
+        raise Refused(listed)
+
+
+def form_faults(goal: object) -> list[Fault]:
+    """Return the faults in a goal's form that need no configuration, such as unknown fields."""
+    if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
+        return demand_goal.parse(goal)[1]
+    return deployment_request_goal.form_faults(goal)
+
+
+def _with_parents(field: str) -> Iterator[str]:
+    yield field
+    for match in re.finditer(r"[.\[]", field):
+        yield field[: match.start()]
+
+
+def _item_of(field: str) -> tuple[str, int]:
+    match = _ITEM.match(field)
+    return (match[1], int(match[2])) if match else ("", 0)

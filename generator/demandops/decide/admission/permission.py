@@ -1,0 +1,210 @@
+"""Permission: the check that requesters may demand the applications, nodes and leases they ask for.
+
+The access domains of the nodes decide. Every refusal names the access domain, and what in it does
+not allow the request. For a connection between two domains, each of the two domains needs a rule
+that names the other one. A domain, one of its rules or an application definition can also require
+that a person approves claims before they are booked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+
+from demandops.base.errors import Fault, fault
+from demandops.connections.connection import Connection
+from demandops.model.config.base_model import duration_text, seconds_of
+from demandops.model.config.config import Config
+from demandops.model.config.policy import AccessDomain, Rule, matches
+from demandops.model.demand.application import Application
+from demandops.model.demand.claim import Claim, Term
+from demandops.model.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put
+
+# pairs of a rule's field, such as ``nodes``, and a value that this field must allow
+Access = list[tuple[str, str]]
+
+# the field of a rule that lists the access domains to which connections may lead
+PEERS = "peers"
+# without rules in a domain's policy, everybody may demand everything inside of the domain
+_NO_RULES = (Rule(name="everything"),)
+
+
+def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
+    """Yield a fault for everything that the access domains do not allow the requesters."""
+    if not request.adds_claims:  # everybody may release what is theirs
+        return
+    lease_s = _wanted_lease(request)
+    for item in request.demanded:
+        for domain, access in needed_access(item.held, config):
+            yield from _not_allowed(item, domain, access)
+        home = config.domain_of.get(item.held.home)  # the admission reports nodes without a domain
+        longest = home.leases.longest if home else None
+        if home and longest and lease_s is not None and lease_s > seconds_of(longest):
+            yield fault(
+                "lease",
+                f"is {duration_text(lease_s)}, but leases.longest of access domain '{home.name}' "
+                f"is {longest}; request a shorter lease, and renew it",
+                code="not-allowed",
+            )
+
+
+def needed_access(
+    held: Application | Connection, config: Config
+) -> Iterator[tuple[AccessDomain, Access]]:
+    """Yield (access domain, access) for each node where services run or a connection has an end.
+
+    The access is what a rule of this domain must grant. A node without a domain is left out.
+    """
+    more: Access = []
+    if isinstance(held, Application):
+        first = [("applications", held.appdef)]
+        services = config.services.get(held.appdef, {}).values()
+        roles = {role for service in services if service.at_source for role in service.roots}
+        # A node to which an override moves a service is left out: the override's owner decides
+        nodes: Iterable[str] = (
+            held.node,
+            *held.services.values(),
+            *(service.runs_at[held.node] for service in services if held.node in service.runs_at),
+            *(topic.source for role in sorted(roles) for topic in held.inputs.get(role, ())),
+        )
+    else:
+        nodes, first = held.nodes, []
+        more = held.type.access(held, config) if held.type else []
+    domains = {node: config.domain_of[node] for node in nodes if node in config.domain_of}
+    for node, domain in domains.items():
+        access = [*first, ("nodes", config.host_of(node)), *more]
+        if isinstance(held, Connection):
+            others = {other.name for other in domains.values()} - {domain.name}
+            access += [(PEERS, other) for other in others]
+        yield domain, access
+
+
+def may_place(item: Demanded, appdef: str, node: str, config: Config) -> bool:
+    """Return whether the requesters may use a node for an ``appdef``, or as the end of a
+    connection.
+    """
+    domain = config.domain_of.get(node)
+    access: Access = [("applications", appdef)] if appdef else []
+    access.append(("nodes", config.host_of(node)))
+    return domain is not None and not any(_not_allowed(item, domain, access))
+
+
+def _not_allowed(item: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
+    """Yield a fault for each requester to whom no rule of the domain grants the access."""
+    rules = domain.rules or _NO_RULES
+    for index, requester in enumerate(item.requesters):
+        own = [rule for rule in rules if matches(requester, rule.requesters)]
+        # one rule must grant the whole access: two rules that grant half of it each do not add up
+        misses = [first_uncovered(rule, access) for rule in own]
+        if own and None in misses:
+            continue
+        if not own:
+            named = ", ".join(f"{rule.name} ({' '.join(rule.requesters)})" for rule in domain.rules)
+            message = (
+                f"no rule of access domain '{domain.name}' is for '{requester}'; its rules are "
+                f"{named}; ask for a change of policy/"
+            )
+        else:
+            reasons = "; ".join(
+                _reason(domain, rule, requester, *miss)
+                for rule, miss in zip(own, filter(None, misses), strict=True)
+            )
+            message = f"{reasons}; request what is allowed, or ask for a change of policy/"
+        yield item.fault(f"requesters[{index}]", message, code="not-allowed")
+
+
+def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: str) -> str:
+    where = f"access domain '{domain.name}'"
+    if kind == PEERS:
+        whose = f"rule '{rule.name}' of {where}" if domain.rules else where
+        return (
+            f"{whose} does not let '{requester}' connect the domain's nodes to nodes of '{value}' "
+            "(peers)"
+        )
+    return (
+        f"rule '{rule.name}' of {where} lets '{requester}' have only these {kind}: "
+        f"{' '.join(getattr(rule, kind))}, not '{value}'"
+    )
+
+
+def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
+    """Return the first pair of ``access`` that ``rule`` lacks; ``None`` if it grants all pairs."""
+    return next(
+        ((kind, value) for kind, value in access if not matches(value, getattr(rule, kind))), None
+    )
+
+
+def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
+    """Return the request with the lease term that its access domain sets for each item."""
+
+    def with_term(item: Demanded) -> Demanded:
+        domain = config.domain_of.get(item.held.home)
+        return replace(item, term=term(request, domain) if domain else None)
+
+    return replace(request, demanded=tuple(map(with_term, request.demanded)))
+
+
+def term(request: DemandRequest, domain: AccessDomain) -> Term | None:
+    policy = domain.leases
+    # the reference's clients need not repeat their demands, unless the policy says so
+    if request.is_reference and not policy.deployment_requests:
+        return None
+    given = policy.default or policy.longest
+    seconds = _wanted_lease(request) or (seconds_of(given) if given else None)
+    return Term(seconds, seconds_of(policy.slack)) if seconds else None
+
+
+def _wanted_lease(request: DemandRequest) -> int | None:
+    return request.lease_s if isinstance(request, Put) else None
+
+
+def approval_reasons(
+    request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
+) -> tuple[str, ...]:
+    """Return the reasons why a request needs approval, such as ``access domain 'edge'``, each once.
+
+    ``changes`` has each changed claim as (before the request, after the request).
+    """
+    if not request.adds_claims:
+        return ()
+    listed = set(request.subjects())  # without the claims of overrides, which need no approval
+    reasons: dict[str, None] = {}
+    for before, after in changes:
+        if after is None or after.subject not in listed:
+            continue
+        # a renewal needs no approval, because the person approved what it renews
+        if before is not None and replace(after, lease=before.lease) == before:
+            continue
+        if isinstance(after.held, Application):
+            appdef = config.appdefs.get(after.held.appdef)
+            if appdef is not None and appdef.approval == "required":
+                reasons[f"application definition '{appdef.name}'"] = None
+        for domain, access in needed_access(after.held, config):
+            for requester in after.requesters:
+                reasons |= dict.fromkeys(_domain_reasons(domain, requester, access))
+    return tuple(reasons)
+
+
+def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:
+    rules = [
+        rule
+        for rule in domain.rules
+        if matches(requester, rule.requesters) and first_uncovered(rule, access) is None
+    ]
+    # one rule that grants the access without approval is enough
+    if any((rule.approval or domain.approval) == "none" for rule in rules):
+        return
+    own = [rule for rule in rules if rule.approval == "required"]
+    for rule in own:
+        yield f"rule '{rule.name}' of access domain '{domain.name}'"
+    if not own and domain.approval == "required":
+        yield f"access domain '{domain.name}'"
+
+
+def with_leases_from_approval(request: AnyRequest) -> AnyRequest:
+    """Return the request with leases that start when a person approves the request."""
+    demanded = (
+        replace(item, term=replace(item.term, on_approval=True)) if item.term else item
+        for item in request.demanded
+    )
+    return replace(request, demanded=tuple(demanded))

@@ -1,0 +1,116 @@
+"""A restoration books the claims of an earlier commit again.
+
+A restoration undoes newer claims only if the request says so. Afterwards, as after every change,
+:mod:`.overrides` updates the claims that overrides keep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+from demandops.base.errors import Fault, Refused, fault
+from demandops.decide.admission import admission, permission
+from demandops.model.demand.claim import Claim, Term
+from demandops.model.demand.demand_request import Demanded, DemandRequest, Put
+from demandops.model.ledger.claim_file import path_of
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
+
+_SHOWN = 20
+
+
+@dataclass(frozen=True, slots=True)
+class Restoration(DemandRequest):
+    """A person's request to restore the claims of the commit ``to``, which was made at ``made``."""
+
+    to: str = ""
+    made: datetime | None = None
+    claims: tuple[Claim, ...] = ()
+    drop_newer: bool = False
+    reason: str = ""
+    by: str = ""
+    email: str = ""
+
+    operation = "rollback"
+
+
+def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
+    """Return the ledger with the claims of the earlier commit, and the changes.
+
+    Raises:
+        Refused: if the restoration drops or changes a claim of the present ledger, and
+            ``drop_newer`` is not set. Claims that overrides keep, and renewals, do not count.
+    """
+    changes = _changes(ledger, request)
+    # claims that overrides keep do not count, because they are made again
+    newer = [c for c in changes if c.before is not None and c.before.keeping_override is None]
+    if newer and not request.drop_newer:
+        raise Refused(_newer_faults(newer))
+    start = ledger
+    for change in changes:
+        claim = change.after
+        if claim and claim.lease:  # from now on, because its old end may have passed
+            lease = Term(claim.lease.seconds, claim.lease.slack).lease_from(now)
+            claim = replace(claim, lease=lease)
+        ledger = ledger.replace(change.key, claim)
+    booked = {who for change in changes if change.after for who in change.after.requesters}
+    shutdowns, forgotten = start.shutdowns.forget(now, booked)
+    return replace(ledger, shutdowns=shutdowns), Changes(
+        claims=claim_changes(start, ledger, [change.key for change in changes]),
+        shutdowns=forgotten,
+    )
+
+
+def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
+    """Return the changes of claims that restore the earlier commit, sorted by path."""
+    earlier = {claim.key: claim for claim in request.claims}
+    changes = [ClaimChange(claim, None) for claim in ledger if claim.key not in earlier]
+    for key, claim in earlier.items():
+        current = ledger.get(key)
+        if current is not None:
+            # a renewal is no change, and neither is a claim that an override kept at another time
+            is_kept = current.keeping_override is not None
+            booked = claim.booked if is_kept else current.booked
+            same_lease = bool(current.lease) == bool(claim.lease)
+            if same_lease and replace(current, booked=booked, lease=claim.lease) == claim:
+                continue
+        changes.append(ClaimChange(current, claim))
+    return sorted(changes, key=lambda change: path_of(change.key))
+
+
+def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
+    for change in changes[:_SHOWN]:
+        claim = change.before
+        assert claim is not None  # noqa: S101 - the caller passes existing claims
+        effect = "drop" if change.after is None else "undo a change of"
+        message = (
+            f"would {effect} the claim of {', '.join(claim.requesters)} on {claim.subject}, booked "
+            f"{claim.booked:%Y-%m-%d %H:%M:%S} UTC (request '{claim.request}')"
+        )
+        yield fault("", message, code="newer").within(path_of(claim.key))
+    more = len(changes) - _SHOWN
+    others = f"{more} more {'claims' if more > 1 else 'claim'} would change; " if more > 0 else ""
+    message = f"{others}claims that were booked or changed since are undone only with --drop-newer"
+    yield fault("", message, code="newer")
+
+
+def faults(request: Restoration, world: World) -> Iterator[Fault]:
+    """Yield a fault for each claim to restore that the current configuration does not allow."""
+    for change in _changes(world.ledger, request):
+        after = change.after
+        if after is None or after.keeping_override is not None:
+            continue
+        booking, config = request_for(after), world.config
+        for each in (*admission.faults(booking, config), *permission.faults(booking, config)):
+            yield each.within(path_of(change.key))
+
+
+def request_for(claim: Claim) -> Put:
+    """Return a request that books this claim; its faults name fields of the claim."""
+    return Put(
+        id=claim.request,
+        demanded=(Demanded(claim.held, claim.requesters, str),),
+        demand=claim.demand,
+        lease_s=claim.lease.seconds if claim.lease else None,
+    )

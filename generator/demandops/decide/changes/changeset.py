@@ -1,0 +1,259 @@
+"""The changes that a decision makes in the state repo: files by path, and how releases change.
+
+A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+from demandops.base.errors import OverLimit, Refused, fault
+from demandops.base.quoting import one_line
+from demandops.decide.checks import collisions
+from demandops.decide.planning.planner import plan
+from demandops.decide.planning.release_keys import ReleaseKey, all_keys
+from demandops.model.config.config import Config
+from demandops.model.config.repo_settings import ROOT_FILE
+from demandops.model.ledger import claim_file, records
+from demandops.model.ledger.ledger import Changes, Ledger, World
+from demandops.model.release import Release, ServiceRelease
+from demandops.render import manifests, release_file
+from demandops.render.paths import path_of
+from demandops.render.release_file import check_files
+from demandops.templating.values import Evaluate
+
+Change = Literal["start", "change", "stop"]
+
+# the order in which lists of changes show them
+CHANGE_ORDER: tuple[Change, ...] = ("start", "change", "stop")
+
+# returns the text of a state repo's file, or None if the file is missing
+FileReader = Callable[[str], str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class ReleaseChange:
+    """A release that starts, changes or stops; ``details`` has a line for each changed fact."""
+
+    name: str
+    what: str
+    file: str
+    change: Change
+    details: tuple[str, ...] = ()
+
+    @property
+    def order(self) -> tuple[int, str]:
+        return CHANGE_ORDER.index(self.change), self.name
+
+
+@dataclass(frozen=True, slots=True)
+class Changeset:
+    """The files to write and the releases that change. A file whose text is None is removed."""
+
+    files: Mapping[str, str | None]
+    releases: tuple[ReleaseChange, ...]
+    # the paths of the overrides that have an effect on the written files, ``hold`` included
+    overrides: tuple[str, ...] = ()
+    # a warning for each release that a ``hold`` override keeps from changing
+    blocked: tuple[str, ...] = ()
+    # each release that the change may affect, as it is after the change; None if it is gone
+    plans: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
+    # the same releases before the change; None if there was none, or if it could not be planned
+    former: Mapping[ReleaseKey, Release | None] = field(default_factory=dict)
+
+
+def build_changeset(  # noqa: PLR0913 - each is an input of its own
+    before: World,
+    after: World,
+    changes: Changes,
+    keys: Iterable[ReleaseKey],
+    evaluate: Evaluate,
+    read: FileReader,
+    plans: Mapping[ReleaseKey, Release] = MappingProxyType({}),
+    *,
+    keeps_late: bool = False,
+    checkpoint: Callable[[], None] = lambda: None,
+) -> Changeset:
+    """Return the changes in the state repo that follow from a change of the ledger.
+
+    Args:
+        before, after: the world before and after the change, with the same configuration.
+        changes: the differences between both ledgers.
+        keys: the keys of the releases that may differ.
+        evaluate: computes the values of services.
+        read: returns the text of a file of the state repo before the change.
+        plans: releases of ``before`` that the caller has planned already.
+        keeps_late: whether a release whose values take too long to compute keeps its file, instead
+            of OverLimit.
+        checkpoint: called for each file and release; it may raise an exception to end the work.
+
+    Raises:
+        Refused, InvalidInput: if a release cannot be planned or rendered, or if a file would not be
+            valid or would be too large.
+    """
+    most = after.config.repo_settings.limits.file_bytes
+    files = _ledger_files(after.ledger, changes, checkpoint)
+    # before anything is planned, because a claim's file is the smallest of the files that need it
+    _refuse_large(files, most, read)
+    releases = []
+    shaped: set[str] = set()
+    blocked: list[str] = []
+    now, former = dict[ReleaseKey, Release | None](), dict[ReleaseKey, Release | None]()
+    for key in keys:  # all before any is rendered, because that takes longer
+        checkpoint()
+        now[key] = plan(after, key)
+        former[key] = plans.get(key)
+        with suppress(Refused):  # what could not be planned before must not stop its remedy
+            former[key] = former[key] or plan(before, key)
+    texts = _Texts(after.config, evaluate)
+    for key, new in now.items():
+        checkpoint()
+        old = former[key]
+        old_path = path_of(old) if old else None
+        new_path = path_of(new) if new else None
+        current = read(new_path) if new_path else None
+        try:
+            text = texts.text_of(new, current) if new else None
+        except OverLimit:
+            if keeps_late or old == new:  # what only renews a lease needs no template
+                continue
+            raise
+        # the path has the node, so a release that moves to another node leaves a file behind
+        if old_path and old_path != new_path and read(old_path) is not None:
+            files[old_path] = None
+        blocked += _blocked(old, new) if current is not None else ()
+        if new_path and text != current:
+            files[new_path] = text
+            shaped |= {override.path for override, _ in new.shaping.by} if new else set()
+        if text is not None and text == current:
+            continue
+        if old or new:
+            releases.append(describe_change(old, new, current is not None))
+    _refuse_large(files, most, read)
+    check_files(files, checkpoint)
+    releases.sort(key=lambda change: change.order)
+    return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked), now, former)
+
+
+def _ledger_files(
+    ledger: Ledger, changes: Changes, checkpoint: Callable[[], None]
+) -> dict[str, str | None]:
+    files: dict[str, str | None] = {}
+    for change in changes.claims:
+        checkpoint()
+        path = claim_file.path_of(change.key)
+        files[path] = claim_file.text_of(change.after) if change.after else None
+    for digest in changes.shutdowns:
+        shutdown = ledger.shutdowns.by_digest.get(digest)
+        path = records.shutdowns_path(digest)
+        files[path] = records.shutdowns_text(shutdown) if shutdown else None
+    for instance in changes.kept:
+        steps = ledger.kept.steps.get(instance)
+        path = records.replicas_path(instance)
+        files[path] = records.replicas_text(instance, steps) if steps else None
+    for demand in changes.waiting:
+        waits = ledger.waiting.get(demand)
+        files[records.waiting_path(demand)] = records.waiting_text(waits) if waits else None
+    return files
+
+
+def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) -> None:
+    faults = []
+    for path, text in files.items():
+        # A file that is too large already may shrink. Else its claims could not be released.
+        # A character has at most four bytes, so most files need not be encoded to be measured.
+        size = len(text.encode()) if text is not None and 4 * len(text) > most else 0
+        if size > max(most, len((read(path) or "").encode()) if size > most else 0):
+            message = (
+                f"would have {size} bytes, but at most {most} are allowed; demand less, or ask a "
+                f"platform engineer to raise limits.fileBytes in {ROOT_FILE}"
+            )
+            faults.append(fault("", message, code="too-large").within(path))
+    if faults:
+        raise Refused(faults)
+
+
+def render_all(
+    world: World,
+    evaluate: Evaluate,
+    current: Mapping[str, str],
+    *,
+    keeps_late: bool,
+) -> dict[str, str]:
+    """Return all generated files except those of the ledger, by path.
+
+    ``current`` are the generated files in the state repo. With ``keeps_late``, a release whose
+    values take too long to compute keeps its file.
+
+    Raises:
+        Refused, InvalidInput: if a release cannot be planned or rendered, or if two need one name.
+    """
+    config, keys = world.config, all_keys(world)
+    files = manifests.base_files(config)
+    texts = _Texts(config, evaluate)
+    collisions.refuse_shared_names(world, keys)  # one would overwrite the file of the other
+    for key in keys:
+        release = plan(world, key)
+        if release is None:
+            continue
+        path = path_of(release)
+        try:
+            files[path] = texts.text_of(release, current.get(path))
+        except OverLimit:
+            if not keeps_late:
+                raise
+            if path in current:
+                files[path] = current[path]
+    return files | release_file.kept_charts(files, current, world)
+
+
+class _Texts:
+    """The texts of releases. A template that took too long for one is not tried for others."""
+
+    def __init__(self, config: Config, evaluate: Evaluate) -> None:
+        self._config, self._evaluate = config, evaluate
+        self._late: dict[str, OverLimit] = {}
+
+    def text_of(self, release: Release, current: str | None) -> str:
+        template = ""
+        if isinstance(release, ServiceRelease):
+            template = self._config.values_template(release.service)
+        if template in self._late:
+            raise self._late[template]
+        try:
+            return release_file.release_text(release, self._config, self._evaluate, current)
+        except OverLimit as error:
+            self._late[template] = error
+            raise
+
+
+def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
+    if new is not None and new.shaping.held and (old and old.facts()) != new.facts():
+        by = " and ".join(each.path for each, effects in new.shaping.by if "hold" in effects)
+        yield f"{new.name} will not change until the 'hold' of {by} ends"
+
+
+def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
+    """Return how a release changes; ``existed`` says that it had a file before."""
+    release = new or old
+    assert release is not None  # noqa: S101 - a change has at least one side
+    kind: Change = "stop" if not new else "change" if existed else "start"
+    details: list[str] = []
+    if new and existed:
+        before, after = _overrides(old), _overrides(new)
+        if not new.shaping.held:  # in a held file, only the comments that name overrides change
+            before = (old.facts() if old else []) + before
+            after = new.facts() + after
+        old_facts, new_facts = frozenset(before), frozenset(after)
+        details = [f"- {one_line(fact)}" for fact in before if fact not in new_facts]
+        details += [f"+ {one_line(fact)}" for fact in after if fact not in old_facts]
+    return ReleaseChange(release.name, release.description, path_of(release), kind, tuple(details))
+
+
+def _overrides(release: Release | None) -> list[str]:
+    by = release.shaping.by if release is not None else ()
+    return [f"{override.path}: {', '.join(effects)}" for override, effects in by]

@@ -1,0 +1,1 @@
+"""What refuses a demand although it is well formed."""

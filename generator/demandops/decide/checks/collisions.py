@@ -1,0 +1,407 @@
+"""Topic clashes: a demand is refused if a node would have two sources of one topic.
+
+A subscriber would mix the two, without an error. Topics are named as the reference names them, so
+two ids of nodes or applications may give the same topic, for example ``a/b`` and ``a-b``. A
+connection may also bring a topic to a node where a service publishes the same topic.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import suppress
+from itertools import chain, islice
+from typing import TypeAlias
+
+from rpds import HashTrieMap, HashTrieSet
+
+from demandops.base import naming
+from demandops.base.errors import Fault, InvalidInput, Refused, fault
+from demandops.base.naming import Subject, SubjectKind
+from demandops.connections.connection import Connection
+from demandops.connections.connection_type import ClientKey
+from demandops.decide.booking.restoration import request_for
+from demandops.decide.planning.flows import flows, outputs, usual_topic
+from demandops.decide.planning.planner import service_name
+from demandops.decide.planning.release_keys import (
+    ReleaseKey,
+    claims_needing,
+    is_needed,
+    keys_of,
+    keys_of_claims,
+)
+from demandops.model.config.appdef import Service
+from demandops.model.config.config import NODES_FILE, Config
+from demandops.model.demand.application import Application
+from demandops.model.demand.claim import Claim, ClaimKey
+from demandops.model.demand.demand_request import Demanded, DemandRequest
+from demandops.model.ledger import claim_file, records
+from demandops.model.ledger.claim_file import path_of
+from demandops.model.ledger.ledger import Changes, World
+from demandops.model.release import ServiceKey
+
+
+def topic_faults(
+    request: DemandRequest, before: World, after: World, keys: Iterable[ReleaseKey]
+) -> Iterator[Fault]:
+    """Yield a fault for each new service, route or delivery that clashes with another source.
+
+    It clashes if it would be a topic's second source on a node. Of a service's outputs, only the
+    first that clashes is reported. ``keys`` are the keys of the releases that the demand may
+    change.
+    """
+    if not request.adds_claims:
+        return
+    for key in keys:
+        if isinstance(key, ServiceKey) and not is_needed(before, key):
+            yield from islice(_clashes_of_service(request, after, key), 1)
+    for item in request.demanded:
+        if isinstance(item.held, Connection):
+            yield from _clashes_of_connection(item, item.held, before, after)
+        else:
+            yield from _clashes_of_flows(item, item.held, after)
+
+
+def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
+    keys = keys_of_claims(after, [claim])
+    for clash in topic_faults(request_for(claim), before, after, keys):
+        yield clash.within(path_of(claim.key))
+
+
+def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -> Iterator[Fault]:
+    claim = next(iter(claims_needing(after, key)), None)
+    if claim is None:
+        return
+    first = after.ledger.application(claim.subject.id) or claim.application
+    service = after.config.services[first.appdef][key.service]
+    further = False
+    if service.root is not None:
+        booked = after.ledger.booked_input(service.root, str(key.source), str(key.topic))
+        further = bool(booked and booked.further)
+    for name, topic in outputs(after.config, service, key, further=further).items():
+        publishers = (
+            (f"{words(other)} already publishes this topic on", other)
+            for other in _publishers(after, key.node, topic, excluded=key)
+        )
+        connections = (
+            (f"connection '{id}' already brings this topic to", None)
+            for id in after.ledger.connections_bringing(key.node, topic)
+        )
+        for clash, other in chain[tuple[str, ServiceKey | None]](publishers, connections):
+            remedy = _remedy(key, other, service, name, after.config)
+            yield fault(
+                _field(request, key, service),
+                f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}",
+                code="conflict",
+            )
+
+
+def _clashes_of_connection(
+    item: Demanded, connection: Connection, before: World, after: World
+) -> Iterator[Fault]:
+    for index, route in enumerate(connection.topics):
+        _, node = route.sender_and_receiver(*connection.nodes)
+        topic = route.written_topic
+        if connection.id in before.ledger.connections_bringing(node, topic):
+            continue
+        # Only services that run before and after the demand count. If an application moves, a
+        # connection may bring the application's output back to the old node.
+        staying = (key for key in _publishers(before, node, topic) if is_needed(after, key))
+        for other in islice(staying, 1):
+            yield item.fault(
+                f"topics[{index}].{'source' if route.reverse else 'target'}",
+                f"connection '{connection.id}' brings {topic} to '{node}', where "
+                f"{words(other)} already publishes this topic; use a connection that brings the "
+                "topic under another name",
+                code="conflict",
+            )
+
+
+def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterator[Fault]:
+    """Yield a fault for each output that the receiving node already gets from another source."""
+    has_outputs_elsewhere = app.deliver or app.services or app.moved
+    for flow in flows(after.config, app) if has_outputs_elsewhere else ():
+        # Of an input that the demand lists, the demand names the source, so it is no fault.
+        if flow.delivery is None and not flow.is_output:
+            continue
+        for id in after.ledger.connections_bringing(flow.receiver, flow.target):
+            other = after.ledger.connection(id)
+            elsewhere = other is not None and {*other.nodes} != {flow.sender, flow.receiver}
+            if flow.delivery is None:
+                if elsewhere:
+                    message = (
+                        f"{flow.target} already comes to '{flow.receiver}' by connection '{id}', "
+                        f"and would also come from '{flow.sender}'; choose another node for the "
+                        "service that reads this topic"
+                    )
+                    yield item.fault("id", message, code="conflict")
+                continue
+            if elsewhere:
+                yield item.fault(
+                    f"deliver[{flow.delivery}].output",
+                    f"{flow.target} already comes to '{flow.receiver}' by connection '{id}'; leave "
+                    "this delivery out",
+                    code="conflict",
+                )
+                continue
+            claims = after.ledger.connection_claims(id)
+            routes = (route for claim in claims for route in claim.connection.topics)
+            read = {route.read_topic for route in routes if route.written_topic == flow.target}
+            for topic in sorted(read - {flow.topic})[:1]:
+                yield item.fault(
+                    f"deliver[{flow.delivery}].topic",
+                    f"connection '{id}' already brings {topic} to '{flow.receiver}' as "
+                    f"{flow.target}; choose another topic for this delivery",
+                    code="conflict",
+                )
+
+
+def _publishers(
+    world: World, node: str, topic: str, *, excluded: ServiceKey | None = None
+) -> Iterator[ServiceKey]:
+    """Yield the keys of the service instances on a node that publish ``topic``.
+
+    The instance ``excluded`` and each instance that no claim needs are left out.
+    """
+    # The output patterns of the definitions tell which instances would publish the topic. So only
+    # these are looked up, and not the outputs of all services on the node.
+    for services in world.config.services.values():
+        for service in services.values():
+            for pattern in service.outputs.values():
+                first, *others = map(re.escape, pattern.split("{instance}"))
+                expression = first + "(.+)" + r"\1".join(others) if others else first
+                match = re.fullmatch(expression, topic)
+                if match is None:
+                    continue
+                keys = (
+                    _keys_called(world, node, service, match[1], excluded)
+                    if others
+                    else _keys_on(world, node, service)
+                )
+                yield from (key for key in keys if key != excluded and is_needed(world, key))
+
+
+def _keys_called(
+    world: World, node: str, service: Service, instance: str, excluded: ServiceKey | None
+) -> Iterator[ServiceKey]:
+    """Yield the keys of a service's instances on ``node`` that topic names show as ``instance``.
+
+    Some of the instances may not run. The instance ``excluded`` may be left out.
+    """
+    ledger, config = world.ledger, world.config
+    name, role = service.name, service.root
+    if service.scope in ("node", "cluster"):
+        if naming.topic_part(node) == instance:
+            yield ServiceKey(name, node, for_cluster=service.scope == "cluster")
+        return
+    if role is None:
+        for id in ledger.applications_in_topics(instance):
+            yield ServiceKey(name, node, application=id)
+        return
+    for source in config.nodes_by_topic_part.get(instance, ()):
+        usual = usual_topic(config, source, role)
+        is_own = excluded is not None and (excluded.service, excluded.source) == (name, source)
+        own = str(excluded.topic) if excluded and is_own else ""
+        for topic in (usual,) if usual else ledger.usual_topics(role, source, excluded=own):
+            yield ServiceKey(name, node, source=source, topic=topic)
+    for further, version in ledger.further_topics(role, instance):
+        own = "" if service.shared else version
+        yield ServiceKey(name, node, source=further.source, topic=further.topic, version=own)
+
+
+def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
+    """Yield the keys of a service's instances on a node; some of them may not run."""
+    name = service.name
+    if service.scope == "cluster":
+        yield ServiceKey(name, node, for_cluster=True)
+        return
+    for id in world.ledger.applications_at(node):
+        for key in keys_of(world, Subject(SubjectKind.APPLICATION, id)):
+            if isinstance(key, ServiceKey) and (key.node, key.service) == (node, name):
+                yield key
+
+
+def words(key: ReleaseKey) -> str:
+    if isinstance(key, ClientKey):
+        return f"connection '{key.id}'" if key.side else f"the {key.type.name} client of '{key.id}'"
+    if key.application is not None:
+        return f"application '{key.application}'"
+    if key.scope in ("node", "cluster"):
+        return key.service
+    return f"{key.service} for {key.topic} of '{key.source}'"
+
+
+def _remedy(
+    key: ServiceKey, other: ServiceKey | None, service: Service, output: str, config: Config
+) -> str:
+    """Return how to resolve a clash; ``other`` is ``None`` if it is with a connection."""
+    is_named = "{instance}" in service.outputs[output]
+    is_of_same = (
+        other is not None
+        and other.service != key.service
+        and (other.application, other.source) == (key.application, key.source)
+    )
+    if key.application is not None and is_named and not is_of_same:
+        return "use another application id"
+    if other is None:
+        return "let the connection bring the topic under another name"
+    if not is_named or is_of_same or {"node", "cluster"} & {key.scope, other.scope}:
+        return f"change this output in {service.file}"
+    file = config.file_of(NODES_FILE, str(key.source))
+    if key.source == other.source:
+        where = f"topics.{service.root} of '{key.source}' in {file}"
+        return f"choose one of the two topics as the usual one, and list it in {where}"
+    return f"give '{key.source}' another id in {file}"
+
+
+def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
+    for item in request.demanded:
+        if not isinstance(item.held, Application):
+            continue
+        if item.held.id == key.application:
+            return item.place("id")
+        for index, topic in enumerate(item.held.inputs.get(str(service.root), ())):
+            if (topic.source, topic.topic) == (key.source, key.topic):
+                return item.place(f"inputs.{service.root}[{index}].topic")
+    return ""
+
+
+# ---- name clashes: a demand is refused if a name or file that it needs belongs to another ----
+#
+# Names and paths contain a short hash of ids (:mod:`.naming`), so ids can be crafted that have the
+# same name. A release's name is its file, its objects in a namespace, its ROS node and its client
+# at a broker. So no other release in the state repo may have it, on whatever node.
+
+# What is named, in words, and its name.
+Name: TypeAlias = "tuple[str, str]"
+
+# For each name, the keys of the releases that have it: one, if nobody wrote claims by hand. The
+# releases of suspended claims count too, because they will run again. A key that no claim needs any
+# longer may be left; :func:`.release_keys.is_needed` tells. All names of a large
+# ledger take long to find, so they follow each change, in a map that shares what did not change.
+Names: TypeAlias = "HashTrieMap[Name, HashTrieSet[ReleaseKey]]"
+
+NONE: Names = HashTrieMap()
+
+_REMEDY = "use another id, or wait until the other is released"
+
+
+def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
+    """Yield the names that only the release at ``key`` may have."""
+    if isinstance(key, ClientKey):
+        yield from key.type.names(key)
+        return
+    app = world.ledger.application(key.application) if key.application is not None else None
+    definitions = world.config.services
+    for services in [definitions.get(app.appdef, {})] if app else definitions.values():
+        service = services.get(key.service)
+        # Nothing is named if the configuration no longer has the service.
+        if service is not None and service.scope == key.scope:
+            yield "release", service_name(world.config, service, key)
+            if key.service in world.config.services_with_down_after:
+                yield "record of replicas", records.replicas_path(key.instance)
+            return
+
+
+def all_names(world: World) -> Names:
+    """Return the names of all releases. This takes time for a large ledger."""
+    keys = (key for claims in world.ledger.claims.values() for key in keys_of_claims(world, claims))
+    return with_keys(NONE, world, dict.fromkeys(keys))
+
+
+def with_keys(names: Names, world: World, keys: Iterable[ReleaseKey]) -> Names:
+    for key in keys:
+        for name in names_of(world, key):
+            names = names.insert(name, (names.get(name) or HashTrieSet()).insert(key))
+    return names
+
+
+def followed(names: Names, before: World, after: World, keys: Collection[ReleaseKey]) -> Names:
+    """Return the names in ``after``; only the releases at ``keys`` differ from ``before``."""
+    for key in keys:
+        for name in names_of(before, key):
+            others = (names.get(name) or HashTrieSet()).discard(key)
+            names = names.insert(name, others) if others else names.discard(name)
+    # A release that an override denies needs its name all the same.
+    return with_keys(names, after, (key for key in keys if is_needed(after, key)))
+
+
+def name_faults(
+    request: DemandRequest,
+    before: World,
+    after: World,
+    keys: Iterable[ReleaseKey],
+    changes: Changes,
+    names: Names,
+) -> Iterator[Fault]:
+    """Yield a fault for each new release that needs a name of another release.
+
+    ``keys`` are the keys of the releases that the demand may change. ``names`` are the names of the
+    releases in ``before``.
+    """
+    for key in keys:
+        for name in names_of(after, key):
+            others = (names.get(name) or HashTrieSet()).discard(key)
+            names = names.insert(name, others.insert(key))  # for the keys that follow
+            # a release keeps the name that it has, even if a person gave another one this name
+            if not others or not is_needed(after, key) or is_needed(before, key):
+                continue
+            for other in islice((each for each in others if is_needed(after, each)), 1):
+                claims = {change.key.subject: change.key for change in changes.claims}
+                needing = (
+                    claim
+                    for subject, claim in claims.items()
+                    if key in keys_of_claims(after, after.ledger.claims_on(subject))
+                )
+                yield _located(_message(key, name, other), request, next(needing, None))
+
+
+def faults_in_files(
+    request: DemandRequest, changes: Changes, text_at: Callable[[str], str | None]
+) -> Iterator[Fault]:
+    """Yield a fault for each new claim or waiting demand whose file belongs to another.
+
+    ``text_at`` returns the text of a file of the state repo before the change.
+    """
+    owners: dict[str, ClaimKey] = {}
+    for change in changes.claims:
+        path = claim_file.path_of(change.key)
+        owner = owners.setdefault(path, change.key)
+        if change.before is None and owner == change.key and (text := text_at(path)):
+            with suppress(InvalidInput):  # a file that is not valid is no claim, and is replaced
+                owner = claim_file.read(text, path).key
+        if owner != change.key:
+            other = f"{owner.subject} of demand '{owner.demand}'"
+            message = f"{change.key.subject} needs the file {path}, which belongs to {other}"
+            yield _located(f"{message}; {_REMEDY}", request, change.key)
+    for demand in changes.waiting:
+        path = records.waiting_path(demand)
+        waiting_there = records.read_waiting(text_at(path) or "", path)
+        if waiting_there is not None and waiting_there.demand != demand:
+            message = f"needs the file {path}, which belongs to demand '{waiting_there.demand}'"
+            yield fault("demand", f"{message}; {_REMEDY}", code="conflict")
+
+
+def refuse_shared_names(world: World, keys: Iterable[ReleaseKey]) -> None:
+    taken: dict[Name, ReleaseKey] = {}
+    clashes = [
+        (key, name, taken[name])
+        for key in keys
+        for name in names_of(world, key)
+        if taken.setdefault(name, key) != key
+    ]
+    if clashes:
+        raise Refused(fault("", _message(*clash), code="conflict") for clash in clashes)
+
+
+def _message(key: ReleaseKey, name: Name, other: ReleaseKey) -> str:
+    needed = f"the {' '.join(name)}, which belongs to {words(other)}"
+    return f"{words(key)} needs {needed}; {_REMEDY}"
+
+
+def _located(message: str, request: DemandRequest, claim: ClaimKey | None) -> Fault:
+    for item in request.demanded:
+        if claim and item.held.subject == claim.subject:
+            return item.fault("id", message, code="conflict")
+    clash = fault("", message, code="conflict")
+    return clash.within(claim_file.path_of(claim)) if claim else clash

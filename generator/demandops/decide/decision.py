@@ -1,0 +1,363 @@
+"""The decision on one demand: from the goal to the files of a commit.
+
+:func:`decide` is one pure function with these stages: parse, admit, book, plan, render. It reads
+the state repo only through ``read`` and writes nothing. So the real run, a dry run, and a replay
+after the remote got newer commits all call the same function.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from datetime import datetime
+from typing import Literal
+
+from demandops.base.errors import Fault, OverBudget, Refused, fault
+from demandops.decide.admission import admission, permission
+from demandops.decide.admission.admitted_request import (
+    Checkpoint,
+    Throttle,
+    admit,
+    admitted,
+    completed,
+    leaves_nodes_open,
+    paced,
+    permission_faults,
+)
+from demandops.decide.booking import restoration
+from demandops.decide.booking.apply import apply
+from demandops.decide.booking.leaving import Drain
+from demandops.decide.booking.restoration import Restoration
+from demandops.decide.changes import changeset
+from demandops.decide.changes.changeset import FileReader, ReleaseChange
+from demandops.decide.checks import collisions, quotas, version_difference
+from demandops.decide.decision_notes import notes_on
+from demandops.decide.placement import capacity, relocation
+from demandops.decide.planning import implied_connections
+from demandops.decide.planning import planner as scale_downs
+from demandops.decide.planning.overrides import with_kept_claims, without_kept_claims
+from demandops.decide.planning.release_keys import ReleaseKey, affected_keys
+from demandops.decide.state import State
+from demandops.model.config.config import Config
+from demandops.model.demand import demand_goal
+from demandops.model.demand.demand_request import Decommission, DemandRequest
+from demandops.model.ledger.ledger import Changes
+from demandops.model.ledger.records import Instance, Wait
+from demandops.model.release import ServiceKey
+
+Stage = Literal["admitted", "booked"]
+Outcome = Literal["booked", "released", "restored", "unchanged", "waiting"]
+
+# the outcome in the receipt, by operation; that of all others is ``released``
+_OUTCOMES: dict[str, Outcome] = {
+    "join": "booked",
+    "put": "booked",
+    "renew": "booked",
+    "drain": "booked",
+    "rollback": "restored",
+    "wait": "waiting",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    """The effect of a demand.
+
+    ``files`` maps each path to the new text, or to ``None`` if the file is to be removed.
+    ``approval`` has the reasons why a person must approve the demand before it is booked.
+    """
+
+    request: DemandRequest
+    outcome: Outcome
+    state: State
+    changes: Changes
+    files: Mapping[str, str | None]
+    releases: tuple[ReleaseChange, ...]
+    warnings: tuple[str, ...]
+    approval: tuple[str, ...] = ()
+    # the paths of the overrides that change the content of the rendered files
+    overrides: tuple[str, ...] = ()
+    # whether services now request less of a node, so that waiting demands are tried again
+    frees: bool = False
+
+    @property
+    def placed(self) -> tuple[str, ...]:
+        """A sentence for each placed application or service: the chosen node and the reason."""
+        if isinstance(self.request, Drain):
+            return self.request.moved
+        return tuple(text for item in self.request.demanded for text in item.placed)
+
+    @property
+    def lease_s(self) -> int | None:
+        """The shortest lease of the demand in seconds: the client must renew as often."""
+        waiting = self.state.ledger.waiting.get(self.request.demand)
+        if waiting is not None:
+            # which domain it will get is open, so any in which it may wait counts
+            put, config = demand_goal.parse(dict(waiting.goal))[0], self.state.config
+            domains = (domain for domain in config.domains.values() if domain.when_full == "wait")
+            terms = (permission.term(put, domain) for domain in domains)
+            return min((term.seconds for term in terms if term), default=None)
+        claims = (
+            self.state.ledger.claims_of_demand(self.request.demand) if self.request.demand else ()
+        )
+        claims = claims or tuple(change.after for change in self.changes.claims if change.after)
+        return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
+
+
+def decide(
+    state: State,
+    goal: object,
+    now: datetime,
+    read: FileReader,
+    on_stage: Callable[[Stage], None] = lambda stage: None,
+    throttle: Throttle = lambda request, config: (),
+    checkpoint: Checkpoint = lambda: None,
+) -> Decision:
+    """Return the decision on a goal, or on a request that the generator makes itself.
+
+    Args:
+        state: the configuration and ledger to decide on.
+        goal: the goal as plain data (:mod:`.deployment_request_goal`,
+            :mod:`.demand_goal`, :class:`Decommission`), or the generator's own
+            request. Of own requests, only a :class:`Restoration` is checked against the
+            configuration and its policy.
+        now: when the demand was received, with time zone.
+        read: returns the current text of a file in the state repo, or ``None``.
+        on_stage: called when the demand is admitted and when it is booked, each at most once.
+            Later checks may still refuse an admitted demand.
+        throttle: called if all other checks of admission find no fault, perhaps twice for one goal.
+            It is not called for a :class:`Decommission` and for the generator's own requests.
+        checkpoint: called often while a demand that may add claims is decided, and raises
+            :class:`OverBudget` to end the decision. It can only refuse a demand, never change what
+            is decided.
+
+    Raises:
+        Refused: with every fault, each with its field in the goal; with the code ``too-large``, if
+            the demand takes too much work.
+        InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
+    """
+    if isinstance(goal, DemandRequest):
+        return _decided(state, goal, now, read, on_stage)
+    try:
+        return _decide_goal(state, goal, now, read, on_stage, throttle, checkpoint)
+    except OverBudget as spent:
+        raise Refused([_too_large(spent)]) from None
+
+
+def _too_large(spent: OverBudget) -> Fault:
+    return fault("", str(spent), code="too-large")
+
+
+def _decide_goal(
+    state: State,
+    goal: object,
+    now: datetime,
+    read: FileReader,
+    on_stage: Callable[[Stage], None],
+    throttle: Throttle,
+    checkpoint: Checkpoint,
+) -> Decision:
+    """Decide a goal; if it is refused on the nodes chosen first, look for others."""
+    throttled, told = list[Fault](), set[Stage]()
+
+    # who was throttled must not get another try on other nodes
+    def noted(request: DemandRequest, config: Config) -> list[Fault]:
+        throttled[:] = throttle(request, config)
+        return throttled
+
+    def once(stage: Stage) -> None:
+        if stage not in told:
+            told.add(stage)
+            on_stage(stage)
+
+    try:
+        request = admitted(state, goal, now, noted, checkpoint)
+        return _decided(state, request, now, read, once, checkpoint)
+    except Refused as refused:
+        if throttled or any(each.code not in _BY_NODE for each in refused.faults):
+            raise
+        try:
+            checkpoint()
+            # Look for nodes on which the demand is not refused. To try many nodes takes time, but
+            # only a demand that is refused on the nodes chosen first takes this time.
+            if leaves_nodes_open(state, goal):
+                checkpoint()
+                with suppress(Refused):
+                    trials = _Trials(state, now, checkpoint)
+                    request = admit(state, goal, throttle, trials.succeeds, checkpoint)
+                    return _decided(state, request, now, read, once, checkpoint)
+        except OverBudget as spent:
+            # keep the faults of the first refusal: they tell the requester what to change
+            raise Refused([_too_large(spent), *refused.faults]) from None
+        raise
+
+
+# The codes of faults that might not occur if other nodes were chosen for the demand
+_BY_NODE = frozenset(
+    ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
+)
+
+
+# How many bookings one demand, or one drain of a node, may try while nodes are looked for. Each
+# trial books all that is placed so far. So the trials of one demand together may also book no more
+# items than the largest demand may list.
+MOST_TRIALS = 64
+
+
+class _Trials:
+    """The bookings that are tried, in memory only, while nodes are looked for."""
+
+    def __init__(self, state: State, now: datetime, checkpoint: Checkpoint) -> None:
+        self._state, self._now, self._checkpoint = state, now, checkpoint
+        self._tried = self._items = 0
+
+    def succeeds(self, request: DemandRequest) -> bool:
+        """Return whether a request, which names a node for each application, can be booked."""
+        self._tried += 1
+        self._items += admission.items_of(request)
+        most = self._state.config.repo_settings.limits.demand_items
+        if self._tried > MOST_TRIALS or self._items > most:
+            raise OverBudget(
+                "too many nodes would have to be tried for this demand; name a node for each "
+                "application, or split the demand"
+            )
+        request, config = completed(request, self._state), self._state.config
+        if next(admission.faults(request, config), None) or next(
+            permission_faults(request, config, self._checkpoint), None
+        ):
+            return False
+        try:
+            _booked(self._state, request, self._now, self._checkpoint)
+        except Refused:
+            return False
+        return True
+
+
+def _decided(
+    state: State,
+    request: DemandRequest,
+    now: datetime,
+    read: FileReader,
+    on_stage: Callable[[Stage], None],
+    checkpoint: Checkpoint = lambda: None,
+) -> Decision:
+    config = state.config
+    # what was booked must be released, however long that takes
+    checkpoint = checkpoint if request.adds_claims else lambda: None
+    if isinstance(request, Drain):
+        request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
+    if isinstance(request, Restoration):
+        request = relocation.with_restored_moves(request, state)
+        faults = list(restoration.faults(request, state))
+        if faults:
+            raise Refused(faults)
+    on_stage("admitted")
+    after, changes, keys = _booked(state, request, now, checkpoint)
+    if taken := list(collisions.faults_in_files(request, changes, read)):
+        raise Refused(taken)
+    rendered = changeset.build_changeset(
+        state,
+        after,
+        changes,
+        keys,
+        state.evaluate,
+        read,
+        state.plans,
+        keeps_late=request.operation not in _OUTCOMES,  # a release waits for no template
+        checkpoint=checkpoint,
+    )
+    differing = list(
+        version_difference.differences(request, state, after, changes.claims, rendered.plans)
+    )
+    refused = [difference.fault for difference in differing if difference.is_refused]
+    grown = _growth(config, rendered)
+    # a drain was tried on its nodes already, and what releases claims makes room
+    if request.adds_claims or isinstance(request, Restoration):
+        refused = refused or list(capacity.faults(state.usage(), grown, config))
+    if refused:
+        raise Refused(refused)
+    checkpoint()
+    after = state.followed_by(after.ledger, rendered, state.usage().plus(grown))
+    checkpoint()
+    on_stage("booked")
+    outcome: Outcome = "unchanged"
+    if changes.claims or changes.waiting or isinstance(request, Wait):
+        outcome = _OUTCOMES.get(request.operation, "released")
+    return Decision(
+        request=request,
+        outcome=outcome,
+        state=after,
+        changes=changes,
+        files=rendered.files if changes.claims or changes.waiting else {},
+        releases=rendered.releases,
+        warnings=(
+            *notes_on(request, after, changes, rendered),
+            *filter(None, (difference.warning() for difference in differing)),
+        ),
+        approval=(
+            *permission.approval_reasons(
+                request, ((c.before, c.after) for c in changes.claims), config
+            ),
+            *filter(None, (difference.approval_reason() for difference in differing)),
+        ),
+        overrides=rendered.overrides,
+        frees=any(amount < 0 for amount in grown.values()),
+    )
+
+
+def _booked(
+    state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
+) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
+    """Return the state with a request booked, the changes, and the releases that may change."""
+    checkpoint()
+    subjects = request.subjects()
+    # Claims of the request replace those that overrides kept. Else a kept claim, which nobody
+    # demands any longer, would contradict the request.
+    ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
+    if isinstance(request, Decommission):
+        ledger, changes = implied_connections.without_idle_deliveries(
+            state.ledger, replace(state, ledger=ledger), changes
+        )
+    after = replace(state, ledger=ledger)
+    checkpoint()
+    refusals = list(quotas.denial_faults(request, after, changes))
+    checkpoint()
+    refusals = refusals or list(quotas.quota_faults(state, after, changes))
+    if refusals:
+        raise Refused(refusals)
+    # overrides may keep what the request releases
+    ledger, changes = with_kept_claims(state.ledger, after, changes, subjects, now)
+    checkpoint()
+    after = replace(state, ledger=ledger)
+    keys = affected_keys(state, after, changes.claims)
+    ledger, kept = scale_downs.with_kept_replicas(state, after, keys, now)
+    after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
+    clashes = list(collisions.topic_faults(request, state, after, paced(keys, checkpoint)))
+    clashes += collisions.name_faults(
+        request, state, after, paced(keys, checkpoint), changes, state.names()
+    )
+    for change in changes.claims if isinstance(request, Restoration) else ():
+        clashes += collisions.faults_of_claim(change.after, state, after) if change.after else ()
+    if clashes:
+        raise Refused(clashes)
+    return after, changes, keys
+
+
+def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
+    if not config.limits_capacity:
+        return {}
+    return capacity.growth(rendered.former, rendered.plans, config)
+
+
+def scale_down(
+    state: State, instance: Instance, now: datetime, read: FileReader
+) -> tuple[State, changeset.Changeset]:
+    """Return the state after a step of a service's kept replicas has ended, and its changeset."""
+    after = replace(state, ledger=scale_downs.without_ended(state, instance, now))
+    changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
+    change = changeset.build_changeset(
+        state, after, changes, keys, state.evaluate, read, state.plans
+    )
+    usage = state.usage().plus(_growth(state.config, change))
+    return state.followed_by(after.ledger, change, usage), change

@@ -1,0 +1,1 @@
+"""Which node an application gets, and when it moves."""

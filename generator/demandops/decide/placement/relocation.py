@@ -1,0 +1,440 @@
+"""Moved connections: when an application moves, the connections of its demands follow.
+
+The connections then carry the same topics to or from the new node, with the same type and options.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial, reduce
+from itertools import islice
+from math import inf
+
+from demandops.base.errors import Fault, sentences
+from demandops.base.naming import Subject, SubjectKind
+from demandops.base.quoting import quoted
+from demandops.connections.connection import Connection, Route
+from demandops.decide.admission import admission, permission
+from demandops.decide.booking.joining import conflicts
+from demandops.decide.booking.leaving import Drain
+from demandops.decide.booking.restoration import Restoration, request_for
+from demandops.decide.checks import collisions, quotas
+from demandops.decide.checks.collisions import Names
+from demandops.decide.placement.capacity import Room, Usage
+from demandops.decide.placement.choice import (
+    MOST_TRIED,
+    Choice,
+    Chosen,
+    joined,
+    on_node,
+    requirement_of,
+    shares,
+)
+from demandops.decide.planning.flows import Flow, flows
+from demandops.decide.planning.implied_connections import connection_for
+from demandops.decide.planning.overrides import suspended_by, with_overridden_nodes
+from demandops.decide.planning.release_keys import affected_keys
+from demandops.model.config.appdef import Service
+from demandops.model.demand.application import Application, InputTopic, Requirement
+from demandops.model.demand.claim import Claim, ClaimKey, requesters_of
+from demandops.model.demand.demand_request import Demanded, Put
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
+
+# Returns the given application on its new nodes.
+Move = Callable[[Application], Application]
+
+
+def with_moved(
+    world: World, claims: Iterable[Claim], move: Move
+) -> tuple[World, tuple[ClaimChange, ...]]:
+    """Return the world with the applications of ``claims`` moved, and the changes of claims.
+
+    The connections of the demands that hold these claims follow the applications.
+    """
+    ledger, keys, claims = world.ledger, list[ClaimKey](), tuple(claims)
+    for claim in claims:
+        ledger = ledger.replace(claim.key, replace(claim, held=move(claim.application)))
+        keys.append(claim.key)
+    for claim in claims:
+        # A goal of the reference's action lists its connections itself, and its clients shut down
+        # what they listed. So a move does not change these connections.
+        if not claim.joined:
+            ledger, touched = _followed(replace(world, ledger=ledger), claim, move)
+            keys += touched
+    return replace(world, ledger=ledger), claim_changes(world.ledger, ledger, keys)
+
+
+def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[ClaimKey]]:
+    """Return the ledger in which the connections of a demand follow, and the changed keys.
+
+    ``claim`` is the demand's claim on the application before the move.
+    """
+    config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
+    app = claim.application
+    old, new = (flows(config, each) for each in (app, move(app)))
+    before, after = ({_path(flow) for flow in each} for each in (old, new))
+    needed = list(new)
+    for other in ledger.claims_of_demand(claim.demand):
+        if other.is_on_application and other.subject != claim.subject:
+            needed += flows(config, other.application)
+    still = {(flow.sender, flow.receiver, flow.target) for flow in needed}
+    carried: dict[tuple[str, str], Connection] = {}
+    # If the application needed connections before and its demand held none of them, the demand
+    # did without, for example by ``connect: none``. Then a move adds none.
+    derives = not old or any(True for flow in old for _ in _carrying(ledger, claim.demand, flow))
+    for flow in old:
+        if _path(flow) in after:
+            continue
+        for held, route in _carrying(ledger, claim.demand, flow):
+            carried[flow.topic, flow.target] = replace(held.connection, topics=(route,))
+            if (flow.sender, flow.receiver, flow.target) not in still:
+                remaining = held.connection.without_topics({(route.source,)})
+                reduced = replace(held, held=remaining) if remaining else None
+                ledger = ledger.replace(held.key, reduced)
+                keys.append(held.key)
+    for flow in new:
+        if _path(flow) not in before and derives:
+            carrier = carried.get((flow.topic, flow.target))
+            booked = _carried_by(flow, carrier, claim, replace(world, ledger=ledger))
+            ledger = ledger.replace(booked.key, booked)
+            keys.append(booked.key)
+    return ledger, keys
+
+
+def _path(flow: Flow) -> tuple[str, str, str, str]:
+    return flow.topic, flow.sender, flow.receiver, flow.target
+
+
+def renaming(world: World, claim: Claim) -> Iterator[tuple[Flow, Route]]:
+    """Yield (flow, route) for each input whose topic is renamed by a connection of the demand.
+
+    The flow brings the input to the application, and the route renames the topic on the way.
+    """
+    for flow in flows(world.config, claim.application):
+        for _, route in _carrying(world.ledger, claim.demand, flow):
+            if flow.delivery is None and route.read_topic != route.written_topic:
+                yield flow, route
+
+
+def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
+    """Yield (the demand's claim, route) for each connection of a demand that carries a flow."""
+    for id in ledger.connections_bringing(flow.receiver, flow.target):
+        claim = ledger.get(ClaimKey(Subject(SubjectKind.CONNECTION, id), demand))
+        if claim is not None:
+            for route in claim.connection.topics:
+                ends = route.sender_and_receiver(*claim.connection.nodes)
+                if (*ends, route.written_topic) == (flow.sender, flow.receiver, flow.target):
+                    yield claim, route
+
+
+def _carried_by(flow: Flow, carrier: Connection | None, claim: Claim, world: World) -> Claim:
+    """Return a demand's new or extended claim on the connection that carries a flow from now on.
+
+    ``carrier`` is the connection that carried the topic before the move, or ``None``. If no claim
+    brings the topic to the receiver yet, the connection gets its type and options.
+    """
+    route = carrier.topics[0] if carrier else None
+    flow = replace(flow, topic=route.read_topic) if route else flow
+    connection = connection_for(flow, carrier.known_type.word if carrier else "auto", world.ledger)
+    if route and not world.ledger.is_carried_to(flow.receiver, flow.target):
+        route = replace(route, source=flow.topic, target=flow.target, reverse=False)
+        connection = replace(connection, topics=(route,))
+    put = Put("", (Demanded(connection, claim.requesters, str),))
+    (item,) = admission.with_chosen_types(put, world.config, world.ledger.connection).demanded
+    booked = replace(claim, held=item.held.booked(), partial={})
+    current = world.ledger.get(booked.key)
+    if current is None:
+        return booked
+    return replace(current, held=current.connection.extended(booked.connection).booked())
+
+
+# ---- relocation: applications and services leave a drained node, and overrides move services ----
+#
+# Claims and definitions contain what is required of a node, so the original demands are not needed.
+# The connections of a moved application follow (:mod:`.relocation`).
+
+
+def with_moves(
+    request: Drain, world: World, usage: Usage, names: Names, most: float = inf
+) -> Drain:
+    """Return ``request`` with the moves of all applications and services that can leave the node.
+
+    After ``most`` tried nodes, the other applications are left for another drain.
+    """
+    start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
+    room, tried, last = Room(world, usage), 0, request.after
+    for id in applications_of(world.ledger, request.id):
+        if id <= request.after:
+            continue
+        if tried >= most:
+            break
+        last = id
+        for service in _placed_at(request.id, id, world):
+            ids = _moving_with(id, service, request.id, world)
+            claims = tuple(claim for each in ids for claim in world.ledger.application_claims(each))
+            what = [f"application '{each}'" for each in ids]
+            what = [f"service '{service.name}' of {each}" for each in what] if service else what
+            fixed = (_why_fixed(claim, request.id, service) for claim in claims)
+            outcome: _Moved | str = next(filter(None, fixed), "")
+            tried += 1
+            if not outcome:
+                outcome, count = _moved(world, claims, room, names, service)
+                tried += count
+            # What cannot move holds up nothing else.
+            if isinstance(outcome, str):
+                stays.append(f"{what[0]} stays, because {outcome}")
+                continue
+            world, chosen, touched, names = outcome
+            # ``world`` has the application on its new node, so ``room`` must count it on this node
+            for each in ids:
+                room.book(world.ledger.application_claims(each))
+            keys += touched
+            moved += [f"{each} is placed on {quoted(chosen.node)}, {chosen.why}" for each in what]
+    else:
+        last = ""
+    moves = claim_changes(start.ledger, world.ledger, keys)
+    return replace(request, moves=moves, moved=tuple(moved), stays=tuple(stays), last=last)
+
+
+# The world after a move, the chosen node, the keys of the changed claims, and the names after it.
+_Moved = tuple[World, Chosen, list[ClaimKey], Names]
+
+
+def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
+    """Return the services of an application on ``node``, and ``None`` first for itself."""
+    app = world.ledger.application(id)
+    if app is None:
+        return []
+    definitions = world.config.services.get(app.appdef, {})
+    names = sorted(name for name, at in app.services.items() if at == node and name in definitions)
+    return [*([None] if app.node == node else []), *(definitions[name] for name in names)]
+
+
+def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
+    """Return the ids of the applications that must move together with ``id``, including ``id``."""
+    app = world.ledger.application(id)
+    if service is None or service.scope != "topic" or app is None:
+        return [id]
+    # They share the instances of the service on the node. If only some moved, the application's
+    # node would get the same outputs from two nodes.
+    others = {each: world.ledger.application(each) for each in applications_of(world.ledger, node)}
+    return [
+        each
+        for each, other in others.items()
+        if other and other.services.get(service.name) == node and shares(service, app, other)
+    ]
+
+
+def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
+    """Return why a claim's application or service must stay on its node, or an empty text."""
+    app = claim.application
+    if service is not None:
+        return f"demand '{claim.demand}' names the node" if service.name in app.named else ""
+    if claim.keeping_override:
+        return f"the override '{claim.keeping_override}' keeps it"
+    if app.place is None:  # a claim has this only if the generator chose the node
+        return f"demand '{claim.demand}' names the node"
+    here = [name for name in app.named if name not in app.services]
+    return f"demand '{claim.demand}' names the node of {joined(here)}" if here else ""
+
+
+def applications_of(ledger: Ledger, node: str) -> list[str]:
+    """Return the ids of the applications on a node, or with a service placed on it, sorted."""
+    if not ledger.applications_on.get(node):
+        return []
+    apps = ((id, ledger.application(id)) for id in ledger.applications_at(node))
+    return [id for id, app in apps if app and node in app.chosen_nodes]
+
+
+def _moved(
+    world: World, claims: tuple[Claim, ...], room: Room, names: Names, service: Service | None
+) -> tuple[_Moved | str, int]:
+    """Return the move of an application, or only of its ``service``, to the best other node.
+
+    If no move is possible, the result is the reason as a text. The second value is how many nodes
+    were tried.
+    """
+    places = (claim.application.place or Requirement() for claim in claims)
+    required = requirement_of(service) if service else reduce(Requirement.united, places)
+    inputs: dict[str, dict[InputTopic, None]] = {}
+    for claim in claims:
+        for role, topics in claim.application.inputs.items():
+            inputs.setdefault(role, {}).update(dict.fromkeys(topics))
+    united = {role: tuple(topics) for role, topics in inputs.items()}
+    app = claims[0].application.with_inputs(united)
+    demanded = Demanded(app, requesters_of(claims), str)
+    choice = Choice(demanded, required, world, room, claims, service)
+    reasons: list[str] = []
+    # On the sender's own node, no connection would rename the topic.
+    renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
+    for chosen in islice(choice.candidates(), MOST_TRIED):
+        if route := renamed.get(chosen.node):
+            problem = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
+            reasons.append(f"on {quoted(chosen.node)} {problem}")
+            continue
+        move = partial(on_node, node=chosen.node, service=service, world=world)
+        after, changes = with_moved(world, claims, move)
+        moved_names = collisions.followed(names, world, after, affected_keys(world, after, changes))
+        fault = next(_faults(world, after, changes, moved_names), None)
+        if fault is None:
+            keys = [change.key for change in changes]
+            return (after, chosen, keys, moved_names), len(reasons) + 1
+        reasons.append(f"on {quoted(chosen.node)} {fault.message}")
+    return sentences(reasons) or choice.none_fits().message, len(reasons)
+
+
+@dataclass(frozen=True, slots=True)
+class LedgerAfterMoves:
+    ledger: Ledger
+    # those of the claims that may have changed
+    keys: tuple[ClaimKey, ...]
+    # (file, message) for each override that cannot move a service of an application
+    stays: tuple[tuple[str, str], ...]
+
+
+def following_overrides(
+    world: World, subjects: Iterable[Subject] | None = None
+) -> LedgerAfterMoves:
+    """Return the ledger after services have moved to the nodes that overrides name.
+
+    The connections follow the services. A service also moves back when no override moves it any
+    longer. A service stays if the move would cause a fault. ``subjects`` are the subjects whose
+    claims changed; ``None`` means all applications.
+    """
+    ids = [subject.id for subject in subjects or () if subject.kind is SubjectKind.APPLICATION]
+    if subjects is None:
+        ids = [*world.ledger.moved_applications()]
+        if any(override.node for override in world.overrides):
+            ids = sorted(world.ledger.subjects(SubjectKind.APPLICATION))
+    change = partial(with_overridden_nodes, world=world)
+    moving = [
+        id
+        for id in dict.fromkeys(ids)
+        for app in [world.ledger.application(id)]
+        if app is not None and change(app) != app
+    ]
+    together, alone = moving, list[str]()
+    names = collisions.all_names(world) if moving else collisions.NONE
+    while together:  # applications that share a service must move at the same time
+        after, changes, moved_names = _all_moved(world, together, change, names)
+        faulty = [
+            id for id, own in changes.items() if next(_faults(world, after, own, moved_names), None)
+        ]
+        if not faulty:
+            break
+        together, alone = [id for id in together if id not in faulty], [*alone, *faulty]
+    keys, stays = list[ClaimKey](), list[tuple[str, str]]()
+    # A fault of one application may have come from another that did not move in the end. So each
+    # that caused a fault is tried again, alone, after the others have moved.
+    for ids in filter(None, (together, *([id] for id in alone))):
+        after, changes, moved_names = _all_moved(world, ids, change, names)
+        faults = (
+            fault for own in changes.values() for fault in _faults(world, after, own, moved_names)
+        )
+        fault = None if ids is together else next(faults, None)
+        if fault is None:
+            world, names = after, moved_names
+            keys += [each.key for own in changes.values() for each in own]
+        else:
+            stays += _unmoved(ids[0], world, fault)
+    return LedgerAfterMoves(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
+
+
+def with_restored_moves(request: Restoration, world: World) -> Restoration:
+    """Return the restoration with its claims adapted to the overrides that move services now.
+
+    A service whose move would cause a fault among these claims is not adapted.
+    """
+    if not any(override.node for override in world.overrides) and not any(
+        claim.is_on_application and claim.application.moved for claim in request.claims
+    ):
+        return request
+    ledger = Ledger(ended=world.ledger.ended)
+    for claim in request.claims:
+        ledger = ledger.replace(claim.key, claim)
+    return replace(request, claims=tuple(following_overrides(replace(world, ledger=ledger)).ledger))
+
+
+def _all_moved(
+    before: World, applications: Iterable[str], move: Move, names: Names
+) -> tuple[World, dict[str, tuple[ClaimChange, ...]], Names]:
+    world, changes = before, dict[str, tuple[ClaimChange, ...]]()
+    for id in applications:
+        world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
+    keys = affected_keys(before, world, [each for own in changes.values() for each in own])
+    return world, changes, collisions.followed(names, before, world, keys)
+
+
+def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
+    app = world.ledger.application(id)
+    assert app is not None  # noqa: S101 - it is claimed
+    moved = with_overridden_nodes(app, world).moved
+    changed = {name for name in {*moved, *app.moved} if moved.get(name) != app.moved.get(name)}
+    nodes = {moved[name] for name in changed if name in moved}
+    for override in world.overrides:
+        if override.node in nodes:
+            services = " and ".join(sorted(n for n in changed if moved.get(n) == override.node))
+            yield (
+                override.path,
+                f"does not move {services} of application '{app.id}' to '{override.node}': "
+                f"{fault.message}",
+            )
+
+
+def _faults(
+    before: World, after: World, changes: tuple[ClaimChange, ...], names: Names
+) -> Iterator[Fault]:
+    """Yield the faults of moved claims; each claim is checked as if it were demanded now.
+
+    ``names`` are those of all releases in ``after``.
+    """
+    for change in changes:
+        claim = change.after
+        if claim is None:
+            continue
+        request, others = request_for(claim), after.ledger.replace(claim.key, None)
+        yield from admission.faults(request, after.config)
+        yield from permission.faults(request, after.config)
+        yield from conflicts(request.demanded[0], others)
+        override = suspended_by(claim, after)
+        if override and change.before and not suspended_by(change.before, before):
+            yield Fault("denied", "", f"{claim.subject} would be denied by {override.path}")
+    yield from quotas.quota_faults(before, after, Changes(changes))
+    for change in changes:
+        if change.after:
+            yield from collisions.faults_of_claim(change.after, before, after)
+            yield from _brought_twice(change.after, after)
+    keys = affected_keys(before, after, changes)
+    yield from collisions.name_faults(Drain(""), before, after, keys, Changes(changes), names)
+
+
+def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
+    """Yield a fault for each topic that two connections bring to a node from different senders."""
+    if claim.is_on_application:
+        return
+    ledger = after.ledger
+    inputs = {
+        (topic.source, topic.topic)
+        for held in ledger.claims_of_demand(claim.demand)
+        if held.is_on_application
+        for _, topic in held.application.all_inputs()
+    }
+    for route in claim.connection.topics:
+        sender, receiver = route.sender_and_receiver(*claim.connection.nodes)
+        # Of an input that the demand lists, the demand names the source.
+        if (sender, route.read_topic) in inputs:
+            continue
+        target = (receiver, route.written_topic)
+        senders = {
+            from_node
+            for connection in map(ledger.connection, ledger.connections_bringing(*target))
+            if connection is not None
+            for other in connection.topics
+            for from_node, to_node in [other.sender_and_receiver(*connection.nodes)]
+            if (to_node, other.written_topic) == target
+        }
+        for other_sender in senders - {sender}:
+            topic = quoted(route.written_topic)
+            words = f"{topic} would come from {quoted(sender)} and from {quoted(other_sender)}"
+            yield Fault("conflict", "", words)

@@ -1,0 +1,1 @@
+"""The releases that claims and overrides ask for."""

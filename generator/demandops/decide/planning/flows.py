@@ -1,0 +1,321 @@
+"""The topics that services publish, named as the reference names them.
+
+``{instance}`` in an output pattern stands for the application or the node for which a service runs.
+For a service with ``each``, ``{instance}`` stands for the source of the input. A source has one
+usual topic for an input role: the topic in the source's inventory entry or, if there is none, the
+first topic that a demand booked. Any other topic is a further topic of the source. A name that is
+made from a further topic contains the source and this topic. If the inventory names no usual topic,
+the claims record which topics are further topics. So a name stays the same while anybody demands
+the topic and nobody changes the usual topic in the inventory. The reference's programs subscribe to
+outputs by name: with other names, they would hear nothing, without an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import NamedTuple
+
+from demandops.base import naming
+from demandops.base.naming import TopicKey
+from demandops.model.config.appdef import Service
+from demandops.model.config.config import Config
+from demandops.model.demand.application import Application, InputTopic
+from demandops.model.demand.demand_request import AnyRequest, Put
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.release import ServiceKey
+
+
+def outputs(
+    config: Config, service: Service, key: ServiceKey, *, further: bool = False
+) -> dict[str, str]:
+    """Return the topics that a service instance publishes, by the name of the output.
+
+    ``further`` is true if the instance runs for a further topic of a source. It is ignored if the
+    inventory names the usual topic.
+    """
+    if service.root is None:
+        instance = naming.topic_part(key.application or key.node)
+    else:
+        topic = InputTopic(str(key.topic), str(key.source), further=further)
+        text = distinguishing_text(config, service.root, topic, key.version)
+        instance = naming.topic_part(topic.source, text)
+    return {
+        name: topic_name(pattern, instance) for name, pattern in sorted(service.outputs.items())
+    }
+
+
+def distinguishing_text(config: Config, role: str, topic: InputTopic, version: str) -> str:
+    """Return the text that makes topic names differ although their source is the same.
+
+    It contains ``topic`` if this is a further topic of its source, and ``version``.
+    """
+    usual = usual_topic(config, topic.source, role)
+    further = topic.further if usual is None else topic.topic != usual
+    return topic.distinguishing_text(further, version)
+
+
+# A fusion reads hundreds of such topics, and each demand plans the fusion again.
+@lru_cache(maxsize=65_536)
+def published_topic(pattern: str, source: str, distinguishing: str) -> InputTopic:
+    return InputTopic(topic_name(pattern, naming.topic_part(source, distinguishing)), source)
+
+
+def topic_name(pattern: str, instance: str) -> str:
+    return pattern.replace("{instance}", instance)
+
+
+def usual_topic(config: Config, source: str, role: str) -> str | None:
+    """Return the usual topic of a source that the inventory names for ``role``, or ``None``."""
+    node = config.nodes.get(source)
+    return node.topics.get(role) if node else None
+
+
+def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
+    """Return the request in which ``further`` says for each input whether it is a further topic.
+
+    Only inputs that may have a service instance of their own are marked.
+    """
+    if not request.adds_claims:
+        return request
+    # The claims of the put's own demand do not count, because the put may release their topics.
+    own = request.demand if isinstance(request, Put) else None
+    first: dict[tuple[str, str], str] = {}
+
+    def is_further(role: str, topic: InputTopic) -> bool:
+        usual = usual_topic(config, topic.source, role)
+        if usual is None:
+            booked = ledger.booked_input(role, topic.source, topic.topic)
+            if booked is not None:
+                return booked.further
+            place = (role, topic.source)
+            if place not in first and ledger.has_usual_topic(*place, except_demand=own):
+                return True
+            usual = first.setdefault(place, topic.topic)
+        return topic.topic != usual
+
+    apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
+    # A usual topic that is booked stays the usual one, even if the request lists it after others.
+    for role, topic in (each for app in apps for each in _per_topic(app, config)):
+        booked = ledger.booked_input(role, topic.source, topic.topic)
+        if booked is not None and not booked.further:
+            first.setdefault((role, topic.source), topic.topic)
+    demanded = (
+        replace(item, held=_marked(item.held, config, is_further))
+        if isinstance(item.held, Application)
+        else item
+        for item in request.demanded
+    )
+    return replace(request, demanded=tuple(demanded))
+
+
+def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
+    """Return the ledger with ``further`` set in claims that were read from an earlier format.
+
+    In this format, the files of claims do not say which topics are further topics.
+    """
+    first: dict[tuple[str, str], str] = {}
+
+    def is_further(role: str, topic: InputTopic) -> bool:
+        usual = usual_topic(config, topic.source, role) or topic.topic
+        return first.setdefault((role, topic.source), usual) != topic.topic
+
+    claims = [claim for claim in ledger if claim.is_on_application]
+    for claim in sorted(claims, key=lambda claim: (claim.booked, claim.subject.id, claim.demand)):
+        held = _marked(claim.application, config, is_further)
+        ledger = ledger.replace(claim.key, replace(claim, held=held))
+    return ledger
+
+
+def _per_topic(app: Application, config: Config) -> Iterator[tuple[str, InputTopic]]:
+    """Yield (role, topic) for each input that may have a service instance of its own."""
+    for role in config.roles_with_services:
+        for topic in app.inputs.get(role, ()):
+            yield role, topic
+
+
+def _marked(
+    app: Application, config: Config, is_further: Callable[[str, InputTopic], bool]
+) -> Application:
+    marked: dict[str, list[InputTopic]] = {}
+    for role, topic in _per_topic(app, config):
+        further = is_further(role, topic)
+        marked.setdefault(role, []).append(topic._replace(further=further))
+    return app.with_inputs(
+        {**app.inputs, **{role: tuple(topics) for role, topics in marked.items()}}
+    )
+
+
+# ---- flows ----
+#
+# The flow of topics through an application: which topics services read, and where they come from.
+#
+# The flows of a demand follow from its own applications and the configuration, never from other
+# demands. So the connections that a demand needs are claimed by it and end with it.
+
+
+class PublishedTopic(NamedTuple):
+    """A topic of an application, and the node that publishes the topic.
+
+    ``root`` is the key of the demanded input from which ``topic`` comes: ``topic`` itself, or the
+    input from which services make ``topic``. It is empty if a service makes ``topic`` from all its
+    inputs together.
+    """
+
+    topic: InputTopic
+    node: str
+    root: TopicKey = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """A topic that is made on one node and needed on another node.
+
+    ``name`` is an input role of the application, or ``<service>.<output>``. ``target`` is the
+    topic's name at the receiver. ``root`` is the key of the demanded topic because of which the
+    flow is needed; it is empty for a delivery, and if no single topic needs the flow. ``delivery``
+    is the position in ``deliver`` of the delivery that needs the flow. ``type`` is the message
+    type; it is empty unless the demand names the type.
+    """
+
+    name: str
+    topic: str
+    sender: str
+    receiver: str
+    target: str
+    root: TopicKey = ()
+    delivery: int | None = None
+    type: str = ""
+
+    @property
+    def is_output(self) -> bool:
+        """Whether a service makes the topic; if not, the demand lists it as an input."""
+        return "." in self.name
+
+
+def node_of(app: Application, service: Service, source: str) -> str:
+    """Return the node where a service of an application runs for inputs from ``source``.
+
+    The result is empty if no node is chosen for the service yet, or if the service runs once for
+    each cluster and has no node in the application's cluster.
+    """
+    if service.nodes:
+        return service.runs_at.get(app.node, "")
+    if service.at_source:
+        return source
+    # An override moves a service without changing the chosen node, so that the service comes back
+    # to this node when the override ends.
+    return app.moved.get(service.name) or app.chosen_node(service.name)
+
+
+def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
+    """Yield the keys of the instances that an application needs; a node may be empty yet."""
+    if service.scope == "application":
+        yield ServiceKey(service.name, node_of(app, service, ""), application=app.id)
+    elif service.root is not None:
+        for topic in app.inputs.get(service.root, ()):
+            node = node_of(app, service, topic.source)
+            version = version_of_instance(app, service)
+            yield ServiceKey(service.name, node, None, topic.source, topic.topic, version)
+    else:
+        for node, _ in _parts(app, service):
+            if node:
+                yield ServiceKey(service.name, node, for_cluster=service.scope == "cluster")
+
+
+def version_of_instance(app: Application, service: Service) -> str:
+    """Return the ``version`` in the keys of a service's instances.
+
+    It is the version of the application if this is a separate instance, and empty otherwise.
+    """
+    # A shared service runs once for all versions: two drivers of one sensor do not work.
+    return "" if service.shared else app.own_version
+
+
+def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicKey]:
+    if service.root is not None:
+        topics = app.inputs_from(service.root, str(key.source), str(key.topic))
+        return [(service.root, topic.topic, topic.source) for topic in topics]
+    return [
+        (role, topic.topic, topic.source)
+        for role in service.roots
+        for topic in app.inputs.get(role, ())
+        if topic.source == key.node
+    ]
+
+
+def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[PublishedTopic]:
+    """Yield the topics of an application that ``origin`` names.
+
+    ``origin`` is an input role of the application, or ``<service>.<output>`` of its definition.
+    """
+    name, _, output = origin.partition(".")
+    if not output:
+        for topic in app.inputs.get(origin, ()):
+            yield PublishedTopic(topic, topic.source, (origin, topic.topic, topic.source))
+        return
+    producer = config.services[app.appdef][name]
+    pattern = producer.outputs[output]
+    if not producer.roots:
+        node = node_of(app, producer, "")
+        instance = naming.topic_part(app.id if producer.scope == "application" else node)
+        yield PublishedTopic(InputTopic(topic_name(pattern, instance), node), node)
+        return
+    version = version_of_instance(app, producer)
+    for role in producer.roots:
+        for topic in app.inputs.get(role, ()):
+            text = distinguishing_text(config, role, topic, version) if producer.root else ""
+            node = topic.source if producer.at_source else node_of(app, producer, topic.source)
+            yield PublishedTopic(
+                published_topic(pattern, topic.source, text),
+                node,
+                (role, topic.topic, topic.source),
+            )
+
+
+def flows(config: Config, app: Application) -> list[Flow]:
+    """Return the flows that an application needs between nodes, sorted by ``name``.
+
+    The result is empty if the application definition is missing. A node that is not chosen yet is
+    an empty text.
+    """
+    services = config.services.get(app.appdef, {})
+    # Several services of one node may read a topic, but it must come to the node only once.
+    needed: dict[tuple[str, str, str, str], Flow] = {}
+    for service in services.values():
+        for node, part in _parts(app, service):
+            for origin in service.inputs.values():
+                for topic, sender, root in topics_of_origin(config, part, origin):
+                    if sender != node:
+                        cause = root or (next(part.topic_keys()) if service.roots else ())
+                        name = topic.topic
+                        flow = Flow(origin, name, sender, node, name, cause, type=topic.type)
+                        needed.setdefault((name, sender, node, name), flow)
+    for index, delivery in enumerate(app.deliver):
+        producer, _, output = delivery.output.partition(".")
+        if producer not in services or output not in services[producer].outputs:
+            continue  # admission reports an unknown output
+        for topic, sender, _ in topics_of_origin(config, app, delivery.output):
+            name, target = topic.topic, delivery.topic or topic.topic
+            if (sender, name) != (delivery.node, target):
+                flow = Flow(delivery.output, name, sender, delivery.node, target, delivery=index)
+                needed.setdefault((name, sender, delivery.node, target), flow)
+    return sorted(needed.values(), key=lambda flow: flow.name)
+
+
+def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
+    """Yield (node, application with only the inputs of this instance) for each instance."""
+    if service.root is not None:
+        for topic in app.inputs.get(service.root, ()):
+            yield node_of(app, service, topic.source), app.with_inputs({service.root: (topic,)})
+    elif service.at_source:
+        by_source: dict[str, dict[str, list[InputTopic]]] = {}
+        for role in service.roots:
+            for topic in app.inputs.get(role, ()):
+                by_source.setdefault(topic.source, {}).setdefault(role, []).append(topic)
+        for source, inputs in sorted(by_source.items()):
+            part = {role: tuple(topics) for role, topics in inputs.items()}
+            yield node_of(app, service, source), app.with_inputs(part)
+    else:
+        yield node_of(app, service, ""), app

@@ -1,0 +1,365 @@
+"""The planner: :func:`plan` returns the release that claims need at a key.
+
+The keys come from :mod:`.release_keys`. A release follows from the ledger and the
+configuration alone, so every generator and every replay of a commit plans the same.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
+from datetime import datetime
+from types import MappingProxyType
+from typing import TypeGuard
+
+from demandops.base import naming, strict_yaml
+from demandops.base.errors import Refused
+from demandops.base.naming import TopicKey
+from demandops.connections import connection as routes
+from demandops.connections.connection import Connection, Route
+from demandops.connections.connection_type import ConnectionType
+from demandops.connections.connection_types import route_faults
+from demandops.decide.planning import overrides
+from demandops.decide.planning.flows import outputs, roots_of, topics_of_origin, usual_topic
+from demandops.decide.planning.overrides import without_suspended
+from demandops.decide.planning.release_keys import (
+    ReleaseKey,
+    claims_needing,
+    services_of,
+    version_of_service,
+)
+from demandops.model.config.appdef import Parameter, Service
+from demandops.model.config.config import Config
+from demandops.model.config.override import Override
+from demandops.model.demand.application import Application, InputTopic
+from demandops.model.demand.claim import Claim, requesters_of
+from demandops.model.ledger.ledger import Ledger, World
+from demandops.model.ledger.records import Instance, Steps, extended
+from demandops.model.release import Release, ServiceKey, ServiceRelease, replicas_of, with_kept
+
+
+def plan(world: World, key: ReleaseKey) -> Release | None:
+    """Return the release at ``key`` with the effects of overrides.
+
+    Return ``None`` if no claim needs the release, or if an override denies it.
+
+    Raises:
+        Refused: if claims contradict each other in a parameter; if the value of a parameter cannot
+            be used; if application definitions that share a service pin different images of one
+            chart version; or if the configuration no longer has what a claim needs.
+    """
+    world = without_suspended(world)
+    release = _unshaped(world, key)
+    return overrides.apply_overrides(release, world) if release else None
+
+
+def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
+    """Return a service as demands need it: without kept replicas, and without overrides."""
+    world = without_suspended(world)
+    kept = world.ledger.kept.replace(key.instance, ())
+    return _service(replace(world, ledger=replace(world.ledger, kept=kept)), key)
+
+
+def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
+    """Return the release at ``key`` and the override that denies it, or ``None``."""
+    world = without_suspended(world)
+    release = _unshaped(world, key)
+    override = overrides.service_denied_by(release, world) if release else None
+    return (release, override) if release and override else None
+
+
+def _unshaped(world: World, key: ReleaseKey) -> Release | None:
+    if isinstance(key, ServiceKey):
+        return _service(world, key)
+    return key.type.client(key, _ClaimedConnections(world, key.type), world.config)
+
+
+def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
+    config, claims = world.config, claims_needing(world, key)
+    if not claims:
+        return None
+    apps = [claim.application for claim in claims]
+    service = services_of(config, _as_claimed(world, apps[0]).appdef)[key.service]
+    node, domain = config.node_and_domain(key.node)
+    parts = list(_parts(world, service, key, apps))
+    inputs: dict[str, tuple[InputTopic, ...]] = {}
+    for role in sorted(service.inputs):
+        read = {
+            published.topic
+            for part in parts
+            for published in topics_of_origin(config, part, _origin(config, key, role, part))
+        }
+        # Only some demands name the message type of a topic. An entry without the type sorts first,
+        # so the entry with the type replaces it here.
+        inputs[role] = tuple({topic[:2]: topic for topic in sorted(read)}.values())
+    # If claims have several values of a parameter, the definition says how they are merged.
+    parameters: dict[str, object] = {}
+    for name, parameter in sorted(service.parameters.items()):
+        giving = [claim for claim in claims if name in claim.application.parameters]
+        parameters[name] = _merged_value(name, parameter, giving) if giving else parameter.default
+    requesters = requesters_of(claims)
+    if service.roots:
+        # A claim may hold many topics, and each topic has holders of its own. Only the holders of
+        # the topics for which this instance runs are its requesters.
+        holders = (
+            claim.holders(topic)
+            for claim in claims
+            for topic in roots_of(claim.application, service, key)
+        )
+        requesters = tuple(sorted({who for names in holders for who in names}))
+    further = service.root is not None and parts[0].inputs[service.root][0].further
+    applications = tuple(dict.fromkeys(app.id for app in apps))
+    version = version_of_service(world, service, applications)
+    topics = [topic for role_topics in inputs.values() for topic in role_topics]
+    needed = replicas_of(service.scaling, parameters, topics, claims, requesters)
+    kept = world.ledger.kept.steps.get(key.instance)
+    replicas, keeps = with_kept(needed, service.scaling, kept or ())
+    return ServiceRelease(
+        key=key,
+        name=service_name(config, service, key),
+        node=node,
+        domain=domain,
+        service=service,
+        version=version,
+        chart=version.charts[service.chart],
+        inputs=MappingProxyType(inputs),
+        outputs=MappingProxyType(outputs(config, service, key, further=further)),
+        parameters=MappingProxyType(parameters),
+        replicas=replicas,
+        keeps=keeps,
+        applications=applications,
+        requesters=requesters,
+    )
+
+
+def _as_claimed(world: World, app: Application) -> Application:
+    # Claims on one application may differ if a person wrote one of them. Its first claim decides
+    # the appdef and the nodes, for all of them alike.
+    return world.ledger.application(app.id) or app
+
+
+def _parts(
+    world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
+) -> Iterator[Application]:
+    """Yield each application with only those inputs that the instance at ``key`` depends on.
+
+    Several claims on one application give one application with the inputs of all these claims.
+    """
+    claimed: dict[str, list[Application]] = {}
+    for app in apps:
+        claimed.setdefault(app.id, []).append(app)
+    shared: dict[str, tuple[InputTopic, ...]] = {}
+    if service.root is not None:
+        source, name = str(key.source), str(key.topic)
+        topics = [topic for app in apps for topic in app.inputs_from(service.root, source, name)]
+        type = min((topic.type for topic in topics if topic.type), default="")
+        further = all(topic.further for topic in topics)
+        shared = {service.root: (InputTopic(name, source, type, further),)}
+    for same in claimed.values():
+        first = _as_claimed(world, same[0])
+        if shared:
+            yield first.with_inputs(shared)
+            if len(service.inputs) == 1:
+                return  # all applications give the instance this one topic, so one is enough
+            continue
+        roles = service.roots or {role for app in same for role in app.inputs}
+        inputs = {
+            role: {topic for app in same for topic in app.inputs.get(role, ())} for role in roles
+        }
+        if service.roots:
+            inputs = {
+                role: {topic for topic in topics if topic.source == key.node}
+                for role, topics in inputs.items()
+            }
+        yield first.with_inputs({role: tuple(topics) for role, topics in inputs.items()})
+
+
+def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str:
+    return services_of(config, app.appdef)[key.service].inputs[role]
+
+
+def demanded_inputs(
+    world: World, release: ServiceRelease, app: Application
+) -> Iterator[tuple[str, str, TopicKey]]:
+    """Yield (role, topic, root) for each topic that a service reads because of an application.
+
+    ``role`` is the service's input that reads the topic. ``root`` is the key of the demanded topic
+    from which this topic comes, or empty (:class:`.flows.PublishedTopic`).
+    """
+    service, key = release.service, release.key
+    app = _as_claimed(world, app).with_inputs(app.inputs)
+    if service.roots:
+        roots = {*roots_of(app, service, key)}
+        inputs = {
+            role: tuple(each for each in topics if (role, each.topic, each.source) in roots)
+            for role, topics in app.inputs.items()
+        }
+        app = app.with_inputs(inputs)
+    for role in service.inputs:
+        origin = _origin(world.config, key, role, app)
+        for published in topics_of_origin(world.config, app, origin):
+            yield role, published.topic.topic, published.root
+
+
+def service_name(config: Config, service: Service, key: ServiceKey) -> str:
+    """Return the release name of a service instance, such as ``od-edge-vehicle00``.
+
+    If the instance runs for a topic, the name contains the node and the topic's source. The name
+    also contains a slug of the topic, unless ``topics`` in the source's inventory entry lists the
+    topic as the usual one. For a separate instance, the name also contains the version.
+    """
+    if service.root is None:
+        return naming.object_name(service.prefix, key.application or key.node)
+    source, topic = str(key.source), str(key.topic)
+    further = [] if topic == usual_topic(config, source, service.root) else [topic]
+    version = [key.version] if key.version else []
+    return naming.object_name(service.prefix, key.node, source, *further, *version)
+
+
+def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> object:
+    values = [claim.application.parameters[name] for claim in claims]
+    if parameter.merge == "latest":
+        latest = max(claims, key=lambda claim: (claim.booked, claim.demand))
+        return latest.application.parameters[name]
+    if parameter.merge == "union":
+        items = [
+            item for value in values for item in (value if isinstance(value, list) else [value])
+        ]
+        # The items may be of any type, and not all types can be compared. As JSON they are sorted
+        # in one order on every machine.
+        unique = {json.dumps(item, sort_keys=True): item for item in items}
+        return [unique[text] for text in sorted(unique)]
+    if parameter.merge in ("max", "min"):
+        numbers = [value for value in values if _is_number(value)]
+        if len(numbers) != len(values):
+            odd, claim = next(
+                (value, claim)
+                for value, claim in zip(values, claims, strict=True)
+                if not _is_number(value)
+            )
+            message = (
+                f"{strict_yaml.short_repr(odd)} for {', '.join(claim.requesters)} is not a number, "
+                f"but the application definition merges the values by {parameter.merge}; give a "
+                "number"
+            )
+            raise Refused.at(f"parameters.{name}", message)
+        return max(numbers) if parameter.merge == "max" else min(numbers)
+    if any(value != values[0] for value in values):
+        first: dict[str, Claim] = {}
+        for claim in claims:
+            first.setdefault(json.dumps(claim.application.parameters[name]), claim)
+        shown = " and ".join(
+            f"{value} for {', '.join(claim.requesters)}" for value, claim in [*first.items()][:3]
+        )
+        message = (
+            f"demands contradict each other: {shown}; demand the same value, or ask that the "
+            "application definition say how to merge the values"
+        )
+        raise Refused.at(f"parameters.{name}", message, code="conflict")
+    return values[0]
+
+
+def _is_number(value: object) -> TypeGuard[int | float]:
+    # In Python a bool is an int, but the maximum of truth values has no meaning for a parameter.
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+@dataclass(frozen=True, slots=True)
+class _ClaimedConnections:
+    world: World
+    type: ConnectionType
+
+    def at(self, node: str) -> Iterable[str]:
+        return self.world.ledger.connections_at(self.type, node)
+
+    def get(self, id: str) -> Connection | None:
+        """Return the connection with an id, or ``None`` if no connection of :attr:`type` has it.
+
+        Raises:
+            Refused: if a person wrote a claim with a route that this type cannot carry, or
+                removed from the inventory what the connection needs.
+        """
+        first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)
+        if first is None or first.type is not self.type:
+            return None
+        topics = tuple(
+            route
+            for route in connection_topics(claims)
+            if not is_bridged(route, *first.nodes, self.world.config)
+        )
+        problems = list(route_faults(self.type, topics, first.nodes, self.world.config))
+        if problems:
+            raise Refused(
+                replace(problem, field="connections", message=f"'{id}': {problem.message}")
+                for problem in problems
+            )
+        brokers = (claim.connection.broker for claim in claims)
+        return replace(first, broker=next(filter(None, brokers), ""), topics=topics)
+
+
+def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
+    """Return one route for each source topic that the claims list, sorted by topic."""
+    return routes.merged_routes(route for claim in claims for route in claim.connection.topics)
+
+
+def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
+    """Return whether the initial deployment already carries a route between two nodes."""
+    sender, receiver = route.sender_and_receiver(source, target)
+    node = config.nodes.get(sender)
+    # The initial deployment keeps topic names, so it carries no route that renames a topic.
+    if node is None or route.source != route.target:
+        return False
+    return route.read_topic in node.bridged.get(receiver, ())
+
+
+# ---- scale down ----
+#
+# When a service gets fewer replicas: at once, or after the time in the service's definition.
+#
+# If the definition has such a time and demands need fewer replicas than before, the decision
+# records how many replicas the service keeps, and until when (:mod:`.records`). When that time is
+# over, the generator publishes a commit that removes these replicas from the record.
+
+
+def with_kept_replicas(
+    before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
+) -> tuple[Ledger, tuple[Instance, ...]]:
+    """Return the updated ledger, and the service instances whose kept replicas changed.
+
+    ``keys`` are the keys of the releases that the demand may change.
+    """
+    kept, changed = after.ledger.kept, list[Instance]()
+    for key in keys:
+        if not isinstance(key, ServiceKey):
+            continue
+        recorded = kept.steps.get(key.instance) or ()
+        if not recorded and key.service not in after.config.services_with_down_after:
+            continue
+        steps = _steps(before, after, key, recorded, now)
+        if steps != recorded:
+            kept = kept.replace(key.instance, steps)
+            changed.append(key.instance)
+    return replace(after.ledger, kept=kept) if changed else after.ledger, tuple(changed)
+
+
+def _steps(before: World, after: World, key: ServiceKey, recorded: Steps, now: datetime) -> Steps:
+    release = without_kept(after, key)
+    kept_for = release.service.scaling.kept_for if release else None
+    if release is None or kept_for is None:
+        return ()  # a service that nobody needs stops at once, as does one without ``downAfter``
+    try:
+        old = without_kept(before, key)
+    except Refused:  # the release before the demand can no longer be planned
+        old = None
+    return extended(recorded, _number(release), _number(old), now, now + kept_for)
+
+
+def _number(release: ServiceRelease | None) -> int:
+    return release.replicas if release and isinstance(release.replicas, int) else 0
+
+
+def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
+    kept = world.ledger.kept
+    steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
+    return replace(world.ledger, kept=kept.replace(instance, steps))

@@ -1,0 +1,97 @@
+"""What a decision about a demand starts from: the world at one commit."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+
+from rpds import HashTrieMap
+
+from demandops.base.errors import Refused
+from demandops.decide.changes import changeset, trial_render
+from demandops.decide.checks import collisions
+from demandops.decide.checks.collisions import Names
+from demandops.decide.placement import capacity
+from demandops.decide.placement.capacity import Usage
+from demandops.decide.planning.release_keys import ReleaseKey, affected_keys
+from demandops.model.ledger.ledger import ClaimChange, Ledger, World
+from demandops.model.release import Release
+from demandops.templating.values import Evaluate
+
+
+@dataclass(frozen=True, slots=True)
+class State(World):
+    """The world at one commit, and what computes the values of services in it."""
+
+    evaluate: Evaluate
+    # The releases that earlier decisions on this configuration planned, so that a decision need not
+    # plan them again to tell what it changes. A copy made with ``replace`` has none; followed_by
+    # carries over those that are still valid.
+    plans: HashTrieMap[ReleaseKey, Release] = field(
+        default_factory=HashTrieMap, init=False, compare=False, repr=False
+    )
+    _usage: Usage | None = field(default=None, init=False, compare=False, repr=False)
+    _names: Names | None = field(default=None, init=False, compare=False, repr=False)
+
+    def usage(self) -> Usage:
+        """Return how much the services request; the first call counts all services."""
+        if self._usage is None:
+            object.__setattr__(self, "_usage", capacity.whole_usage(self))
+        assert self._usage is not None  # noqa: S101 - set above
+        return self._usage
+
+    def names(self) -> Names:
+        """Return the names of all releases; only the first call looks at all releases."""
+        if self._names is None:
+            object.__setattr__(self, "_names", collisions.all_names(self))
+        assert self._names is not None  # noqa: S101 - set above
+        return self._names
+
+    def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
+        """Return the state after a decision, with the releases that the decision planned."""
+        plans = self.plans
+        for key, release in rendered.plans.items():
+            plans = plans.insert(key, release) if release else plans.discard(key)
+        state = replace(self, ledger=ledger)
+        object.__setattr__(state, "plans", plans)
+        object.__setattr__(state, "_usage", usage)
+        state._follow_names(self, rendered.plans.keys())
+        return state
+
+    def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
+        """Return the state with another ledger, whose claims differ by ``changes``."""
+        state, changes = replace(self, ledger=ledger), tuple(changes)
+        with suppress(Refused):  # if a definition is gone; then ``names`` looks at all releases
+            state._follow_names(self, affected_keys(self, state, changes))
+        if self._usage is not None:
+            with suppress(Refused):  # if a definition is gone; then ``usage`` counts all services
+                usage = self._usage.plus(capacity.growth_by(self, state, changes))
+                object.__setattr__(state, "_usage", usage)
+        return state
+
+    def _follow_names(self, before: State, keys: Collection[ReleaseKey]) -> None:
+        """Take over the names of ``before``, from which only the releases at ``keys`` differ."""
+        if before._names is not None:
+            names = collisions.followed(before._names, before, self, keys)
+            object.__setattr__(self, "_names", names)
+
+
+def rendered_files(
+    state: State,
+    current: Mapping[str, str] = MappingProxyType({}),
+    *,
+    keeps_late: bool = False,
+) -> dict[str, str]:
+    """Return every generated file that the state requires, as a map from path to text.
+
+    ``current`` are the current generated files, which ``hold`` overrides and ``keeps_late`` may
+    preserve (:func:`.changeset.render_all`).
+    """
+    return changeset.render_all(state, state.evaluate, current, keeps_late=keeps_late)
+
+
+def try_configuration(state: State) -> None:
+    """Raise Refused or InvalidInput if an appdef or an override in effect does not work."""
+    trial_render.render_trial_demands(state, state.evaluate)

@@ -1,0 +1,403 @@
+"""Missing inputs: topics that applications read or deliver, but that do not arrive.
+
+A demand that needs a connection gets the connection, or its requester gets a warning. Later an
+override may suspend the connection, demands may release the connection, or people may remove a node
+or an output from the configuration. Then a topic no longer arrives.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import groupby, islice, takewhile
+
+from demandops.base.errors import MOST_FAULTS, Fault, fault, suggestion
+from demandops.base.quoting import quoted
+from demandops.connections.connection import Connection
+from demandops.decide.admission.permission import PEERS, needed_access
+from demandops.decide.booking.leaving import Drain
+from demandops.decide.checks.collisions import all_names
+from demandops.decide.placement.capacity import overcommitted, whole_usage
+from demandops.decide.placement.choice import lacks, requirement_of, unmet
+from demandops.decide.placement.relocation import following_overrides, with_moves
+from demandops.decide.planning.flows import flows
+from demandops.decide.planning.overrides import without_suspended
+from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
+from demandops.model.config.policy import AccessDomain, matches
+from demandops.model.demand.application import Application
+from demandops.model.demand.demand_request import DemandRequest
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import World
+from demandops.templating import chart_files
+
+
+@dataclass(frozen=True, slots=True)
+class MissingInput:
+    """A topic that does not arrive, or an output that is no longer delivered."""
+
+    application: str
+    file: str
+    reason: str
+
+    @property
+    def warning(self) -> Fault:
+        return fault(f"application '{self.application}'", self.reason).within(self.file)
+
+
+def missing_inputs(world: World) -> list[MissingInput]:
+    """Return the topics that do not arrive, sorted by application."""
+    # Suspended claims need no topics, and suspended connections carry none.
+    active = without_suspended(world)
+    missing = {
+        MissingInput(claim.application.id, claim_file.path_of(claim.key), reason)
+        for claim in active.ledger
+        if claim.is_on_application
+        for reason in _reasons(claim.application, active)
+    }
+    return sorted(missing, key=lambda each: (each.application, each.reason, each.file))
+
+
+def _reasons(app: Application, active: World) -> Iterator[str]:
+    config = active.config
+    for role, topic in app.all_inputs():
+        if topic.source not in config.nodes:
+            where = f"'{topic.source}' is not in the inventory"
+            yield f"{role} {topic.topic} does not arrive: {where}"
+    for flow in flows(config, app):
+        sender = config.nodes.get(flow.sender)
+        carried = active.ledger.is_carried_to(flow.receiver, flow.target)
+        if sender is None or carried:
+            continue
+        # The initial deployment keeps topic names, so it carries no flow that renames a topic.
+        bridged = sender.bridged.get(flow.receiver, ())
+        if flow.topic != flow.target or flow.topic not in bridged:
+            yield (
+                f"{flow.name} {flow.topic} does not arrive: no connection carries it from "
+                f"'{flow.sender}' to '{flow.receiver}'"
+            )
+    services = config.services.get(app.appdef, {})
+    for delivery in app.deliver:
+        name, _, output = delivery.output.partition(".")
+        if name not in services or output not in services[name].outputs:
+            yield (
+                f"{delivery.output} is no longer delivered to '{delivery.node}': the application "
+                f"definition '{app.appdef}' has no such output"
+            )
+
+
+# ---- misspelled topics ----
+#
+# Warnings about misspelled topics, which differ by a letter from a known topic of the node.
+#
+# Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ in a
+# digit, or in a letter of a short word (``lidar_fl``, ``lidar_fr``), count as two correct topics.
+
+_WORD = re.compile(r"[A-Za-z]+")
+# In words with fewer letters, one other letter often makes another correct word.
+_SHORT = 4
+
+
+def notes(request: DemandRequest, world: World) -> Iterator[str]:
+    if request.adds_claims:
+        known = _KnownTopics(world)
+        for item in request.demanded:
+            yield from known.notes_on(item.held)
+
+
+def misspelled_topic_warnings(world: World) -> Iterator[Fault]:
+    known = _KnownTopics(world)
+    for claim in sorted(world.ledger, key=lambda claim: claim_file.path_of(claim.key)):
+        for note in known.notes_on(claim.held):
+            yield fault("", note).within(claim_file.path_of(claim.key))
+
+
+class _KnownTopics:
+    """The known topics of each node: those of the inventory, and the booked usual topics."""
+
+    def __init__(self, world: World) -> None:
+        self._world = world
+        self._listed: dict[str, frozenset[str]] = {}
+        self._booked: dict[tuple[str, str], frozenset[str]] = {}
+        self._told: set[tuple[str, str]] = set()
+
+    def notes_on(self, held: Application | Connection) -> Iterator[str]:
+        """Yield a warning for each misspelled topic that an earlier call did not report."""
+        if isinstance(held, Application):
+            what = f"application '{held.id}'"
+            for role, input in held.all_inputs():
+                place = (role, input.source)
+                if place not in self._booked:
+                    booked = self._world.ledger.usual_topics(*place, excluded="")
+                    self._booked[place] = frozenset(booked)
+                known = (self._of(input.source), self._booked[place])
+                yield from self._notes(what, input.source, input.topic, *known)
+            return
+        for route in held.topics:
+            sender, _ = route.sender_and_receiver(held.source, held.target)
+            topic = route.read_topic
+            yield from self._notes(f"connection '{held.id}'", sender, topic, self._of(sender))
+
+    def _notes(self, what: str, node: str, topic: str, *known: frozenset[str]) -> Iterator[str]:
+        # not united: a demand may list thousands of topics, and all of them may be known
+        if (node, topic) in self._told or any(topic in topics for topics in known):
+            return
+        near = [each for topics in known for each in topics if _is_misspelling(topic, each)]
+        if near:
+            self._told.add((node, topic))
+            yield f"{what}: '{node}' is not known to publish {topic}; did you mean '{min(near)}'?"
+
+    def _of(self, node: str) -> frozenset[str]:
+        if node not in self._listed:
+            entry = self._world.config.nodes.get(node)
+            topics = set[str]()
+            if entry:
+                topics = {*entry.topics.values(), *entry.types}.union(*entry.bridged.values())
+            self._listed[node] = frozenset(topics)
+        return self._listed[node]
+
+
+def _is_misspelling(topic: str, other: str) -> bool:
+    """Return whether ``topic`` may be a misspelling of ``other``.
+
+    It is one if both differ only in a word of at least four letters. In this word, ``topic`` must
+    have one wrong, missing or additional letter, or two letters in the wrong order.
+    """
+    if abs(len(topic) - len(other)) > 1:
+        return False
+    start = _common(topic, other)
+    end = _common(topic[start:][::-1], other[start:][::-1])
+    written, correct = topic[start : len(topic) - end], other[start : len(other) - end]
+    if sorted(written) != sorted(correct) and max(len(written), len(correct)) > 1:
+        return False
+    if len(written) > len("ab") or not (written + correct).isalpha():
+        return False
+    word = next(match for match in _WORD.finditer(other + " a") if match.end() >= start)
+    return len(word[0]) >= _SHORT and word.start() <= start
+
+
+def _common(one: str, other: str) -> int:
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))
+
+
+# ---- warnings about patterns of the policy that match nothing now ----
+#
+# Such a pattern is misspelled, or what it matches was removed or does not exist yet. Patterns of
+# requesters are not checked: the state repo has no list of requesters.
+
+
+def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
+    nodes = tuple(sorted(config.nodes))
+    for name, domain in sorted(config.domains.items()):
+        own = tuple(sorted(id for id, of in config.domain_of.items() if of.name == name))
+        others = tuple(sorted(config.domains.keys() - {name}))
+        # (field, patterns, what the patterns may match, all names that they may match)
+        kinds = [("nodes", domain.nodes, "node", nodes)]
+        for rule in domain.rules:
+            place = f"rule '{rule.name}'"
+            appdefs, brokers = (*config.appdefs,), (*config.brokers,)
+            kinds += [
+                (f"{place}: applications", rule.applications, "application definition", appdefs),
+                (f"{place}: nodes", rule.nodes, "node of the domain", own),
+                (f"{place}: brokers", rule.brokers, "broker", brokers),
+                (f"{place}: peers", rule.peers, "other access domain", others),
+            ]
+        file = config.file_of(DOMAINS_FILE, name)
+        for field, patterns, what, names in kinds:
+            for pattern in patterns:
+                if pattern != "*" and not any(matches(each, (pattern,)) for each in names):
+                    hint = suggestion(pattern, names) or "; there is none"
+                    message = f"{quoted(pattern)} matches no {what}{hint}"
+                    yield fault(f"access domain '{name}', {field}", message).within(file)
+
+
+# ---- policy warnings ----
+#
+# Warnings about access domains, nodes and requirements on nodes, which ``demandops check`` shows.
+#
+# Some warnings report what the cluster will refuse or what demands cannot get. Others report an
+# access that the cluster cannot prevent. None is a fault, because the check may not know enough.
+# For example, a chart may render a refused kind only with certain values, and only Helm can find
+# that out.
+
+# Kinds are read line by line, because a template of Helm is no YAML before it is rendered.
+_KIND = re.compile(r"kind:[ \t]*(?P<kind>[^#]*)")
+_PLAIN = re.compile(r"\"?([A-Z][A-Za-z0-9]*)\"?")
+_TEMPLATE = re.compile(r"(.*/)?templates/(?!tests/).*\.(ya?ml|tpl)")
+_CRDS = re.compile(r"(.*/)?crds/.*")
+_MOST_NODES = 3
+
+
+def policy_warnings(world: World) -> Iterator[Fault]:
+    config = world.config
+    yield from _kinds_of_charts(config)
+    yield from _open_by_host_network(config)
+    yield from _connections_no_longer_allowed(world)
+    for node, excess in overcommitted(world, whole_usage(world)):
+        message = (
+            f"{excess}; these services stay on the node, but no demand gets more of this resource "
+            "there; raise the capacity, or move something to another node"
+        )
+        file = config.file_of(NODES_FILE, node.id)
+        yield fault("", f"'{node.id}': {message}").within(file)
+    for id in config.drained_nodes:
+        if world.ledger.applications_on.get(id):
+            drain = with_moves(Drain(id), world, whole_usage(world), all_names(world))
+            file = config.file_of(NODES_FILE, config.host_of(id))
+            for text in (*drain.moved, *drain.stays):
+                yield fault("", f"'{id}' is drained: {text}").within(file)
+    yield from _unfit_places(config)
+    for path, text in following_overrides(world).stays:
+        yield fault("node", text).within(path)
+
+
+def _unfit_places(config: Config) -> Iterator[Fault]:
+    placed = {  # a shared service is in several definitions, but in one file
+        (service.file, service.name): service
+        for services in config.services.values()
+        for service in services.values()
+        if service.place
+    }
+    for (file, name), service in sorted(placed.items()):
+        field = "place" if service.shared else f"services.{name}.place"
+        requirement = requirement_of(service)
+        problems = [*unmet(requirement, config)]
+        if not problems and all(any(lacks(node, requirement)) for node in config.nodes.values()):
+            problems = [f"no node in {config.place_of(NODES_FILE)} meets all requirements"]
+        for problem in problems:
+            message = f"{problem}, so demands that need '{name}' are refused"
+            yield fault(field, message).within(file)
+
+
+def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
+    counts: Counter[tuple[str, str]] = Counter()
+    for claim in world.ledger:
+        if isinstance(claim.held, Connection):
+            for domain, access in needed_access(claim.held, world.config):
+                others = (value for kind, value in access if kind == PEERS)
+                counts.update(
+                    (domain.name, other)
+                    for other in others
+                    if not any(matches(other, rule.peers) for rule in domain.rules)
+                )
+    for (name, other), count in sorted(counts.items()):
+        message = (
+            f"no rule of access domain '{name}' has '{other}' among its 'peers', so nobody can "
+            "demand a connection between the two domains; claims on such connections stay in "
+            f"effect: {count}"
+        )
+        yield fault("", message).within(world.config.file_of(DOMAINS_FILE, name))
+
+
+def _open_by_host_network(config: Config) -> Iterator[Fault]:
+    """Yield warnings of access domains that are open because pods use the host's network."""
+    nodes = [
+        (config.domain_of[node.id].name, node)
+        for node in config.nodes.values()
+        if node.host_network and node.id in config.domain_of
+    ]
+    nodes.sort(key=lambda pair: (pair[0], pair[1].id))
+    # Kubernetes applies a NetworkPolicy only to pods with their own network.
+    for name, group in groupby(nodes, key=lambda pair: pair[0]):
+        if config.domains[name].network == "namespace":
+            ids = [node.id for _, node in group]
+            listed = ", ".join(f"'{id}'" for id in ids[:_MOST_NODES])
+            if len(ids) > _MOST_NODES:
+                listed += f" and {len(ids) - _MOST_NODES} more"
+            message = (
+                f"'network: namespace' of access domain '{name}' has no effect on nodes whose pods "
+                f"use the host's network: {listed}; set hostNetwork: false for these nodes, "
+                "or separate their network yourself"
+            )
+            yield fault("", message).within(config.file_of(DOMAINS_FILE, name))
+    graphs: dict[tuple[str, int], dict[str, None]] = {}
+    for name, node in nodes:
+        graphs.setdefault((node.cluster, node.ros.domain_id), {})[name] = None
+    for (cluster, number), names in sorted(graphs.items()):
+        if len(names) > 1:
+            listed = " and ".join(f"'{name}'" for name in names)
+            message = (
+                f"access domains {listed} share ROS domain {number} on the network of the hosts "
+                f"of cluster '{cluster}', so each may read and write the topics of the others; "
+                "give each access domain its own ros.domainId"
+            )
+            yield fault("", message).within(config.file_of(DOMAINS_FILE, next(iter(names))))
+
+
+def _kinds_of_charts(config: Config) -> Iterator[Fault]:
+    """Yield a warning for each Kubernetes kind in a chart that an access domain does not allow.
+
+    There is also a warning for each kind that cannot be read from the chart's files. Only charts
+    and libraries in the state repo are read.
+    """
+    # A chart may run in an access domain that has no rules, or in which a rule allows an
+    # application that uses the chart.
+    domains_of: dict[str, list[AccessDomain]] = {}
+    for appdef, services in config.services.items():
+        allowing = [
+            domain
+            for domain in config.domains.values()
+            if not domain.rules or any(matches(appdef, rule.applications) for rule in domain.rules)
+        ]
+        for service in services.values():
+            for source in config.charts[service.chart].sources():
+                top = source.folder
+                for folder in chart_files.folders(top, config.files) if top else ():
+                    domains = domains_of.setdefault(folder, [])
+                    domains += [domain for domain in allowing if domain not in domains]
+    paths = sorted(config.files)
+    for folder, domains in sorted(domains_of.items()):
+        for chart in chart_files.dependencies(folder, config.files):
+            if (
+                chart.folder is None
+                and f"{folder}/charts/{chart.name}/Chart.yaml" not in config.files
+            ):
+                message = (
+                    f"subchart {quoted(chart.name)} is not unpacked in charts/, so the kinds of "
+                    "its objects are not known; check yourself that the access domain allows these "
+                    "kinds"
+                )
+                yield fault(f"dependencies[{chart.index}]", message).within(f"{folder}/Chart.yaml")
+        for path in chart_files.below(folder, paths):
+            name = path.removeprefix(f"{folder}/")
+            if _CRDS.fullmatch(name):
+                yield from _refused(path, None, "CustomResourceDefinition", domains, config)
+            elif _TEMPLATE.fullmatch(name):
+                # A pull request of a stranger may have a template with any number of kinds.
+                faults = _template(path, config.files[path], domains, config)
+                shown = [*islice(faults, MOST_FAULTS + 1)]
+                yield from shown[:MOST_FAULTS]
+                if len(shown) > MOST_FAULTS:
+                    yield Fault("more", "", "has more objects of such kinds", path)
+
+
+def _template(path: str, text: str, domains: list[AccessDomain], config: Config) -> Iterator[Fault]:
+    for line, words in enumerate(text.split("\n"), start=1):
+        match = _KIND.match(words)
+        if match is None:
+            continue
+        value = match["kind"].strip()
+        plain = _PLAIN.fullmatch(value)
+        if plain:
+            yield from _refused(path, line, plain[1], domains, config)
+        else:
+            message = (
+                f"the template computes the kind {quoted(value)}; check yourself that the access "
+                "domain allows it"
+            )
+            yield fault("", message, line=line).within(path)
+
+
+def _refused(
+    path: str, line: int | None, kind: str, domains: list[AccessDomain], config: Config
+) -> Iterator[Fault]:
+    for domain in domains:
+        if kind not in {allowed.kind for allowed in domain.allowed_kinds}:
+            remedy = domain.how_to_allow(kind, config.file_of(DOMAINS_FILE, domain.name))
+            message = (
+                f"{kind} is not among the kinds of access domain '{domain.name}', so the cluster "
+                f"refuses such an object if the chart renders one; {remedy}, or remove the object "
+                "from the chart"
+            )
+            yield fault("", message, line=line).within(path)

@@ -1,0 +1,1 @@
+"""The event detector without ROS: rules, events, and the demands that they want."""

@@ -1,0 +1,365 @@
+"""An index of areas by position, so that an entity is compared only with the areas near it."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
+from functools import partial
+from math import floor, inf
+from statistics import median
+from typing import TYPE_CHECKING, Generic, TypeVar
+
+from demandops.detect.compiled_rule import (
+    AreaRule,
+    CompiledRule,
+    HoursRule,
+    PairRule,
+    ThresholdRule,
+    compiled,
+    distance,
+)
+from demandops.detect.condition import Area
+from demandops.detect.detection_state import Event, Key, Observation, Phase, State, Who
+from demandops.detect.rule_file import RuleFile
+from demandops.model.config.base_model import seconds_of
+
+if TYPE_CHECKING:
+    pass  # DROPPED
+Item = TypeVar("Item")
+
+_SMALLEST_CELL_M = 10.0
+# How many squares an area in the index may touch. A larger area is compared with every entity.
+_MOST_CELLS = 4096
+
+
+class AreaGrid(Generic[Item]):
+    """Items with areas, indexed by the squares of the map that each area and its margin touch."""
+
+    def __init__(self, items: Iterable[tuple[Item, Area, float]]) -> None:
+        """Build the index of (item, area, margin around the area in metres)."""
+        boxes: list[tuple[Item, tuple[float, float, float, float]]] = []
+        for item, area, around in items:
+            low_x, low_y, high_x, high_y = area.bounds
+            boxes.append((item, (low_x - around, low_y - around, high_x + around, high_y + around)))
+        # With squares as wide as a usual area, an area touches few squares and a square few areas.
+        sizes = [max(box[2] - box[0], box[3] - box[1]) for _, box in boxes]
+        self._size = max(_SMALLEST_CELL_M, median(sizes) if sizes else 0.0)
+        cells = defaultdict[tuple[int, int], list[Item]](list)
+        large: list[Item] = []
+        for item, box in boxes:
+            left, bottom, right, top = (floor(edge / self._size) for edge in box)
+            if (right - left + 1) * (top - bottom + 1) > _MOST_CELLS:
+                large.append(item)
+                continue
+            for x in range(left, right + 1):
+                for y in range(bottom, top + 1):
+                    cells[x, y].append(item)
+        self._large = tuple(large)
+        self._cells = {cell: (*large, *inside) for cell, inside in cells.items()}
+
+    def at(self, x: float, y: float) -> Sequence[Item]:
+        """Return a superset of the items whose area or margin contains a position."""
+        return self._cells.get((floor(x / self._size), floor(y / self._size)), self._large)
+
+
+# ---- the engine, which turns observations into events by the rules of one file ----
+#
+# ``step`` changes none of its arguments and reads no clock. The same observations give the same
+# events, however they are split into steps.
+
+
+class EventEngine:
+    """The rules of a file, indexed by source and area; :meth:`step` applies them."""
+
+    def __init__(self, file: RuleFile) -> None:
+        self.rules: dict[str, CompiledRule] = {}
+        self.timeouts = {
+            name: float(seconds_of(source.timeout)) for name, source in file.sources.items()
+        }
+        self.hours: list[HoursRule] = []
+        self.thresholds: dict[str, list[ThresholdRule]] = {name: [] for name in file.sources}
+        self.pairs: dict[str, list[PairRule]] = {name: [] for name in file.sources}
+        areas = defaultdict[str, list[AreaRule]](list)
+        for each in file.rules:
+            rule = self.rules[each.name] = compiled(each)
+            for source in dict.fromkeys(rule.sources):
+                if isinstance(rule, AreaRule):
+                    areas[source].append(rule)
+                elif isinstance(rule, PairRule):
+                    self.pairs[source].append(rule)
+                elif isinstance(rule, ThresholdRule):
+                    self.thresholds[source].append(rule)
+            if isinstance(rule, HoursRule):
+                self.hours.append(rule)
+        self.areas = {
+            name: AreaGrid((rule, rule.area, rule.stop) for rule in areas[name])
+            for name in file.sources
+        }
+
+    def start(self, now: float, held: Iterable[Key] = (), settle_s: float = 0.0) -> State:
+        """Return the state with which the engine starts.
+
+        ``held`` are the events whose demands are already booked. Events that no rule is for are
+        left out. Their entities count as gone if they stay unseen for ``settle_s`` seconds, or for
+        the timeout of their source if that is longer.
+        """
+        keys, settle = tuple(held), settle_s
+        # A count is complete only when each of its entities had the time to report.
+        for name, _ in keys:
+            rule = self.rules.get(name)
+            if isinstance(rule, AreaRule) and rule.count is not None:
+                settle = max(settle, self.timeouts[rule.sources[0]])
+        step = EngineStep(self, State(now, due=-inf, settled=now + settle, hours_due=now))
+        for key in keys:
+            step.resume(key, settle_s)
+        return step.result()
+
+    def step(
+        self, state: State, observations: Iterable[Observation], now: float
+    ) -> tuple[State, tuple[Event, ...]]:
+        """Return the new state, and the events that observations and passing time cause.
+
+        The observations are in the order in which they were made. One of a source that the file
+        lacks is left out. One earlier than ``state.now`` counts as made then, and one later than
+        ``now`` as made at ``now``.
+        """
+        step = EngineStep(self, state)
+        for observation in observations:
+            if observation.source in self.timeouts:
+                step.pass_time(min(observation.at, now))
+                step.observe(observation)
+        step.pass_time(now)
+        return step.result(), tuple(step.events)
+
+
+# ---- engine step ----
+#
+# One step of the engine, which collects the events that observations and passing time cause.
+#
+# A step changes a copy of the state, not the state itself.
+
+_NONE: frozenset[Key] = frozenset()
+_NO_RULES: frozenset[str] = frozenset()
+
+
+class EngineStep:
+    """The work of one step: call its methods, then take ``events`` and :meth:`result`."""
+
+    def __init__(self, engine: EventEngine, state: State) -> None:
+        # The copies cost little: one step takes many observations, and the values in the mappings
+        # are immutable, so they are not copied.
+        self._engine, self._before = engine, state
+        self._now, self._due, self._hours_due = state.now, state.due, state.hours_due
+        self._seen, self._awaited = dict(state.seen), dict(state.awaited)
+        self._phases, self._engaged = dict(state.phases), dict(state.engaged)
+        self._counted, self._counts = dict(state.counted), dict(state.counts)
+        self._cells = dict(state.cells)
+        self.events: list[Event] = []
+
+    def result(self) -> State:
+        return replace(
+            self._before,
+            now=self._now,
+            due=self._due,
+            hours_due=self._hours_due,
+            seen=self._seen,
+            awaited=self._awaited,
+            phases=self._phases,
+            engaged=self._engaged,
+            counted=self._counted,
+            counts=self._counts,
+            cells=self._cells,
+        )
+
+    def resume(self, key: Key, settle_s: float) -> None:
+        """Continue an event that started before a restart, and wait for its entities.
+
+        An event that no rule is for is ignored.
+        """
+        rule = self._engine.rules.get(key[0])
+        if rule is None or len(rule.subjects) != len(key[1]):
+            return
+        entities = rule.entities_of(key[1])
+        if all(map(rule.takes, entities)):
+            self._enter(key, rule, Phase(self._now, lasts=True))
+            for who in entities:
+                # A source that reports seldom may not have reported yet when the detector settles.
+                wait_s = max(settle_s, self._engine.timeouts[who[0]])
+                self._awaited[who] = self._before.now + wait_s
+
+    # ---- time ----
+
+    def pass_time(self, until: float) -> None:
+        """Advance the time to ``until``, and apply all changes that are due by then."""
+        while until >= self._due:
+            self._due = inf
+            # In the order of their times, so a long silence gives the same events as short ones.
+            for at, act in sorted(self._all_due(), key=lambda due: due[0]):
+                if at > min(until, self._due):  # an action may have made another change due before
+                    break
+                self._now = max(self._now, at)
+                act()
+            self._due = min((at for at, _ in self._all_due()), default=inf)
+        self._now = max(self._now, until)
+
+    def _all_due(self) -> Iterator[tuple[float, Callable[[], None]]]:
+        """Yield (when, action) for each change that passing time alone may cause."""
+        for key, phase in self._phases.items():
+            if not phase.lasts:
+                at = phase.since + self._engine.rules[key[0]].dwell
+                yield at, partial(self._end_dwell, key, phase)
+        if self._engine.hours:
+            yield self._hours_due, self._look_at_hours
+        if self._now < self._before.settled:
+            yield self._before.settled, self._look_at_counts
+        timeouts = self._engine.timeouts
+        for who, last in self._seen.items():
+            yield last.at + timeouts[last.source], partial(self._lose_silent, who, last)
+        for who, until in self._awaited.items():
+            yield until, partial(self._give_up, who)
+
+    def _end_dwell(self, key: Key, phase: Phase) -> None:
+        # An action before this one may have ended the phase, or begun another.
+        if self._phases.get(key) is phase:
+            self._begin(key, self._engine.rules[key[0]])
+
+    def _look_at_hours(self) -> None:
+        for rule in self._engine.hours:
+            is_on = rule.schedule.is_on(self._now)
+            self._latch((rule.name, ()), rule, is_on, not is_on)
+        self._hours_due = min(rule.schedule.next_check(self._now) for rule in self._engine.hours)
+        self._due = min(self._due, self._hours_due)
+
+    def _look_at_counts(self) -> None:
+        for rule in self._engine.rules.values():
+            if isinstance(rule, AreaRule):
+                self._latch_count(rule)
+
+    def _lose_silent(self, who: Who, last: Observation) -> None:
+        if self._seen.get(who) is last:
+            self._lose(who, f"{who[1]} has been silent for {self._engine.timeouts[who[0]]:g} s")
+
+    def _give_up(self, who: Who) -> None:
+        if self._awaited.pop(who, None) is not None:
+            self._lose(who, f"{who[1]} has not been seen since the start")
+
+    def _lose(self, who: Who, why: str) -> None:
+        """Forget an entity, and end all events that it takes part in."""
+        last = self._seen.pop(who, None)
+        for key in sorted(self._engaged.get(who, _NONE)):
+            self._leave(key, self._engine.rules[key[0]], why)
+        for name in sorted(self._counted.pop(who, _NO_RULES)):
+            self._count(name, -1)
+        for pair in self._engine.pairs[who[0]]:
+            if pair.takes(who):
+                pair.move(self._cells, who[1], last, None)
+
+    # ---- observations ----
+
+    def observe(self, observation: Observation) -> None:
+        if observation.at != self._now:
+            observation = observation._replace(at=self._now)
+        who, source, entity = observation.who, observation.source, observation.entity
+        before = self._seen.get(who)
+        self._seen[who] = observation
+        self._awaited.pop(who, None)
+        self._due = min(self._due, observation.at + self._engine.timeouts[source])
+        for rule in self._engine.thresholds[source]:
+            value = observation.values.get(rule.field)
+            if value is not None and rule.is_for(entity):
+                key = (rule.name, (entity,))
+                self._latch(key, rule, rule.starts(value), rule.stops(value))
+        if observation.position is not None:
+            self._compare_with_areas(observation, *observation.position)
+            for pair in self._engine.pairs[source]:
+                if pair.takes(who):
+                    pair.move(self._cells, entity, before, observation)
+                    self._compare_with_others(pair, observation)
+
+    def _compare_with_areas(self, observation: Observation, x: float, y: float) -> None:
+        who, entity = observation.who, observation.entity
+        compared, counted = set[str](), set[str]()
+        for rule in self._engine.areas[observation.source].at(x, y):
+            if not rule.is_for(entity):
+                continue
+            away = rule.area.distance(x, y)
+            if rule.count is None:
+                compared.add(rule.name)
+                key: Key = (rule.name, (entity,))
+                self._latch(key, rule, away <= rule.start, away > rule.stop)
+            elif away <= rule.start:
+                counted.add(rule.name)
+        # The index does not yield the areas that the entity has left, so their events end here.
+        for key in sorted(self._engaged.get(who, _NONE)):
+            left = self._engine.rules[key[0]]
+            if isinstance(left, AreaRule) and key[0] not in compared:
+                self._latch(key, left, False, True)
+        before = self._counted.get(who, _NO_RULES)
+        if counted != before:
+            self._counted[who] = frozenset(counted)
+            for name in sorted(counted ^ before):
+                self._count(name, 1 if name in counted else -1)
+
+    def _compare_with_others(self, rule: PairRule, observation: Observation) -> None:
+        who, compared = observation.who, set[Key]()
+        for other in sorted(rule.around(self._cells, observation)):
+            key, away = rule.key(who, other), distance(observation, self._seen[other])
+            compared.add(key)
+            self._latch(key, rule, away <= rule.start, away > rule.stop)
+        # The squares around do not have the partners that are far away, so their events end here. A
+        # partner that is still awaited after a restart has no position yet.
+        for key in sorted(self._engaged.get(who, _NONE)):
+            is_left = key[0] == rule.name and key not in compared
+            if is_left and all(entity in self._seen for entity in rule.entities_of(key[1])):
+                self._latch(key, rule, False, True)
+
+    def _count(self, name: str, change: int) -> None:
+        rule = self._engine.rules[name]
+        self._counts[name] = self._counts.get(name, 0) + change
+        if isinstance(rule, AreaRule):
+            self._latch_count(rule)
+
+    def _latch_count(self, rule: AreaRule) -> None:
+        count = self._counts.get(rule.name, 0)
+        if rule.count is not None:
+            stops = count <= rule.count.stop and self._now >= self._before.settled
+            self._latch((rule.name, ()), rule, count >= rule.count.start, stops)
+
+    # ---- events ----
+
+    def _latch(self, key: Key, rule: CompiledRule, starts: bool, stops: bool) -> None:
+        phase = self._phases.get(key)
+        if stops and phase is not None:
+            self._leave(key, rule, "")
+        elif starts and phase is None:
+            if rule.dwell:
+                self._enter(key, rule, Phase(self._now, lasts=False))
+                self._due = min(self._due, self._now + rule.dwell)
+            else:
+                self._begin(key, rule)
+
+    def _begin(self, key: Key, rule: CompiledRule) -> None:
+        self._enter(key, rule, Phase(self._now, lasts=True))
+        self._report(key, rule, True, "")
+
+    def _enter(self, key: Key, rule: CompiledRule, phase: Phase) -> None:
+        self._phases[key] = phase
+        for who in rule.entities_of(key[1]):
+            self._engaged[who] = self._engaged.get(who, _NONE) | {key}
+
+    def _leave(self, key: Key, rule: CompiledRule, why: str) -> None:
+        phase = self._phases.pop(key)
+        for who in rule.entities_of(key[1]):
+            self._engaged[who] -= {key}
+            if not self._engaged[who]:
+                del self._engaged[who]
+        if phase.lasts:
+            self._report(key, rule, False, why)
+
+    def _report(self, key: Key, rule: CompiledRule, starts: bool, why: str) -> None:
+        if why:
+            self.events.append(Event(*key, starts, self._now, why))
+        else:
+            facts = rule.facts(key[1], self._seen, self._counts.get(key[0], 0))
+            self.events.append(Event(*key, starts, self._now, facts.text, facts.values))

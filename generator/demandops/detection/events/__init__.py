@@ -1,1 +1,0 @@
-"""The engine: from observations to events."""

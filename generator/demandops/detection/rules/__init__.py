@@ -1,1 +1,0 @@
-"""The rules that people write, and what they demand."""

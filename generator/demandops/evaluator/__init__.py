@@ -1,1 +1,0 @@
-"""Evaluates what people wrote in a process with limits, which can be killed."""

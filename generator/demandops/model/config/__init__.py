@@ -1,0 +1,1 @@
+"""What people write: inventory, appdefs, registry, policy, overrides, settings."""

@@ -1,0 +1,229 @@
+"""Durations and times for people: ``1h30m``, ``in 10m``, ``3m20s ago``."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from datetime import datetime
+from typing import Annotated, Any, Literal, TypeVar, get_args
+
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+)
+from pydantic.alias_generators import to_camel
+
+from demandops.base import strict_yaml
+from demandops.base.errors import Fault, InvalidInput, fault, field_path, suggestion
+from demandops.base.naming import PATTERN_WORDS, control_character
+from demandops.base.quoting import quoted
+
+_DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
+_UNITS = ((86_400, "d"), (3_600, "h"), (60, "m"), (1, "s"))
+_YEAR_S = 366 * 86_400
+
+
+def seconds_of(text: str) -> int:
+    """Return the seconds of a duration like ``1h30m``; a ValueError says what is wrong with it."""
+    match = _DURATION.fullmatch(text)
+    if not text or match is None:
+        raise ValueError(f"{quoted(text)} is not a duration; write one like 90s, 10m, 1h30m or 2d")
+    pairs = zip(match.groups("0"), _UNITS, strict=True)
+    seconds = sum(int(part) * size for part, (size, _) in pairs)
+    if seconds > _YEAR_S:
+        raise ValueError(f"'{text}' is longer than a year; choose a shorter duration")
+    return seconds
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration, which is not negative, as text like ``1h30m``, rounded to seconds."""
+    text, left = "", round(seconds)
+    for size, name in _UNITS:
+        whole, left = divmod(left, size)
+        text += f"{whole}{name}" if whole else ""
+    return text or "0s"
+
+
+def span(seconds: float) -> str:
+    """Return a duration without its sign, rounded down, in one or two units: ``12d``, ``3h20m``."""
+    left = int(abs(seconds))
+    for place, (size, unit) in enumerate(_UNITS):
+        if left >= size or size == 1:
+            whole, remainder = divmod(left, size)
+            text = f"{whole}{unit}"
+            if whole < 10 and size > 1:  # beside two digits, the next unit says nothing
+                smaller, name = _UNITS[place + 1]
+                text += f"{remainder // smaller}{name}" if remainder >= smaller else ""
+            return text
+    raise AssertionError("the smallest unit is one second")
+
+
+def relative(moment: datetime, now: datetime) -> str:
+    """Return a time relative to ``now``, like ``3m20s ago`` or ``in 10m``."""
+    seconds = (moment - now).total_seconds()
+    return f"in {span(seconds)}" if seconds >= 1 else f"{span(seconds)} ago"
+
+
+# ---- the base classes of every model that is parsed from a file or a message ----
+#
+# Models are frozen and strict, and reject unknown fields. :func:`parse` turns pydantic's errors
+# into faults that name the field as it is written in the file.
+
+Model = TypeVar("Model", bound=BaseModel)
+Item = TypeVar("Item")
+
+# A list in a file. The model has the items as a tuple.
+Items = Annotated[tuple[Item, ...], Field(strict=False)]
+
+Positive = Annotated[int, Field(ge=1)]
+
+# A name that is valid in Kubernetes (RFC 1123 label)
+DnsLabel = Annotated[
+    str, StringConstraints(pattern=r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$", max_length=63)
+]
+
+# A short name in a configuration file, such as that of a role, a channel or a capability
+Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_length=63)]
+
+
+def without(problem_of: Callable[[str], str]) -> AfterValidator:
+    """Return a validator that rejects a text for which ``problem_of`` returns a message."""
+
+    def check(value: str) -> str:
+        problem = problem_of(value)
+        if problem:
+            raise ValueError(problem)
+        return value
+
+    return AfterValidator(check)
+
+
+def readable_by(parse: Callable[[str], object]) -> AfterValidator:
+    """Return a validator that rejects a value for which ``parse`` raises a ValueError."""
+
+    def check(value: str) -> str:
+        parse(value)
+        return value
+
+    return AfterValidator(check)
+
+
+def _hidden(value: str) -> str:
+    control = control_character(re.sub(r"[\n\t]", " ", value))
+    return control and f"{quoted(value)} has the control character {control}; remove it"
+
+
+# A validator that rejects control characters, and characters that reorder text. Line breaks and
+# tabs are valid.
+Visible = without(_hidden)
+
+# Any text that `Visible` accepts
+Text = Annotated[str, Visible]
+
+Approval = Literal["none", "required"]
+
+
+class FrozenModel(BaseModel):
+    """An immutable value that rejects unknown fields."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class CamelModel(FrozenModel):
+    """A part of a configuration file. The field ``host_network`` is ``hostNetwork`` in the file."""
+
+    model_config = ConfigDict(alias_generator=to_camel)
+
+
+class FileModel(CamelModel):
+    """A configuration file; ``apiVersion`` names its format."""
+
+    apiVersion: Literal["demandops/v1"]
+
+
+def faults_of(
+    error: ValidationError,
+    model: type[BaseModel],
+    file: str = "",
+    place: tuple[int | str, ...] = (),
+    most: int | None = None,
+) -> list[Fault]:
+    """Return every fault of a failed validation, or the first ``most``.
+
+    ``place`` is the path to the validated value in the file, ``()`` for the whole file.
+    """
+    faults = []
+    for item in error.errors(include_url=False)[:most]:
+        value = item.get("input")
+        is_short = item["type"] == "too_short" and isinstance(value, list)
+        # pydantic counts only valid items, and the invalid ones have faults of their own
+        if is_short and len(value) >= item["ctx"]["min_length"]:
+            continue
+        path = field_path((*place, *item["loc"]))
+        faults.append(fault(path, _message(dict(item), model)).within(file))
+    return faults
+
+
+_EXPECTED = {
+    "model_type": "must be a mapping",
+    "dict_type": "must be a mapping",
+    "list_type": "must be a list",
+    "tuple_type": "must be a list",
+    "bool_type": "must be true or false",
+    "int_type": "must be a whole number",
+    "string_type": "must be text",
+}
+
+
+def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
+    kind, value = item["type"], item.get("input")
+    if kind == "missing":
+        return "is missing; add it"
+    if kind == "extra_forbidden":
+        message = "is not a field here; remove it or correct its spelling"
+        if len(item["loc"]) == 1:  # deeper, the field belongs to a model that is not known here
+            fields = [field.alias or name for name, field in model.model_fields.items()]
+            message += suggestion(str(item["loc"][-1]), fields)
+        return message
+    if kind == "string_type" and isinstance(value, int | float):
+        return f"must be text, not {strict_yaml.short_repr(value)}; put it in quotes"
+    if kind == "literal_error":
+        expected = str(item["ctx"]["expected"]).replace("True", "true")  # as YAML has it
+        return f"is {strict_yaml.short_repr(value)}, but must be {expected}"
+    if kind == "string_pattern_mismatch":
+        pattern = item["ctx"]["pattern"]
+        return f"{value!r} cannot be used here; write {PATTERN_WORDS.get(pattern, pattern)}"
+    if kind == "value_error":
+        return str(item["ctx"]["error"])
+    if kind in ("string_too_short", "too_short") and not value:
+        return "is empty; fill it in"
+    if kind == "too_short" and isinstance(value, list):
+        return f"needs at least {item['ctx']['min_length']} entries, not {len(value)}"
+    expected = _EXPECTED.get(kind) or f"{item['msg'][:1].lower()}{item['msg'][1:]}"
+    return f"{expected}, not {strict_yaml.short_repr(value)}"
+
+
+def parse(model: type[Model], data: object, file: str = "") -> Model:
+    """Validate plain data, and return it as an instance of ``model``.
+
+    Rules about several fields are checked only if each field is valid.
+    """
+    try:
+        return model.model_validate(data)
+    except ValidationError as error:
+        raise InvalidInput(faults_of(error, model, file)) from None
+
+
+def parse_file(model: type[Model], text: str, file: str) -> Model:
+    """Parse the text of a YAML file, and return its content as an instance of ``model``."""
+    data = strict_yaml.load(text, file)
+    if not isinstance(data, dict):
+        message, version = "must be a mapping", model.model_fields.get("apiVersion")
+        if version is not None:
+            message += f" that starts with apiVersion: {get_args(version.annotation)[-1]}"
+        raise InvalidInput.at("", message, file=file)
+    return parse(model, data, file)

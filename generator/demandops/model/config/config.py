@@ -1,0 +1,408 @@
+"""The whole configuration as one frozen, indexed value: :class:`Config`."""
+
+from __future__ import annotations
+
+import shlex
+from collections import Counter, defaultdict
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, TypeAdapter, ValidationError
+
+from demandops.base import naming, strict_yaml
+from demandops.base.errors import (
+    MOST_FAULTS,
+    Fault,
+    InvalidInput,
+    Refused,
+    fault,
+    field_path,
+    suggestion,
+)
+from demandops.model.config.appdef import (
+    ApplicationDefinition,
+    Service,
+    ServiceDefinition,
+    Services,
+)
+from demandops.model.config.base_model import DnsLabel, faults_of, parse, parse_file
+from demandops.model.config.inventory import Broker, Cluster, Kind, Node, id_in_domain, kind_of
+from demandops.model.config.override import OVERRIDES_ROOT, Override
+from demandops.model.config.policy import AccessDomain
+from demandops.model.config.registry import (
+    DEFAULT_SETTINGS,
+    ApplicationVersion,
+    Chart,
+    ClientsFile,
+    Image,
+    ImagePin,
+    VersionList,
+)
+from demandops.model.config.repo_settings import RepoSettings
+
+CLUSTERS_FILE = "inventory/clusters.yaml"
+NODES_FILE = "inventory/nodes.yaml"
+BROKERS_FILE = "inventory/brokers.yaml"
+DOMAINS_FILE = "policy/access-domains.yaml"
+CHARTS_FILE = "registry/charts.yaml"
+IMAGES_FILE = "registry/images.yaml"
+CLIENTS_FILE = "registry/clients.yaml"
+VERSIONS_FILE = "registry/versions.yaml"
+
+# The collections of entries, each named by the file that usually lists its entries. Files in the
+# folder `inventory/nodes/` may list further entries of the collection `inventory/nodes.yaml`, and
+# likewise for the others (`collection_of`).
+COLLECTIONS = (
+    CLUSTERS_FILE,
+    NODES_FILE,
+    BROKERS_FILE,
+    DOMAINS_FILE,
+    CHARTS_FILE,
+    IMAGES_FILE,
+    CLIENTS_FILE,
+    VERSIONS_FILE,
+)
+
+# The top-level entries of a state repo that hold the configuration, which people write
+CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", OVERRIDES_ROOT)
+
+
+def collection_of(path: str) -> str | None:
+    """Return the collection to which the entries of a file belong, if any.
+
+    ``inventory/nodes.yaml`` and ``inventory/nodes/berlin.yaml`` have entries of the collection
+    ``inventory/nodes.yaml``.
+    """
+    folder, _, name = path.rpartition("/")
+    if name.startswith(".") or not name.endswith(".yaml"):
+        return None
+    return next((file for file in (path, f"{folder}.yaml") if file in COLLECTIONS), None)
+
+
+def place_of_collection(collection: str, files: Iterable[str]) -> str:
+    """Return the text for a collection's files: ``inventory/nodes.yaml or inventory/nodes/``."""
+    used = {*files} or {collection}
+    folder = [collection.replace(".yaml", "/")] if used - {collection} else []
+    return " or ".join([collection] * (collection in used) + folder)
+
+
+@dataclass(frozen=True, slots=True)
+class Config:
+    """What can run, where, and from which charts and images.
+
+    Most mappings go from the name of an entry to the entry.
+    """
+
+    repo_settings: RepoSettings
+    clusters: Mapping[str, Cluster]
+    nodes: Mapping[str, Node]
+    brokers: Mapping[str, Broker]
+    domains: Mapping[str, AccessDomain]
+    charts: Mapping[str, Chart]
+    images: Mapping[str, Image]
+    appdefs: Mapping[str, ApplicationDefinition]
+    definitions: Mapping[str, ServiceDefinition]
+    # For each appdef, its own services and those of `definitions` that it uses
+    services: Mapping[str, Services]
+    domain_of: Mapping[str, AccessDomain]
+    # The text of each file below `appdefs/`, such as a template or a chart, by path
+    files: Mapping[str, str]
+    # For each node in a further access domain (`edge@city`), the inventory's id (`edge`)
+    hosts: Mapping[str, str] = field(default_factory=dict)
+    # Every override; `demandops.model.ledger.ledger.World` knows which of them have ended
+    overrides: Mapping[str, Override] = field(default_factory=dict)
+    clients: ClientsFile = DEFAULT_SETTINGS
+    versions: Mapping[str, VersionList] = field(default_factory=dict)
+    # For each collection, a map from each entry to the file that has the entry
+    entry_files: Mapping[str, Mapping[str, str]] = field(
+        default_factory=dict, compare=False, repr=False
+    )
+    # A map from each `topic_part(id)` to the ids of the nodes that have this topic part
+    nodes_by_topic_part: Mapping[str, tuple[str, ...]] = field(
+        init=False, compare=False, repr=False
+    )
+    # For each role, the nodes with this `type`, sorted by id. The empty role has all nodes.
+    nodes_by_role: Mapping[str, tuple[Node, ...]] = field(init=False, compare=False, repr=False)
+    # For each `(capability,)` or `(label key, value)`, the nodes with it, sorted by id
+    nodes_with: Mapping[tuple[str, ...], tuple[Node, ...]] = field(
+        init=False, compare=False, repr=False
+    )
+    # For each property, the type of its value on most nodes, and the first node with this type
+    property_kinds: Mapping[str, tuple[Kind, str]] = field(init=False, compare=False, repr=False)
+    drained_nodes: tuple[str, ...] = field(init=False, compare=False, repr=False)
+    limits_capacity: bool = field(init=False, compare=False, repr=False)
+    # The input roles, sorted, that are the `root` of a service in at least one appdef
+    roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
+    # The names of the services whose scaling has `downAfter`, in at least one appdef
+    services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
+    # For each appdef, a map from names of versions and channels to versions. The empty name stands
+    # for the default version.
+    application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
+        init=False, compare=False, repr=False
+    )
+
+    def __post_init__(self) -> None:
+        by_topic_part: dict[str, tuple[str, ...]] = {}
+        by_kind: dict[str, dict[Kind, list[str]]] = {}
+        for id, node in self.nodes.items():
+            part = naming.topic_part(id)
+            by_topic_part[part] = (*by_topic_part.get(part, ()), id)
+            for name, value in node.properties.items():
+                ids_by_kind = by_kind.setdefault(name, {})
+                ids_by_kind.setdefault(kind_of(value) or "text", []).append(id)
+        kinds = {
+            name: max(ids_by_kind.items(), key=lambda kind_and_ids: len(kind_and_ids[1]))
+            for name, ids_by_kind in by_kind.items()
+        }
+        by_role: dict[str, list[Node]] = {}
+        by_trait: dict[tuple[str, ...], list[Node]] = {}
+        for _, node in sorted(self.nodes.items()):
+            for role in ("", node.type):
+                by_role.setdefault(role, []).append(node)
+            for trait in {*((name,) for name in node.capabilities), *node.labels().items()}:
+                by_trait.setdefault(trait, []).append(node)
+        services = [s for services in self.services.values() for s in services.values()]
+        indexes = {
+            "nodes_by_topic_part": by_topic_part,
+            "nodes_by_role": {role: tuple(nodes) for role, nodes in by_role.items()},
+            "nodes_with": {trait: tuple(nodes) for trait, nodes in by_trait.items()},
+            "property_kinds": {name: (kind, ids[0]) for name, (kind, ids) in kinds.items()},
+            "drained_nodes": tuple(sorted(id for id, node in self.nodes.items() if node.drained)),
+            "limits_capacity": any(node.capacity is not None for node in self.nodes.values()),
+            "services_with_down_after": frozenset(s.name for s in services if s.scaling.down_after),
+            "roles_with_services": tuple(sorted({s.root for s in services if s.root})),
+            "application_versions": {name: self._versions(name) for name in self.services},
+        }
+        for name, index in indexes.items():
+            object.__setattr__(self, name, index)  # the class is frozen
+
+    def _versions(self, appdef: str) -> dict[str, ApplicationVersion]:
+        used = {service.chart for service in self.services[appdef].values()}
+        charts = {name: chart for name, chart in self.charts.items() if name in used}
+
+        def version(
+            name: str, by_chart: Mapping[str, str], images: Mapping[str, ImagePin]
+        ) -> ApplicationVersion:
+            sources = {name: c.at(by_chart.get(name, "")) or c for name, c in charts.items()}
+            return ApplicationVersion(appdef, name, sources, images)
+
+        listed = self.versions.get(appdef)
+        if listed is None:
+            words = {"", *(word for chart in charts.values() for word in chart.versions())}
+            # a chart that lacks a version or channel of another chart has its default
+            return {word: version("", dict.fromkeys(charts, word), {}) for word in words}
+        versions = {name: version(name, v.charts, v.images) for name, v in listed.versions.items()}
+        channels = {"": listed.default, **listed.channels}
+        return versions | {channel: versions[name] for channel, name in channels.items()}
+
+    def host_of(self, node: str) -> str:
+        """Return the inventory's name of a node: ``edge`` for ``edge@city``."""
+        return self.hosts.get(node, node)
+
+    def nodes_of(self, host: str) -> tuple[str, ...]:
+        """Return a node's name in each of its access domains: ``edge``, then ``edge@city``."""
+        node = self.nodes.get(host)
+        domains = node.access_domains if node else ()
+        return host, *(id_in_domain(host, domain.name) for domain in domains)
+
+    def file_of(self, collection: str, name: str) -> str:
+        """Return the file that has an entry; for an unknown entry, the collection's usual file."""
+        return self.entry_files.get(collection, {}).get(name, collection)
+
+    def place_of(self, collection: str) -> str:
+        """Return the text by which messages name a collection's files."""
+        return place_of_collection(collection, self.entry_files.get(collection, {}).values())
+
+    def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
+        node, domain = self.nodes.get(id), self.domain_of.get(id)
+        if node is None or domain is None:  # a person removed it while claims name it
+            missing = self.place_of(NODES_FILE) if node is None else "any access domain"
+            message = (
+                f"'{id}' is in use, but not in {missing}; restore it there, or release all that "
+                f"uses it: demandops decommission {shlex.quote(id)}"
+            )
+            file = NODES_FILE if node is None else DOMAINS_FILE
+            raise Refused.at("node", message, code="unknown-node", file=file)
+        return node, domain
+
+    def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
+        """Return the appdef that ``DeploymentRequest`` names by ``number``, or ``None``."""
+        for appdef in self.appdefs.values():
+            if appdef.deployment_request and appdef.deployment_request.type == number:
+                return appdef
+        return None
+
+    def versions_of(self, appdef: str) -> list[str]:
+        return sorted(self.application_versions[appdef].keys() - {""})
+
+    def versions_file(self, appdef: str) -> str:
+        """Return the text by which messages name the files that list the versions of an appdef."""
+        if appdef in self.versions:
+            return self.file_of(VERSIONS_FILE, appdef)
+        return self.place_of(CHARTS_FILE)
+
+    def users_of(self, service: str) -> list[str]:
+        return [appdef for appdef, services in self.services.items() if service in services]
+
+    def parameters_of(self, appdef: str) -> set[str]:
+        services = self.services[appdef].values()
+        return {
+            *self.appdefs[appdef].parameters,
+            *(name for s in services for name in s.parameters),
+        }
+
+    def values_template(self, service: Service) -> str:
+        return f"appdefs/{service.folder}/{service.values}"
+
+
+# ---- config reader ----
+#
+# The reader of configuration files: it reads item by item, to find the faults of every item.
+
+Model = TypeVar("Model", bound=BaseModel)
+Valid = TypeVar("Valid")
+
+_NAME = TypeAdapter(DnsLabel)
+
+
+class ConfigReader:
+    """Reads the configuration files of one state repo, and collects their faults."""
+
+    def __init__(self, files: Mapping[str, str]) -> None:
+        self.files = files
+        self.faults: list[Fault] = []
+        self._counts = Counter[str]()
+        self._by_collection = defaultdict[str | None, list[str]](list)
+        for path in sorted(files):
+            self._by_collection[collection_of(path)].append(path)
+        self._places: dict[str, dict[str, tuple[str, str]]] = {}
+        self._incomplete: set[str] = set()
+        self._heads: dict[str, BaseModel] = {}
+
+    def add_fault(self, file: str, field: str, message: str) -> None:
+        self._counts[file] += 1
+        self.faults.append(fault(field, message).within(file))
+
+    def read_file(self, file: str, model: type[Model]) -> Model | None:
+        """Return a file as an instance of ``model``, or ``None`` after adding its faults."""
+        text = self.files.get(file)
+        if text is None:
+            self.add_fault(file, "", "is missing; `demandops init` creates an example")
+            return None
+        try:
+            return parse_file(model, text, file)
+        except InvalidInput as error:
+            self.faults += error.faults
+            return None
+
+    def files_of(self, collection: str) -> list[str]:
+        """Return the files with entries of a collection, its usual file first."""
+        return self._by_collection[collection]
+
+    def read_items(
+        self, collection: str, whole: type[BaseModel], field: str, item: type[Model], key: str = ""
+    ) -> dict[str, Model]:
+        """Return the valid items of a collection, by name; collect the faults of invalid ones.
+
+        ``whole`` is the model of the collection's files, and ``field`` their field with the items:
+        a list if ``key`` names the field with an item's name, else a mapping.
+        """
+        items: dict[str, Model] = {}
+        places = self._places[collection] = {}
+        kind: type[Any] = list if key else dict
+        for file in self.files_of(collection) or [collection]:
+            entries: Any = None
+            try:
+                data = strict_yaml.load(self.files.get(file, ""), file)
+                raw = data.get(field) if isinstance(data, dict) else None
+                if isinstance(raw, kind):
+                    entries = raw
+                    # without the items, each of which is parsed below, so that an invalid item
+                    # hides neither the others nor the faults of the file's other fields
+                    self._heads[file] = parse(whole, {**data, field: kind()}, file)
+                else:
+                    self.read_file(file, whole)
+            except InvalidInput as error:
+                self.faults += error.faults
+            if entries is None:
+                self._incomplete.add(collection)
+                continue
+            for place, entry in enumerate(entries) if key else entries.items():
+                name: Any = place
+                if key:
+                    name = entry.get(key) if isinstance(entry, dict) else None
+                at = (field, place)
+                if isinstance(name, str) and name in places:
+                    self.add_duplicate(name, places[name], (file, field_path(at)), key)
+                    continue
+                parsed = self._valid(item.model_validate, entry, item, file, at)
+                label = key or self._valid(_NAME.validate_python, name, item, file, at)
+                if parsed is None or label is None:
+                    self._incomplete.add(collection)
+                else:
+                    items[name], places[name] = parsed, (file, field_path(at))
+        return items
+
+    def add_duplicate(
+        self, name: str, first: tuple[str, str], second: tuple[str, str], key: str = ""
+    ) -> None:
+        """Add the faults of an entry that is at two places; a place is (file, field)."""
+        dot_key = f".{key}" if key else ""
+        if first[0] == second[0]:
+            self.add_fault(
+                second[0], f"{second[1]}{dot_key}", f"'{name}' appears twice; remove one"
+            )
+            return
+        # both files, so that the changed one is quarantined, whichever of them a person changed
+        for (file, field), (other, _) in ((first, second), (second, first)):
+            self.add_fault(file, f"{field}{dot_key}", f"'{name}' is in {other} too; remove one")
+
+    def entry_files(self) -> dict[str, dict[str, str]]:
+        return {
+            collection: {name: file for name, (file, _) in places.items()}
+            for collection, places in self._places.items()
+        }
+
+    def head(self, file: str, model: type[Model]) -> Model | None:
+        """Return a file that :meth:`read_items` has read, without its items, if it is valid."""
+        head = self._heads.get(file)
+        return head if isinstance(head, model) else None
+
+    def place_of(self, collection: str, name: str) -> tuple[str, str]:
+        """Return the file that has an item, and the item's path in this file, like ``nodes[3]``."""
+        return self._places[collection][name]
+
+    def add_alias(self, collection: str, name: str, item: str) -> None:
+        self._places[collection][name] = self._places[collection][item]
+
+    def is_complete(self, collection: str) -> bool:
+        return collection not in self._incomplete
+
+    def is_missing(self, collection: str, name: str) -> bool:
+        # an invalid item may be the missing one, and has faults of its own
+        return self.is_complete(collection) and name not in self._places[collection]
+
+    def check_reference(self, file: str, field: str, name: str, collection: str) -> None:
+        """Add a fault if the item ``name`` is missing in the collection."""
+        if self.is_missing(collection, name):
+            where = place_of_collection(collection, self.files_of(collection))
+            where = where.replace("inventory/", "")
+            # thousands of names may be unknown, and only the first faults of a file are listed
+            is_listed = self._counts[file] < MOST_FAULTS
+            hint = suggestion(name, self._places[collection]) if is_listed else ""
+            self.add_fault(file, field, f"'{name}' is not in {where}{hint}")
+
+    def _valid(
+        self,
+        validate: Callable[[Any], Valid],
+        value: object,
+        model: type[BaseModel],
+        file: str,
+        place: tuple[int | str, ...],
+    ) -> Valid | None:
+        try:
+            return validate(value)
+        except ValidationError as error:
+            self.faults += faults_of(error, model, file, place)
+            return None

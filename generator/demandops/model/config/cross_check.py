@@ -1,0 +1,598 @@
+"""Refuses two overrides of equal priority that could change one release differently.
+
+Such a pair needs an order, and only different priorities give one. It is refused even if no release
+matches both overrides yet, because a later demand could add a release that does.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from bisect import bisect_left, insort
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+
+from demandops.base import naming, strict_yaml
+from demandops.base.errors import InvalidInput, suggestion
+from demandops.connections import connection_types
+from demandops.model.config.appdef import Deployed, ServiceDefinition
+from demandops.model.config.config import (
+    BROKERS_FILE,
+    CHARTS_FILE,
+    CLIENTS_FILE,
+    CLUSTERS_FILE,
+    DOMAINS_FILE,
+    IMAGES_FILE,
+    NODES_FILE,
+    VERSIONS_FILE,
+    Config,
+    ConfigReader,
+)
+from demandops.model.config.inventory import comparable_kind, kind_of
+from demandops.model.config.override import Override, Selector, by_rank, patched_settings
+from demandops.model.config.policy import matches
+from demandops.model.config.registry import ChartSource
+from demandops.templating import chart_files
+
+_MERGED = ("values", "images")
+_SINGLE = ("version", "replicas", "node")
+_FROZEN = (*_SINGLE, *_MERGED)
+
+
+# A merge may bring thousands of overrides, each of which contradicts all others
+_MOST_SHOWN = 3
+_INDEXED = ("nodes", "services", "applications", "connections", "appdefs")
+
+
+def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
+    contests = defaultdict[tuple[int, tuple[str, ...]], list[tuple[Override, str]]](list)
+    for override in by_rank(config.overrides.values()):
+        for what, token in _settings(override):
+            contests[override.priority, what].append((override, token))
+    rivals = defaultdict[str, dict[str, Override]](dict)
+    for contenders in contests.values():
+        if len({token for _, token in contenders}) > 1:
+            for rival, override in _rivals(contenders, config):
+                rivals[override.name][rival.name] = rival
+    for override in by_rank(config.overrides[name] for name in rivals):
+        for rival in by_rank(rivals[override.name].values())[:_MOST_SHOWN]:
+            names = " and ".join(f"'{name}'" for name in contested_effects(rival, override))
+            reader.add_fault(
+                override.path,
+                "priority",
+                f"is {override.priority}, as in {rival.path}, and both overrides may set {names} "
+                "of the same release; change one of the priorities, or select different releases",
+            )
+
+
+def _settings(override: Override) -> Iterator[tuple[tuple[str, ...], str]]:
+    """Yield (what, token) for all that an override sets; another token contradicts it."""
+    for name in _SINGLE:
+        if (value := getattr(override, name)) is not None:
+            yield (name,), str(value)
+    yield from _leaves(("values",), override.values or {})
+    for name, pin in (override.images or {}).items():
+        yield ("images", name), pin.model_dump_json()
+    if override.hold or any(name in _FROZEN for name in override.effects()):
+        yield ("hold",), str(override.hold)
+
+
+def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, ...], str]]:
+    if not isinstance(patch, Mapping):
+        yield path, json.dumps(patch, sort_keys=True)
+        return
+    yield path, "mapping"
+    for key, value in patch.items():
+        yield from _leaves((*path, key), value)
+
+
+def _rivals(
+    contenders: list[tuple[Override, str]], config: Config
+) -> Iterator[tuple[Override, Override]]:
+    """Yield (earlier, later) for overrides with different tokens that may select one release.
+
+    Each later one is yielded with at most three others.
+    """
+    # Only selectors are compared whose patterns begin alike in one field, the one in which the
+    # selectors differ most. So the cost grows with the number of overrides, not with that of pairs,
+    # unless patterns hardly differ.
+    shares = shares_any_clients(config)
+
+    def crowding(field: str) -> int:
+        starts = Counter(
+            s for o, _ in contenders for left in o.select for s in starts_of(left, field)
+        )
+        return sum(count * (count - 1) for count in starts.values())
+
+    def starts_of(selector: Selector, field: str) -> set[str]:
+        patterns = (
+            getattr(selector, field)
+            if field in _separating_fields(selector, selector, config, shares)
+            else ()
+        )
+        return {re.split("[*?]", pattern)[0] for pattern in patterns or ("",)}
+
+    field = min(_INDEXED, key=crowding)
+    earlier: dict[str, dict[str, list[tuple[Override, Selector]]]] = {}
+    starts: list[str] = []  # the keys of `earlier`, sorted
+
+    def alike(start: str) -> Iterator[str]:
+        """Yield the starts that begin with ``start`` or with which ``start`` begins."""
+        yield from (start[:end] for end in range(len(start)) if start[:end] in earlier)
+        for place in range(bisect_left(starts, start), len(starts)):
+            if not starts[place].startswith(start):
+                return
+            yield starts[place]
+
+    for override, token in contenders:
+        rivals = dict[str, Override]()
+        for right in override.select:
+            for start in starts_of(right, field):
+                if len(rivals) < _MOST_SHOWN:
+                    near = (
+                        pair
+                        for begin in alike(start)
+                        for other_token, pairs in earlier[begin].items()
+                        if other_token != token
+                        for pair in pairs
+                    )
+                    for rival, left in near:
+                        if rival.name not in rivals and may_match_same_release(
+                            left, right, config, shares
+                        ):
+                            rivals[rival.name] = rival
+                            if len(rivals) == _MOST_SHOWN:
+                                break
+        for right in override.select:
+            for start in starts_of(right, field):
+                if start not in earlier:
+                    insort(starts, start)
+                earlier.setdefault(start, {}).setdefault(token, []).append((override, right))
+        yield from ((rival, override) for rival in rivals.values())
+
+
+def contested_effects(first: Override, second: Override) -> list[str]:
+    """Return the effects for which the order of two overrides matters."""
+    contested = [
+        name
+        for name in _SINGLE
+        if None not in (left := getattr(first, name), right := getattr(second, name))
+        and left != right
+    ]
+    if first.values and second.values and not patches_commute(first.values, second.values):
+        contested.append("values")
+    pins = (first.images or {}, second.images or {})
+    contested += [
+        f"images.{name}"
+        for name in sorted({*pins[0]} & {*pins[1]})
+        if pins[0][name] != pins[1][name]
+    ]
+    for holding, shaping in ((first, second), (second, first)):
+        effects = [name for name in shaping.effects() if name in _FROZEN]
+        if holding.hold and effects:
+            contested += ["hold", *effects]
+    return contested
+
+
+def patches_commute(first: object, second: object) -> bool:
+    """Return whether two merge patches have the same result in either order."""
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return all(patches_commute(first[key], second[key]) for key in first if key in second)
+    # unlike ==, JSON distinguishes 1 from True
+    return json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)
+
+
+def may_match_same_release(
+    first: Selector, second: Selector, config: Config, shares_clients: bool
+) -> bool:
+    """Return whether some release, now or later, may match both selectors."""
+    if (first.connections and _selects_services(second)) or (
+        second.connections and _selects_services(first)
+    ):
+        return False
+    for name in _separating_fields(first, second, config, shares_clients):
+        left, right = getattr(first, name), getattr(second, name)
+        if left and right and not _any_overlap(left, right):
+            return False
+    left, right = first.labels or {}, second.labels or {}
+    return all(left[key] == right[key] for key in left if key in right)
+
+
+def _any_overlap(left: Iterable[str], right: Iterable[str]) -> bool:
+    """Return whether some text matches a pattern of both sides."""
+    plain = [{text for text in side if not {*text} & {*"*?"}} for side in (left, right)]
+    if plain[0] & plain[1]:
+        return True
+    # two texts without wildcards overlap only if they are equal, and lists of names may be long
+    return any(
+        patterns_overlap(first, second)
+        for first in left
+        for second in ({*right} - plain[1] if first in plain[0] else right)
+    )
+
+
+def _selects_services(selector: Selector) -> bool:
+    return bool(selector.applications or selector.appdefs or selector.services)
+
+
+def shares_any_clients(config: Config) -> bool:
+    return any(kind.shares_clients(config) for kind in connection_types.CONNECTION_TYPES)
+
+
+def _separating_fields(
+    first: Selector, second: Selector, config: Config, shares_clients: bool
+) -> Iterator[str]:
+    """Yield the fields in which selectors must overlap to match the same release."""
+    # A release has only one service and one node. But a shared service has many applications and
+    # requesters, and a Zenoh bridge has many connections.
+    yield from ("services", "nodes")
+    may_match_shared_service = any(
+        service.scope != "application"
+        and all(not s.services or matches(name, s.services) for s in (first, second))
+        for services in config.services.values()
+        for name, service in services.items()
+    )
+    if not may_match_shared_service:
+        yield from ("applications", "appdefs")
+    if first.connections and second.connections and not shares_clients:
+        yield "connections"
+
+
+def patterns_overlap(first: str, second: str) -> bool:
+    # row[i]: whether the part of `first` read so far overlaps with i characters of `second`
+    row = [not second[:length].strip("*") for length in range(len(second) + 1)]
+    for a in first:
+        after = [row[0] and a == "*"]
+        for b, above, before in zip(second, row[1:], row, strict=False):
+            if "*" in (a, b):
+                after.append(above or after[-1])
+            else:
+                after.append(before and (a == b or "?" in (a, b)))
+        row = after
+    return row[-1]
+
+
+# ---- cross check ----
+#
+# Checks across files and entries, for example for an unknown cluster or a prefix used twice.
+#
+# The checks run after all files are parsed. Every check runs, and a :class:`ConfigReader` collects
+# all faults.
+
+
+def cross_check(config: Config, reader: ConfigReader) -> None:
+    for check in (
+        _check_inventory,
+        _check_domains,
+        _check_host_network,
+        _check_charts,
+        _check_services,
+        _check_uses,
+        _check_versions,
+        _check_wire_types,
+    ):
+        check(config, reader)
+    for connection_type in connection_types.by_number():
+        reader.faults += connection_type.config_faults(config, reader)
+    _check_overrides(config, reader)
+    check_override_conflicts(config, reader)
+
+
+def _check_inventory(config: Config, reader: ConfigReader) -> None:
+    roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
+    folders: dict[str, str] = {}
+    for node in config.nodes.values():
+        file, place = reader.place_of(NODES_FILE, node.id)
+        other = folders.setdefault(folder := naming.object_name("", node.id), node.id)
+        if other != node.id:
+            message = f"'{other}' has the folder {folder} too; choose another id"
+            reader.add_fault(file, f"{place}.id", message)
+        reader.check_reference(file, f"{place}.cluster", node.cluster, CLUSTERS_FILE)
+        for peer in node.bridged:
+            reader.check_reference(file, f"{place}.bridged.{peer}", peer, NODES_FILE)
+        for name, value in node.properties.items():
+            kind, first = config.property_kinds[name]
+            if kind_of(value) != kind and node.id not in config.hosts:  # once for each host
+                where = f"at '{first}' in {config.file_of(NODES_FILE, first)}"
+                message = f"is {kind_of(value)}, but the property is {kind} {where}"
+                message += "; give it the same type on all nodes"
+                reader.add_fault(file, f"{place}.properties.{name}", message)
+        for role in node.topics:
+            if roles and role not in roles:
+                message = f"'{role}' is not an input of any application{suggestion(role, roles)}"
+                reader.add_fault(file, f"{place}.topics.{role}", message)
+    for broker in config.brokers.values():
+        file, place = reader.place_of(BROKERS_FILE, broker.node)
+        reader.check_reference(file, f"{place}.node", broker.node, NODES_FILE)
+
+
+def _check_domains(config: Config, reader: ConfigReader) -> None:
+    argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
+    seen: dict[str, str] = {}
+    for domain in config.domains.values():
+        file, place = reader.place_of(DOMAINS_FILE, domain.name)
+        for broker in domain.broker_credentials:
+            field = f"{place}.brokerCredentials.{broker}"
+            reader.check_reference(file, field, broker, BROKERS_FILE)
+        other = seen.setdefault(domain.namespace, domain.name)
+        if other != domain.name:
+            reader.add_fault(
+                file,
+                f"{place}.namespace",
+                f"'{domain.namespace}' is already the namespace of '{other}'; give each "
+                "access domain its own namespace",
+            )
+        if argocd and domain.namespace == argocd.namespace:
+            reader.add_fault(
+                file,
+                f"{place}.namespace",
+                f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
+                "all that Argo CD may; choose another namespace",
+            )
+
+
+def _check_host_network(config: Config, reader: ConfigReader) -> None:
+    for node in config.nodes.values():
+        domain = config.domain_of.get(node.id)
+        if domain and domain.pod_security == "baseline" and node.host_network:
+            file, place = reader.place_of(NODES_FILE, node.id)
+            message = (
+                f"is true (the default), and podSecurity of access domain '{domain.name}' is "
+                "baseline, which forbids it; set 'hostNetwork: false' or "
+                "'podSecurity: host-network'"
+            )
+            reader.add_fault(file, f"{place}.hostNetwork", message)
+    closed = [d.name for d in config.domains.values() if d.pod_security == "baseline"]
+    for word, file in config.entry_files[CLIENTS_FILE].items():
+        if closed and config.clients.of(word).host_network:
+            message = (
+                f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
+                "forbids it; leave it out, so that each client has the setting of its node"
+            )
+            reader.add_fault(file, f"{word}.hostNetwork", message)
+
+
+def _check_charts(config: Config, reader: ConfigReader) -> None:
+    for name, chart in config.charts.items():
+        file, place = reader.place_of(CHARTS_FILE, name)
+        _check_chart(file, place, chart, config, reader)
+        for channel, source in chart.channels.items():
+            _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
+    tops = (source.folder for chart in config.charts.values() for source in chart.sources())
+    folders = (each for top in tops if top for each in chart_files.folders(top, config.files))
+    for folder in dict.fromkeys(folders):  # each library once, in the order in which it is needed
+        reader.faults += chart_files.faults(folder, config.files)
+
+
+def _check_chart(
+    file: str, where: str, chart: ChartSource, config: Config, reader: ConfigReader
+) -> None:
+    if not chart.folder:
+        return
+    path = f"{chart.folder}/Chart.yaml"
+    text = config.files.get(path)
+    if text is None:
+        message = f"'{path}' does not exist; correct the folder"
+        if not path.startswith("appdefs/"):
+            message = f"'{chart.folder}' is not in appdefs/; move the chart there"
+        reader.add_fault(file, f"{where}.folder", message)
+        return
+    try:
+        metadata = strict_yaml.load(text, path)
+    except InvalidInput as error:
+        reader.faults += error.faults
+        return
+    version = metadata.get("version") if isinstance(metadata, dict) else None
+    if version != chart.version:
+        message = f"is {chart.version}, but {path} says {version}; make them equal"
+        if version is None:
+            message = f"is {chart.version}, but {path} has no version; add it there"
+        reader.add_fault(file, f"{where}.version", message)
+
+
+def _check_services(config: Config, reader: ConfigReader) -> None:
+    prefixes: dict[str, tuple[str, str]] = {}
+    files: dict[str, str] = {}
+    words = {connection_type.word for connection_type in connection_types.CONNECTION_TYPES}
+    for file, where, name, service in _defined_services(config):
+        folder, _, own = file.rpartition("/")
+        reader.check_reference(file, f"{where}chart", service.chart, CHARTS_FILE)
+        for image in service.images:
+            reader.check_reference(file, f"{where}images", image, IMAGES_FILE)
+        if f"{folder}/{service.values}" not in config.files:
+            message = f"'{service.values}' does not exist; add it beside {own}"
+            reader.add_fault(file, f"{where}values", message)
+        for word, value in (service.place.properties if service.place else {}).items():
+            kind, first = config.property_kinds.get(word, (None, ""))
+            if kind and comparable_kind(value) != kind:
+                registry = config.file_of(NODES_FILE, first)
+                message = (
+                    f"asks for {comparable_kind(value)}, but the property is {kind} at '{first}' "
+                    f"in {registry}; ask for {kind}"
+                )
+                reader.add_fault(file, f"{where}place.properties.{word}", message)
+        if service.prefix in words:
+            message = f"'{service.prefix}' is the prefix of connections; choose another prefix"
+            reader.add_fault(file, f"{where}prefix", message)
+            continue
+        if service.each or isinstance(service, ServiceDefinition):
+            other = files.setdefault(name, file)
+            if other != file:
+                reader.add_fault(
+                    file,
+                    where.rstrip("."),
+                    f"'{name}' is defined in {other} too; choose another name, or define it once "
+                    f"in appdefs/{name}/service.yaml and use it in both",
+                )
+                continue
+        # releases of two services with one prefix could have the same name
+        owner = prefixes.setdefault(service.prefix, (file, name))
+        if owner != (file, name):
+            message = (
+                f"'{service.prefix}' is already the prefix of '{owner[1]}'; choose another prefix"
+            )
+            reader.add_fault(file, f"{where}prefix", message)
+
+
+def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
+    """Yield (file, beginning of its fields' paths, name, definition) for each service."""
+    for appdef in config.appdefs.values():
+        for name, service in appdef.services.items():
+            yield f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, service
+    for name, definition in config.definitions.items():
+        yield f"appdefs/{name}/service.yaml", "", name, definition
+
+
+def _check_uses(config: Config, reader: ConfigReader) -> None:
+    origins: dict[str, tuple[str, str]] = {}
+    for name, definition in config.definitions.items():
+        file = f"appdefs/{name}/service.yaml"
+        for cluster, node in definition.nodes.items():
+            reader.check_reference(file, f"nodes.{cluster}", cluster, CLUSTERS_FILE)
+            reader.check_reference(file, f"nodes.{cluster}", node, NODES_FILE)
+            actual = config.nodes[node].cluster if node in config.nodes else cluster
+            if actual != cluster:
+                message = f"'{node}' is in cluster '{actual}'; name a node of '{cluster}'"
+                reader.add_fault(file, f"nodes.{cluster}", message)
+    for appdef, services in config.services.items():
+        for name, service in services.items():
+            if not service.shared or service.each is None:
+                continue
+            # one instance for each topic serves all appdefs, so they must mean the same topics
+            origin = service.inputs[service.each]
+            first, other = origins.setdefault(name, (appdef, origin))
+            if origin != other:
+                reader.add_fault(
+                    f"appdefs/{appdef}/appdef.yaml",
+                    f"uses.{name}.{service.each}",
+                    f"is '{origin}', but '{other}' in appdefs/{first}/appdef.yaml; both "
+                    "definitions share the service, so give this input the same origin in both",
+                )
+
+
+def _check_versions(config: Config, reader: ConfigReader) -> None:
+    for name, appdef in config.appdefs.items():
+        # an invalid entry may be the missing one
+        is_unlisted = not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, name)
+        if appdef.versions != "refuse" and is_unlisted:
+            reader.add_fault(
+                f"appdefs/{name}/appdef.yaml",
+                "versions",
+                f"is {appdef.versions}, but {config.place_of(VERSIONS_FILE)} does not list the "
+                f"versions of '{name}'; add them there, or remove 'versions'",
+            )
+        if appdef.versions == "separate":
+            _check_separate(name, config, reader)
+    for name, listed in config.versions.items():
+        file, place = reader.place_of(VERSIONS_FILE, name)
+        if name not in config.appdefs:
+            # an appdef.yaml that exists but is invalid has faults of its own
+            if f"appdefs/{name}/appdef.yaml" not in reader.files:
+                hint = suggestion(name, config.appdefs)
+                reader.add_fault(file, place, f"'{name}' is not an application definition{hint}")
+            continue
+        services = config.services.get(name, {}).values()
+        if not services:  # the definition has faults of its own
+            continue
+        charts = {service.chart for service in services}
+        images = {image for service in services for image in service.images}
+        for version, contents in listed.versions.items():
+            where = f"{place}.versions.{version}"
+            for chart, wanted in contents.charts.items():
+                _check_used(file, f"{where}.charts.{chart}", chart, charts, name, reader)
+                listed_chart = config.charts.get(chart) if chart in charts else None
+                if listed_chart is not None and listed_chart.at(wanted) is None:
+                    sources = listed_chart.sources()
+                    hint = suggestion(wanted, [source.version for source in sources])
+                    registry = config.file_of(CHARTS_FILE, chart)
+                    message = f"'{wanted}' is not a version of {chart} in {registry}{hint}"
+                    reader.add_fault(file, f"{where}.charts.{chart}", message)
+            for image in contents.images:
+                _check_used(file, f"{where}.images.{image}", image, images, name, reader)
+
+
+def _check_separate(appdef: str, config: Config, reader: ConfigReader) -> None:
+    services = config.services.get(appdef, {})
+    for name, service in services.items():
+        origin = service.inputs[service.each] if service.shared and service.each else ""
+        producer = services.get(origin.partition(".")[0])
+        if producer is not None and not producer.shared:
+            reader.add_fault(
+                f"appdefs/{appdef}/appdef.yaml",
+                f"uses.{name}.{service.each}",
+                f"the shared service '{name}' reads '{origin}' and runs once for all versions, but "
+                f"'{producer.name}' runs once for each version (versions: separate); make "
+                f"'{producer.name}' a shared service too, or define '{name}' in this appdef",
+            )
+
+
+def _check_used(
+    file: str, where: str, name: str, used: set[str], appdef: str, reader: ConfigReader
+) -> None:
+    if name not in used:
+        message = f"no service of {appdef} uses '{name}'{suggestion(name, used)}"
+        reader.add_fault(file, where, message)
+
+
+def _check_wire_types(config: Config, reader: ConfigReader) -> None:
+    seen: dict[int, str] = {}
+    for appdef in config.appdefs.values():
+        if appdef.deployment_request is None:
+            continue
+        number = appdef.deployment_request.type
+        other = seen.setdefault(number, appdef.name)
+        if other != appdef.name:
+            reader.add_fault(
+                f"appdefs/{appdef.name}/appdef.yaml",
+                "deploymentRequest.type",
+                f"{number} already names '{other}'; choose another number",
+            )
+
+
+def _check_overrides(config: Config, reader: ConfigReader) -> None:
+    for override in config.overrides.values():
+        for image in override.images or ():
+            reader.check_reference(override.path, f"images.{image}", image, IMAGES_FILE)
+        if override.node is not None:
+            reader.check_reference(override.path, "node", override.node, NODES_FILE)
+        selected = [
+            service
+            for appdef, services in config.services.items()
+            for name, service in services.items()
+            for selector in override.select
+            if selector.takes(name, appdef)
+        ]
+        if override.node is not None:
+            if selected and not any(service.is_movable for service in selected):
+                message = (
+                    f"moves nothing, because {selected[0].name} runs at its sources or at the "
+                    "nodes that its definition lists; change its definition, or remove 'node'"
+                )
+                reader.add_fault(override.path, "node", message)
+            if (
+                override.node in config.nodes
+                and override.node not in config.domain_of
+                and config.domains
+                and reader.is_complete(DOMAINS_FILE)
+                # a node that several domains match is in none, and has a fault of its own
+                and not any(matches(override.node, d.nodes) for d in config.domains.values())
+            ):
+                message = f"'{override.node}' is not in any access domain; add it to one in "
+                message += config.place_of(DOMAINS_FILE)
+                reader.add_fault(override.path, "node", message)
+        if override.values and override.patches_clients():
+            try:
+                # MQTT clients have every field that other clients have
+                patched_settings(config.clients.mqtt, override.values, override.path)
+            except InvalidInput as error:
+                reader.faults += error.faults
+        charts = {service.chart for service in selected} & {*config.charts}
+        versions = {version for chart in charts for version in config.charts[chart].versions()}
+        if override.version and versions and override.version not in versions:
+            reader.add_fault(
+                override.path,
+                "version",
+                f"'{override.version}' is not a version or channel that "
+                f"{config.place_of(CHARTS_FILE)} has for a selected chart"
+                f"{suggestion(override.version, versions)}",
+            )

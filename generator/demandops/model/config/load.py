@@ -1,0 +1,337 @@
+"""Loading of the configuration: the files' texts become a :class:`Config`.
+
+The functions here are pure. If any file has a fault, the whole configuration is rejected, with
+every fault of every file.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Mapping
+from pathlib import PurePosixPath
+from types import MappingProxyType
+from typing import TypeVar
+
+from demandops.base.errors import InvalidInput
+from demandops.base.quoting import quoted
+from demandops.base.settings import API_VERSION, RENDER_VERSION
+from demandops.model.config.appdef import (
+    ApplicationDefinition,
+    ServiceDefinition,
+    Services,
+    resolved_services,
+)
+from demandops.model.config.config import (
+    BROKERS_FILE,
+    CHARTS_FILE,
+    CLIENTS_FILE,
+    CLUSTERS_FILE,
+    COLLECTIONS,
+    DOMAINS_FILE,
+    IMAGES_FILE,
+    NODES_FILE,
+    VERSIONS_FILE,
+    Config,
+    ConfigReader,
+    collection_of,
+)
+from demandops.model.config.cross_check import cross_check
+from demandops.model.config.inventory import (
+    Broker,
+    BrokersFile,
+    Cluster,
+    ClustersFile,
+    Node,
+    NodesFile,
+    id_in_domain,
+)
+from demandops.model.config.override import OVERRIDES_ROOT, Override, OverrideFile
+from demandops.model.config.policy import AccessDomain, AccessDomainsFile, matches
+from demandops.model.config.registry import (
+    DEFAULT_SETTINGS,
+    Chart,
+    ChartsFile,
+    ClientsFile,
+    Image,
+    ImagesFile,
+    VersionList,
+    VersionsFile,
+)
+from demandops.model.config.repo_settings import ROOT_FILE, Flux, RepoSettings
+
+Definition = TypeVar("Definition", ApplicationDefinition, ServiceDefinition)
+
+_NAME = re.compile(r"[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?")
+_ANY = RepoSettings(
+    apiVersion=API_VERSION,
+    kind="StateRepository",
+    gitops="flux",
+    renderVersion=RENDER_VERSION,
+    flux=Flux(url="https://unread.invalid/repo.git"),
+)  # replaces settings that are not valid, so that the other files can be checked
+
+
+def load(files: Mapping[str, str]) -> Config:
+    """Return the configuration of a state repo; files outside of the configuration are ignored."""
+    reader = ConfigReader(files)
+    repository = reader.read_file(ROOT_FILE, RepoSettings)
+    if repository and repository.render_version > RENDER_VERSION:
+        reader.add_fault(
+            ROOT_FILE,
+            "renderVersion",
+            f"is {repository.render_version}, but this generator renders version "
+            f"{RENDER_VERSION}; write {RENDER_VERSION}, or update the generator if `demandops "
+            "upgrade` of a newer one wrote this",
+        )
+    if repository and getattr(repository, repository.gitops) is None:
+        reader.add_fault(
+            ROOT_FILE,
+            repository.gitops,
+            f"is missing, but 'gitops' is {repository.gitops}; add it, with the 'url' from which "
+            "the clusters fetch this repo",
+        )
+    _refuse_unread(reader)
+    nodes = reader.read_items(NODES_FILE, NodesFile, "nodes", Node, "id")
+    domains = reader.read_items(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
+    appdefs = _read_definitions(reader, "appdef.yaml", ApplicationDefinition)
+    definitions = _read_definitions(reader, "service.yaml", ServiceDefinition)
+    services = {
+        name: _services_of(appdef, definitions, nodes.values(), reader)
+        for name, appdef in appdefs.items()
+    }
+    clients, client_files = _read_clients(reader)
+    domain_of = _domains_of_nodes(reader, nodes, domains)
+    all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
+    clusters = reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name")
+    brokers = reader.read_items(BROKERS_FILE, BrokersFile, "brokers", Broker, "node")
+    charts = reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart)
+    images = reader.read_items(IMAGES_FILE, ImagesFile, "images", Image)
+    for name, image in images.items():
+        head = reader.head(reader.place_of(IMAGES_FILE, name)[0], ImagesFile)
+        if head is not None and head.registry is not None:
+            images[name] = image.pulled_from(head.registry)
+    versions: Mapping[str, VersionList] = {}
+    if reader.files_of(VERSIONS_FILE):  # unlike the other collections, this one may have no file
+        versions = reader.read_items(VERSIONS_FILE, VersionsFile, "applications", VersionList)
+    config = Config(
+        repo_settings=repository or _ANY,
+        clusters=clusters,
+        nodes={id: _in_ros_domain(node, domain_of.get(id)) for id, node in all_nodes.items()},
+        brokers=brokers,
+        domains=domains,
+        charts=charts,
+        images=images,
+        clients=clients,
+        versions=versions,
+        appdefs=appdefs,
+        definitions=definitions,
+        services=MappingProxyType(services),
+        domain_of=domain_of,
+        hosts=hosts,
+        files=MappingProxyType({p: text for p, text in files.items() if p.startswith("appdefs/")}),
+        overrides=_read_overrides(reader),
+        entry_files={**reader.entry_files(), CLIENTS_FILE: client_files},
+    )
+    cross_check(config, reader)
+    if reader.faults:
+        raise InvalidInput(dict.fromkeys(reader.faults))
+    return config
+
+
+def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
+    """Return the settings of all connection types, and for each type the file with its settings."""
+    clients, files = DEFAULT_SETTINGS, dict[str, str]()
+    for file in reader.files_of(CLIENTS_FILE):
+        part = reader.read_file(file, ClientsFile)
+        words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
+        for word in sorted(words):
+            first = files.setdefault(word, file)
+            if first != file:
+                reader.add_duplicate(word, (first, word), (file, word))
+            clients = clients.model_copy(update={word: getattr(part, word)})
+    return clients, files
+
+
+def _refuse_unread(reader: ConfigReader) -> None:
+    # whoever mistypes a file's name must not believe that its entries are in force
+    folders = {collection.partition("/")[0] for collection in COLLECTIONS}
+    for path in sorted(reader.files):
+        folder, *names = path.split("/")
+        if folder not in folders or not path.endswith((".yaml", ".yml")):
+            continue
+        if collection_of(path) is None and not any(name.startswith(".") for name in names):
+            stems = [PurePosixPath(file).stem for file in COLLECTIONS if file.startswith(folder)]
+            reader.add_fault(
+                path,
+                "",
+                f"is not read; only <name>.yaml and <name>/*.yaml in {folder}/ are read, where "
+                f"<name> is one of {', '.join(sorted(stems))}; rename the file, or remove it",
+            )
+
+
+def _read_definitions(
+    reader: ConfigReader, file: str, model: type[Definition]
+) -> Mapping[str, Definition]:
+    """Return the definitions in all valid files ``appdefs/<folder>/{file}``, by folder."""
+    definitions = {}
+    for path in sorted(reader.files):
+        parts = path.split("/")
+        if len(parts) != 3 or parts[0] != "appdefs" or parts[2] != file:
+            continue
+        folder, definition = parts[1], reader.read_file(path, model)
+        if definition is None:
+            continue
+        if definition.name != folder:
+            message = f"is '{definition.name}', but the folder is '{folder}'; make them equal"
+            reader.add_fault(path, "name", message)
+            # go on with the folder's name, so that others who use it get no fault
+            definition = definition.model_copy(update={"name": folder})
+        definitions[folder] = definition
+    return MappingProxyType(definitions)
+
+
+def _services_of(
+    appdef: ApplicationDefinition,
+    definitions: Mapping[str, ServiceDefinition],
+    nodes: Iterable[Node],
+    reader: ConfigReader,
+) -> Services:
+    files = {f"appdefs/{name}/service.yaml" for name in appdef.uses.keys() - definitions.keys()}
+    if files & reader.files.keys():  # an invalid definition, which has faults of its own
+        return {}
+    resolved, problems = resolved_services(appdef, definitions)
+    for where, problem in problems:
+        reader.add_fault(f"appdefs/{appdef.name}/appdef.yaml", where, problem)
+    services = dict(resolved)
+    for name, service in resolved.items():
+        if service.nodes:
+            runs_at = {}
+            for node in nodes:
+                if service_node := service.nodes.get(node.cluster):
+                    further = (id_in_domain(node.id, d.name) for d in node.access_domains)
+                    runs_at.update(dict.fromkeys((node.id, *further), service_node))
+            services[name] = service.model_copy(update={"runs_at": runs_at})
+    return services
+
+
+def is_override_name(name: str) -> bool:
+    return _NAME.fullmatch(name) is not None
+
+
+def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
+    overrides = {}
+    for path in sorted(reader.files):
+        folder, _, name = path.partition("/")
+        if folder != OVERRIDES_ROOT or name.startswith(".") or name.endswith(".md"):
+            continue
+        stem = name.removesuffix(".yaml")
+        if stem == name or not is_override_name(stem):
+            reader.add_fault(
+                path,
+                "",
+                "is not an override file; rename it to overrides/<name>.yaml, where <name> has up "
+                "to 63 lower-case letters, digits and '-' between them, or remove it",
+            )
+            continue
+        file = reader.read_file(path, OverrideFile)
+        if file is not None:
+            overrides[stem] = Override.from_file(stem, file)
+    return MappingProxyType(overrides)
+
+
+def _in_ros_domain(node: Node, domain: AccessDomain | None) -> Node:
+    if domain is None or domain.ros is None:
+        return node
+    ros = node.ros.model_copy(update={"domain_id": domain.ros.domain_id})
+    return node.model_copy(update={"ros": ros})
+
+
+def _in_further_domains(
+    reader: ConfigReader,
+    nodes: Mapping[str, Node],
+    domains: Mapping[str, AccessDomain],
+    domain_of: Mapping[str, AccessDomain],
+) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
+    """Return nodes, domains and hosts, with a node ``<id>@<domain>`` for each further domain."""
+    # Everything follows from the node: namespace, rules, quotas, keys of releases. A domain beside
+    # each node would have to be asked for at each place, and a place that forgets it would mix the
+    # data of two domains.
+    nodes, domain_of, hosts = dict(nodes), dict(domain_of), dict[str, str]()
+    for node in [node for node in nodes.values() if node.access_domains]:  # `nodes` grows
+        file, place = reader.place_of(NODES_FILE, node.id)
+        first = domain_of.get(node.id)
+        ros = {_in_ros_domain(node, first).ros.domain_id: first.name} if first else {}
+        for index, further in enumerate(node.access_domains):
+            where, id = f"{place}.accessDomains[{index}]", id_in_domain(node.id, further.name)
+            domain = domains.get(further.name)
+            reader.check_reference(file, f"{where}.name", further.name, DOMAINS_FILE)
+            if first is None:
+                # the node may be in an invalid domain, or in several, which has a fault of its own
+                is_matched = any(matches(node.id, d.nodes) for d in domains.values())
+                if not is_matched and reader.is_complete(DOMAINS_FILE):
+                    message = f"no access domain has '{node.id}' in its nodes; add it to one"
+                    reader.add_fault(file, where, message)
+            elif domain is first or id in nodes:
+                message = f"'{node.id}' is already in '{further.name}'; remove this entry"
+                if domain is not first and id not in hosts:
+                    message = f"a node of the inventory has the id '{id}'; rename that node"
+                reader.add_fault(file, f"{where}.name", message)
+            elif domain is not None:
+                number = _in_ros_domain(node, domain).ros.domain_id
+                other = ros.setdefault(number, domain.name)
+                if other != domain.name:
+                    message = (
+                        f"access domains '{other}' and '{domain.name}' share ROS domain {number}, "
+                        f"so each would read the other's topics on '{node.id}'; give one of them "
+                        "'ros: {domainId: …}' in " + reader.place_of(DOMAINS_FILE, domain.name)[0]
+                    )
+                    reader.add_fault(file, f"{where}.name", message)
+                # the first domain keeps the plain name, so a further one changes nothing that runs
+                nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
+                reader.add_alias(NODES_FILE, id, node.id)
+    return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
+
+
+# How many of the domains that match one node a message names
+_MOST_DOMAINS = 3
+
+
+def _domains_of_nodes(
+    reader: ConfigReader, nodes: Mapping[str, Node], domains: Mapping[str, AccessDomain]
+) -> Mapping[str, AccessDomain]:
+    owner: dict[str, AccessDomain] = {}
+    # by the text before the first wildcard: both lists may be long, and hardly any pair matches
+    by_start = defaultdict[str, dict[str, list[str]]](dict)
+    for name, domain in domains.items():
+        for pattern in domain.nodes:
+            by_start[re.split("[*?]", pattern)[0]].setdefault(name, []).append(pattern)
+    for node in nodes:
+        matches_of_node = (
+            (name, pattern)
+            for end in range(len(node) + 1)
+            for name, patterns in by_start.get(node[:end], {}).items()
+            for pattern in patterns
+            if matches(node, (pattern,))
+        )
+        matching: dict[str, str] = {}
+        for name, pattern in matches_of_node:
+            matching.setdefault(name, pattern)
+            if len(matching) > _MOST_DOMAINS:
+                break
+        if len(matching) > 1:  # an overlap by accident must not move the node
+            by = " and ".join(
+                f"'{name}' by {quoted(pattern)} in {reader.place_of(DOMAINS_FILE, name)[0]}"
+                for name, pattern in sorted(matching.items())[:_MOST_DOMAINS]
+            )
+            file, place = reader.place_of(NODES_FILE, node)
+            reader.add_fault(
+                file,
+                f"{place}.id",
+                f"'{node}' is in the access domains {by}; narrow these patterns so that only one "
+                "domain matches the node, and list the other domains under 'accessDomains' of the "
+                "node",
+            )
+        elif matching:
+            owner[node] = domains[next(iter(matching))]
+    return MappingProxyType(owner)

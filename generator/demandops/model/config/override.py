@@ -1,0 +1,312 @@
+"""Overrides: a person's declared deviations, one file each in ``overrides/``.
+
+This module has the model and the rules for one override. The module
+:mod:`.cross_check` finds conflicts between two overrides, and the
+package ``plan/overrides`` applies overrides to releases and claims.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import AfterValidator, Field, StringConstraints, ValidationError, model_validator
+
+from demandops.base.errors import InvalidInput, sentences
+from demandops.base.naming import id_problem
+from demandops.base.quoting import quoted
+from demandops.model.config.base_model import (
+    DnsLabel,
+    FileModel,
+    FrozenModel,
+    Items,
+    Text,
+    Visible,
+    faults_of,
+    readable_by,
+    without,
+)
+from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
+from demandops.model.config.policy import matches
+from demandops.model.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
+from demandops.templating.chart_files import merge_patch
+
+OVERRIDES_ROOT = "overrides"
+
+_MOMENT = re.compile(
+    r"(\d{4}-\d\d-\d\d)[Tt ](\d\d:\d\d:\d\d)(?:\.(\d{1,6})\d*)?([Zz]|[+-]\d\d:\d\d)"
+)
+_SHAPING = ("values", "version", "images", "replicas", "node")
+_OF_SERVICES = ("version", "replicas", "node")
+# The effects of overrides, in the order in which messages list them
+EFFECTS = (*_SHAPING, "hold", "deny", "keep")
+
+
+def parse_time(text: str) -> datetime:
+    """Parse an RFC 3339 time that has a time zone, and return it in UTC, or raise ValueError."""
+    match = _MOMENT.fullmatch(text)
+    if match is None:
+        raise ValueError(
+            f"{quoted(text)} is not a time with a time zone; write one like 2026-01-31T12:00:00Z"
+        )
+    day, clock, fraction, zone = match.groups()
+    zone = "+00:00" if zone in "Zz" else zone
+    try:
+        moment = datetime.fromisoformat(f"{day}T{clock}.{(fraction or '0').ljust(6, '0')}{zone}")
+        return moment.astimezone(timezone.utc)
+    except (ValueError, OverflowError):
+        raise ValueError(
+            f"{quoted(text)} is a time that does not exist; correct the date or the clock time"
+        ) from None
+
+
+def format_time(moment: datetime) -> str:
+    """Return a time as RFC 3339 text in UTC, as messages and the ledger's markers have it."""
+    text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
+    return re.sub(r"\.?0*\+00:00$", "Z", text)
+
+
+def _one_line(text: str) -> str:
+    if not text.strip() or text != text.strip():
+        raise ValueError("is empty or starts or ends with white space; write one line of text")
+    if not text.isprintable():
+        raise ValueError(f"{quoted(text)} is more than one line of plain text; write one line")
+    return text
+
+
+def _finite(value: Any) -> None:  # noqa: ANN401 - Helm values are any data
+    if isinstance(value, float) and not math.isfinite(value):
+        raise ValueError(f"contains {value}, which is not a number in JSON; choose another value")
+    inner = value.values() if isinstance(value, dict) else value
+    for item in inner if isinstance(value, dict | list) else ():
+        _finite(item)
+
+
+def _not_empty(items: tuple[Any, ...]) -> tuple[Any, ...]:
+    if not items or "" in items:
+        raise ValueError("is empty or has an empty item; name what to select")
+    return items
+
+
+Patterns = Annotated[Items[Text], AfterValidator(_not_empty)]
+Line = Annotated[str, StringConstraints(max_length=300), AfterValidator(_one_line)]
+
+
+def _filled_in(model: FrozenModel) -> None:
+    # a field without a value would have no effect, and a person would wait for one
+    empty = [name for name in sorted(model.model_fields_set) if getattr(model, name) is None]
+    if empty:
+        raise ValueError(
+            sentences(f"'{name}' has no value; add one, or remove '{name}'" for name in empty)
+        )
+
+
+class Selector(FrozenModel):
+    """Selects the releases and claims that match every field given here.
+
+    Patterns may contain ``*`` and ``?``. ``requesters`` matches if a pattern matches one requester
+    of the release or claim. ``labels`` matches if the node's selector has all of these labels.
+    """
+
+    applications: Patterns | None = None
+    appdefs: Patterns | None = None
+    services: Patterns | None = None
+    connections: Patterns | None = None
+    nodes: Patterns | None = None
+    requesters: Patterns | None = None
+    labels: Annotated[dict[LabelKey, LabelValue], Field(min_length=1)] | None = None
+
+    @model_validator(mode="after")
+    def _sensible(self) -> Selector:
+        if not self.model_fields_set:
+            raise ValueError("selects nothing; give at least one field, for example nodes: ['*']")
+        _filled_in(self)
+        others = [name for name in ("applications", "appdefs", "services") if getattr(self, name)]
+        if self.connections and others:
+            raise ValueError(
+                f"one selector cannot have both 'connections' and '{others[0]}', because nothing "
+                "matches both; write a selector for each"
+            )
+        return self
+
+    def takes(self, service: str, appdef: str) -> bool:
+        """Return whether a service of an appdef fits ``services`` and ``appdefs``."""
+        return (not self.services or matches(service, self.services)) and (
+            not self.appdefs or matches(appdef, self.appdefs)
+        )
+
+
+class OverrideFile(FileModel):
+    """``overrides/<name>.yaml``. Of several overrides for a release, the highest priority wins."""
+
+    kind: Literal["Override"]
+    reason: Line
+    owner: Annotated[
+        str, StringConstraints(max_length=100), without(id_problem), AfterValidator(_one_line)
+    ]
+    priority: Annotated[int, Field(ge=-1_000_000, le=1_000_000)] = 0
+    expires: Annotated[str, readable_by(parse_time)] | None = None
+    select: Annotated[Items[Selector], AfterValidator(_not_empty)]
+    values: Annotated[dict[str, Any], Field(min_length=1), readable_by(_finite)] | None = None
+    version: Annotated[str, StringConstraints(min_length=1, max_length=63), Visible] | None = None
+    images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None
+    replicas: Annotated[int, Field(ge=0, le=1000)] | None = None
+    node: NodeId | None = None
+    hold: Literal[True] | None = None
+    deny: Literal[True] | None = None
+    keep: Literal[True] | None = None
+
+    @model_validator(mode="after")
+    def _consistent(self) -> OverrideFile:
+        _filled_in(self)
+        if problems := [*self._problems()]:
+            raise ValueError(sentences(problems))
+        return self
+
+    def _problems(self) -> Iterable[str]:
+        effects = self.effects()
+        if not effects:
+            yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
+        if "deny" in effects and len(effects) > 1:
+            others = " and ".join(f"'{name}'" for name in effects if name != "deny")
+            yield (
+                f"with 'deny', nothing runs, so {others} cannot apply; remove 'deny', or remove "
+                f"{others}"
+            )
+        frozen = " and ".join(f"'{name}'" for name in effects if name in _SHAPING)
+        if "hold" in effects and frozen:
+            yield (
+                f"'hold' freezes the release, so {frozen} cannot apply; remove 'hold', or remove "
+                f"{frozen}"
+            )
+        selects_clients = any(selector.connections for selector in self.select)
+        if self.values is not None and selects_clients and not self.patches_clients():
+            yield (
+                "select: selects both connections and services, but 'values' fits only connections "
+                "(settings of clients) or only services (Helm values); write two overrides"
+            )
+        of_services = [name for name in effects if name in _OF_SERVICES]
+        for index, selector in enumerate(self.select):
+            if selector.connections and of_services:
+                yield (
+                    f"select[{index}].connections: '{of_services[0]}' is for services, but this "
+                    f"selector selects connections; remove 'connections' or '{of_services[0]}'"
+                )
+            if selector.requesters and "node" in effects:
+                yield (
+                    f"select[{index}].requesters: 'node' moves a service for all its "
+                    "requesters, so it cannot be limited to some of them; select by applications, "
+                    "appdefs, services, nodes or labels"
+                )
+            if selector.services and "keep" in effects:
+                yield (
+                    f"select[{index}].services: 'keep' applies to applications and connections "
+                    "only; select those"
+                )
+
+    def patches_clients(self) -> bool:
+        """Return whether ``values`` patches the settings of clients instead of Helm values."""
+        return all(selector.connections for selector in self.select)
+
+    def effects(self) -> tuple[str, ...]:
+        return tuple(name for name in EFFECTS if getattr(self, name) is not None)
+
+    @property
+    def end(self) -> datetime | None:
+        return parse_time(self.expires) if self.expires else None
+
+
+class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so they have no hash
+    """An override with its name, which is its file's name."""
+
+    name: str
+
+    @classmethod
+    def from_file(cls, name: str, file: OverrideFile) -> Override:
+        return cls.model_construct(file.model_fields_set | {"name"}, **dict(file), name=name)
+
+    def __eq__(self, other: object) -> bool:
+        # as JSON, because 1, True and 1.0 are equal in Python, but not for a chart
+        return isinstance(other, Override) and self.model_dump_json() == other.model_dump_json()
+
+    @property
+    def path(self) -> str:
+        return f"{OVERRIDES_ROOT}/{self.name}.yaml"
+
+    @property
+    def rank(self) -> tuple[int, str]:
+        return (self.priority, self.name)
+
+
+@dataclass(frozen=True, slots=True)
+class Shaping:
+    """The overrides that shape a release, each with the names of its effects on the release.
+
+    The overrides are in the order in which they apply; the last one wins.
+    """
+
+    by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
+
+    def image(self, name: str, image: Image) -> Image:
+        """Return ``image``, which the registry calls ``name``, as the overrides pin it."""
+        for override, effects in self.by:
+            if "images" in effects and override.images and name in override.images:
+                image = override.images[name].over(image)
+        return image
+
+    @property
+    def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
+        """The file and the patch of each override that patches values."""
+        return tuple(
+            (override.path, override.values or {})
+            for override, effects in self.by
+            if "values" in effects
+        )
+
+    @property
+    def held(self) -> bool:
+        """Whether a ``hold`` keeps the release's file unchanged."""
+        held = False
+        for _, effects in self.by:
+            # one that applies later and changes the release cancels the hold
+            held = "hold" in effects or (held and set(effects) <= {"keep"})
+        return held
+
+
+UNSHAPED = Shaping()
+
+
+Settings = TypeVar("Settings", bound=ClientSettings)
+
+
+def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
+    """Return the settings of clients, patched by the ``values`` of the override in ``file``."""
+    data = merge_patch(settings.model_dump(by_alias=True), patch)
+    own, of_mqtt = (
+        {field.alias for field in model.model_fields.values()}
+        for model in (type(settings), MqttClientSettings)
+    )
+    try:
+        # one override may select clients of several types, of which only MQTT has further fields
+        return settings.model_validate({k: v for k, v in data.items() if k not in of_mqtt - own})
+    except ValidationError as error:
+        raise InvalidInput(faults_of(error, type(settings), file, ("values",))) from None
+
+
+def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
+    """Return overrides in the order in which they apply; the last one wins."""
+    return tuple(sorted(overrides, key=lambda override: override.rank))
+
+
+def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
+    """Return the overrides that have not ended; ``ended`` maps names to the expiry that passed."""
+    return [
+        override
+        for name, override in overrides.items()
+        # a person who extends an ended override gives it a new expiry, and so it is active again
+        if override.end is None or ended.get(name) != format_time(override.end)
+    ]

@@ -1,0 +1,321 @@
+"""The registry: sources and versions of charts, images and applications, and how clients run.
+
+A chart is in a folder of the state repo (the default), an OCI registry or an HTTP chart repository.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Annotated, Any, Literal
+
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
+
+from demandops.base.errors import sentences, suggestion
+from demandops.model.config.base_model import (
+    CamelModel,
+    DnsLabel,
+    FileModel,
+    FrozenModel,
+    Items,
+    Text,
+    Visible,
+    Word,
+)
+from demandops.model.config.inventory import Rmw
+
+ChartVersion = Annotated[
+    str, StringConstraints(pattern=r"^\d+\.\d+\.\d+(-[0-9A-Za-z.-]+)?$", max_length=40)
+]
+
+ChartFolder = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_./-]*$")]
+
+Repository = Annotated[str, StringConstraints(pattern=r"^[a-z0-9][a-z0-9._/:-]*$")]
+Tag = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.-]{0,127}$")]
+Digest = Annotated[str, StringConstraints(pattern=r"^sha256:[0-9a-f]{64}$")]
+
+
+class ChartSource(FrozenModel):
+    """One version of a Helm chart; exactly one of ``folder``, ``oci``, ``http`` is its source."""
+
+    version: ChartVersion
+    folder: ChartFolder | None = None
+    oci: Annotated[str, StringConstraints(pattern=r"^oci://[^\s]+$"), Visible] | None = None
+    http: Annotated[str, StringConstraints(pattern=r"^https?://[^\s]+$"), Visible] | None = None
+
+    @model_validator(mode="after")
+    def _one_source(self) -> ChartSource:
+        given = [name for name in ("folder", "oci", "http") if getattr(self, name)]
+        if len(given) != 1:
+            raise ValueError(
+                "needs exactly one of folder, oci and http"
+                + (f", not {' and '.join(given)}" if given else "")
+            )
+        if re.search(r"://[^/\s]*@", self.http or self.oci or ""):
+            raise ValueError(
+                "must not contain a user or password; give them to the GitOps controller as a "
+                "Secret"
+            )
+        if self.folder and ".." in self.folder.split("/"):
+            raise ValueError("'folder' must stay inside the state repo; remove '..'")
+        return self
+
+
+class Chart(ChartSource):
+    """A Helm chart: its default version, and further versions by channel.
+
+    A demand may request a channel by name, or one of the versions.
+    """
+
+    channels: dict[Word, ChartSource] = Field(default_factory=dict)
+
+    @model_validator(mode="after")
+    def _distinct(self) -> Chart:
+        seen = {self.version.lower(): "the default"}
+        for name, source in self.channels.items():
+            other = seen.setdefault(source.version.lower(), f"channel '{name}'")
+            if other != f"channel '{name}'":
+                raise ValueError(
+                    f"channels.{name} and {other} have the same version, {source.version}; give "
+                    "each its own, because a version names one chart, in capitals or not"
+                )
+        return self
+
+    def sources(self) -> tuple[ChartSource, ...]:
+        return (self, *self.channels.values())
+
+    def at(self, version: str) -> ChartSource | None:
+        """Return the source of a channel or version, if known; an empty name is the default."""
+        if not version:
+            return self
+        if version in self.channels:
+            return self.channels[version]
+        return next((source for source in self.sources() if source.version == version), None)
+
+    def versions(self) -> tuple[str, ...]:
+        return (*self.channels, *(source.version for source in self.sources()))
+
+
+class Image(FrozenModel):
+    """A container image, pinned by tag or digest; if it has both, the digest counts."""
+
+    repository: Repository
+    tag: Tag | None = None
+    digest: Digest | None = None
+
+    @model_validator(mode="after")
+    def _pinned(self) -> Image:
+        if not (self.tag or self.digest):
+            raise ValueError("needs a tag or a digest; without one the image is not pinned")
+        return self
+
+    def pulled_from(self, registry: str) -> Image:
+        """Return this image with ``registry`` as the host in its name."""
+        host, _, path = self.repository.partition("/")
+        # Docker's rule: only such a first part is a host
+        has_host = path and ("." in host or ":" in host or host == "localhost")
+        repository = f"{registry}/{path if has_host else self.repository}"
+        return self.model_copy(update={"repository": repository})
+
+    def parts(self) -> dict[str, str]:
+        """Return repository, tag and digest as chart values; an absent value is empty text."""
+        return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
+
+    def reference(self) -> str:
+        return (
+            f"{self.repository}@{self.digest}" if self.digest else f"{self.repository}:{self.tag}"
+        )
+
+
+class ChartsFile(FileModel):
+    """``registry/charts.yaml``, and files of ``registry/charts/``."""
+
+    kind: Literal["Charts"]
+    charts: dict[DnsLabel, Chart]
+
+
+class ImagesFile(FileModel):
+    """``registry/images.yaml``, and files of ``registry/images/``.
+
+    If a file gives a ``registry``, all images of the file are pulled from this registry.
+    """
+
+    kind: Literal["Images"]
+    registry: Repository | None = None
+    images: dict[DnsLabel, Image]
+
+
+class ImagePin(FrozenModel):
+    """Changes to an image of the registry.
+
+    An absent field changes nothing, except that a new tag removes the image's digest, and a new
+    digest its tag (:meth:`over`).
+    """
+
+    repository: Repository | None = None
+    tag: Tag | None = None
+    digest: Digest | None = None
+
+    @model_validator(mode="after")
+    def _says_something(self) -> ImagePin:
+        if not (self.repository or self.tag or self.digest):
+            raise ValueError("changes nothing; give a tag, a digest or a repository")
+        return self
+
+    def over(self, image: Image) -> Image:
+        # a digest would win over a new tag, and a tag would misname a new digest
+        pins_anew = self.tag or self.digest
+        return Image(
+            repository=self.repository or image.repository,
+            tag=self.tag if pins_anew else image.tag,
+            digest=self.digest if pins_anew else image.digest,
+        )
+
+
+class VersionContents(CamelModel):
+    """The charts and images of one version of an application.
+
+    A chart that is not listed has its default version. An image that is not listed stays as
+    ``registry/images.yaml`` has it.
+    """
+
+    charts: dict[DnsLabel, ChartVersion] = Field(default_factory=dict)
+    images: dict[DnsLabel, ImagePin] = Field(default_factory=dict)
+
+
+class VersionList(CamelModel):
+    """The versions of one application definition, its default version, and its channels."""
+
+    default: ChartVersion
+    channels: dict[Word, ChartVersion] = Field(default_factory=dict)
+    versions: dict[ChartVersion, VersionContents]
+
+    @model_validator(mode="after")
+    def _listed(self) -> VersionList:
+        named = {"default": self.default} | {f"channels.{k}": v for k, v in self.channels.items()}
+        problems = [
+            f"{field}: '{version}' is not in versions{suggestion(version, self.versions)}"
+            for field, version in named.items()
+            if version not in self.versions
+        ]
+        if problems:
+            raise ValueError(sentences(problems))
+        return self
+
+
+class VersionsFile(FileModel):
+    """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
+
+    An application definition without an entry here has the versions of its charts.
+    """
+
+    kind: Literal["Versions"]
+    applications: dict[DnsLabel, VersionList]
+
+
+Precedence = tuple[tuple[int, ...], bool, tuple[tuple[bool, int, str], ...], str]
+
+
+def precedence(version: str) -> Precedence:
+    """Return the key that sorts versions by the rules of Semantic Versioning 2.0.0 (item 11)."""
+    numbers, _, before = version.partition("-")
+    words = (
+        (not word.isdigit(), int(word) if word.isdigit() else 0, word) for word in before.split(".")
+    )
+    return tuple(map(int, numbers.split("."))), not before, tuple(words), version
+
+
+@dataclass(frozen=True)
+class ApplicationVersion:
+    """One version of an application definition, with the version's chart sources and image pins.
+
+    ``name`` is empty if the definition has no entry in ``registry/versions.yaml``.
+    """
+
+    appdef: str
+    name: str
+    charts: Mapping[str, ChartSource]
+    images: Mapping[str, ImagePin]
+
+    @cached_property
+    def rank(self) -> tuple[Precedence, ...]:
+        """The key that sorts the versions of a definition; equal keys mean the same version."""
+        # without a list of versions, a version is that of the charts
+        charts = (chart.version for _, chart in sorted(self.charts.items()))
+        return tuple(map(precedence, [self.name] if self.name else charts))
+
+    def image(self, name: str, image: Image) -> Image:
+        """Return ``image``, which the registry calls ``name``, as this version pins it."""
+        return self.images[name].over(image) if name in self.images else image
+
+
+_EnvName = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+_Quantity = Annotated[str, StringConstraints(pattern=r"^\d+(\.\d+)?(m|k|Ki|M|Mi|G|Gi)?$")]
+_Resource = Annotated[str, StringConstraints(pattern=r"^[a-z0-9./-]+$")]
+_LaunchFile = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_.-]+$")]
+_Package = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_]*$")]
+
+
+def _free(env: dict[str, str]) -> dict[str, str]:
+    for name in ("ROS_DOMAIN_ID", "RMW_IMPLEMENTATION"):
+        if name in env:
+            raise ValueError(
+                f"{name} follows from 'ros' of the node in the inventory; set 'ros' there, and "
+                f"remove {name} here"
+            )
+    return env
+
+
+class Resources(FrozenModel):
+    """What a container requests, and its limits (Kubernetes core/v1 ResourceRequirements)."""
+
+    requests: dict[_Resource, _Quantity] = Field(
+        default_factory=lambda: {"cpu": "50m", "memory": "64Mi"}
+    )
+    limits: dict[_Resource, _Quantity] = Field(default_factory=lambda: {"memory": "256Mi"})
+
+
+class ClientSettings(CamelModel):
+    """How the client containers of one connection type run.
+
+    Without ``host_network``, a client uses the setting of its node. Each probe has the form of a
+    Kubernetes core/v1 Probe.
+    """
+
+    env: Annotated[dict[_EnvName, Text], AfterValidator(_free)] = Field(default_factory=dict)
+    resources: Resources = Resources()
+    host_network: bool | None = None
+    startup_probe: dict[str, Any] = Field(default_factory=dict)
+    readiness_probe: dict[str, Any] = Field(default_factory=dict)
+    liveness_probe: dict[str, Any] = Field(default_factory=dict)
+
+
+class MqttClientSettings(ClientSettings):
+    """The settings of MQTT clients, which are ROS nodes.
+
+    Without ``rmw``, a client uses the middleware of its node. ``messages`` are the packages whose
+    messages the image can carry; an empty list means that these packages are not known.
+    """
+
+    launch_file: _LaunchFile = "standalone.launch.xml"
+    rmw: Rmw | None = None
+    messages: Items[_Package] = ()
+
+
+class ClientsFile(FileModel):
+    """``registry/clients.yaml``, and files of ``registry/clients/``; a state repo may have none."""
+
+    kind: Literal["Clients"]
+    mqtt: MqttClientSettings = MqttClientSettings()
+    zenoh: ClientSettings = ClientSettings()
+    ros: ClientSettings = ClientSettings()
+
+    def of(self, connection_type: str) -> ClientSettings:
+        """Return the settings of a connection type, which is a word like ``mqtt``."""
+        settings: ClientSettings = getattr(self, connection_type, ClientSettings())
+        return settings
+
+
+DEFAULT_SETTINGS = ClientsFile(apiVersion="demandops/v1", kind="Clients")

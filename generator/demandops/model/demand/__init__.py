@@ -1,0 +1,1 @@
+"""What is demanded: goals of both actions, and what they become."""

@@ -1,0 +1,165 @@
+"""Demand requests: one class for each operation on the ledger.
+
+Goals of ROS actions and YAML files are parsed into these values, and
+:mod:`.admission` checks them. :mod:`.apply` carries them out. The
+stage of the ledger has further classes: ``Wait``, ``Drain`` and ``Restoration``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeVar
+
+from demandops.base.errors import Fault, Refused, fault
+from demandops.base.naming import Subject, id_problem
+from demandops.connections.connection import Connection
+from demandops.model.config.inventory import Position
+from demandops.model.demand.application import Application
+from demandops.model.demand.claim import Term
+
+# Takes a field's path in an application or connection, and returns the field's path in the goal.
+# For example, ``inputs.ego_data[2].source`` becomes ``applications[0].inputs.ego_data[2].source``.
+Place = Callable[[str], str]
+
+
+@dataclass(frozen=True, slots=True)
+class Demanded:
+    """One application or connection that a request lists, and its requesters."""
+
+    held: Application | Connection
+    requesters: tuple[str, ...]
+    place: Place
+    term: Term | None = None
+    # the type of an application's derived connections; ``auto``: any type, ``none``: none
+    connect: str = "none"
+    # how a connection differs from the requested one, for a warning in the receipt
+    note: str = ""
+    # a sentence for each placed application or service: which node was chosen, and why
+    placed: tuple[str, ...] = ()
+
+    def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
+        """Return a fault for the field at ``path`` in this item, named by its path in the goal."""
+        return fault(self.place(path), message, code=code)
+
+
+@dataclass(frozen=True, slots=True)
+class DemandRequest:
+    """A request; it is booked or refused as a whole.
+
+    The reference's requests have no demand id; :func:`.claim.demand_id` makes one
+    for each item. ``own_requesters`` are those of the request as a whole: a release lists nothing,
+    but has requesters.
+    """
+
+    id: str
+    demanded: tuple[Demanded, ...] = ()
+    demand: str = ""
+    own_requesters: tuple[str, ...] = ()
+
+    operation: ClassVar[str]  # as in commits and files
+    adds_claims: ClassVar[bool] = False
+    # the request is a goal of the reference's action, which names no demand
+    is_reference: ClassVar[bool] = False
+
+    def requesters(self) -> tuple[str, ...]:
+        """Return all requesters, each once, in the order of the request."""
+        listed = (who for item in self.demanded for who in item.requesters)
+        return tuple(dict.fromkeys((*self.own_requesters, *listed)))
+
+    def subjects(self) -> tuple[Subject, ...]:
+        return tuple(dict.fromkeys(item.held.subject for item in self.demanded))
+
+
+AnyRequest = TypeVar("AnyRequest", bound=DemandRequest)
+
+
+@dataclass(frozen=True, slots=True)
+class Join(DemandRequest):
+    """A goal of the reference's action, which adds to what its requesters hold already."""
+
+    operation = "join"
+    adds_claims = True
+    is_reference = True
+
+
+@dataclass(frozen=True, slots=True)
+class Shutdown(DemandRequest):
+    """A goal of the reference's action with ``shutdown``: its requesters give up what it lists."""
+
+    operation = "shutdown"
+    is_reference = True
+
+
+@dataclass(frozen=True, slots=True)
+class Put(DemandRequest):
+    """A goal of our own action, after which the demand holds exactly what the goal lists.
+
+    ``lease_s`` is the wanted lease in seconds. ``positions`` has the positions of nodes that have
+    none in the inventory. ``priority`` ranks the demand among those that wait for room.
+    """
+
+    lease_s: int | None = None
+    positions: Mapping[str, Position] = field(default_factory=dict)
+    priority: int = 0
+
+    operation = "put"
+    adds_claims = True
+
+
+@dataclass(frozen=True, slots=True)
+class Release(DemandRequest):
+    """Releases everything that its demand holds."""
+
+    operation = "release"
+
+
+@dataclass(frozen=True, slots=True)
+class Renew(DemandRequest):
+    """Renews the leases of its demand."""
+
+    operation = "renew"
+
+
+@dataclass(frozen=True, slots=True)
+class Expire(DemandRequest):
+    """The generator's request to release those claims of a demand whose lease has ended."""
+
+    operation = "expire"
+
+
+@dataclass(frozen=True, slots=True)
+class Decommission(DemandRequest):
+    """An operator's request to release what needs a node or names a requester.
+
+    ``id`` is the name of the node or requester. ``kinds`` are ``node``, ``requester`` or both.
+    ``nodes`` lists the names that the node has in its access domains; the admission fills it in.
+    ``by`` is the operator as ``name <email>``.
+    """
+
+    kinds: frozenset[str] = frozenset()
+    by: str = ""
+    reason: str = ""
+    nodes: tuple[str, ...] = ()
+
+    operation = "decommission"
+
+    # The journal stores the request as a goal. No action and no demand file can express it.
+    @staticmethod
+    def is_goal(data: object) -> bool:
+        return isinstance(data, dict) and data.get("kind") == "Decommission"
+
+    def goal(self) -> dict[str, Any]:
+        """Return the request as plain data for :meth:`parse`, without ``nodes``."""
+        data = {"kind": "Decommission", "name": self.id, "as": sorted(self.kinds), "by": self.by}
+        return data | ({"reason": self.reason} if self.reason else {})
+
+    @classmethod
+    def parse(cls, data: dict[str, Any]) -> Decommission:
+        name = data.get("name")
+        problem = id_problem(name) if isinstance(name, str) else "must be text"
+        if problem:
+            raise Refused.at("name", problem)
+        kinds = frozenset(kind for kind in data.get("as", ()) if kind in ("node", "requester"))
+        by, reason = (str(data.get(key) or "") for key in ("by", "reason"))
+        return cls(id=str(name), kinds=kinds, by=by, reason=reason)

@@ -1,0 +1,401 @@
+"""The ledger: which demand holds which subject, as a set of persistent maps.
+
+A :class:`Ledger` never changes, because each request makes a new one.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from datetime import datetime
+from operator import attrgetter
+from typing import TypeAlias
+
+from rpds import HashTrieMap, HashTrieSet
+
+from demandops.base.naming import Subject, SubjectKind
+from demandops.connections import connection_types
+from demandops.connections.connection import Connection
+from demandops.connections.connection_type import ConnectionType
+from demandops.model.config.config import Config
+from demandops.model.config.override import Override, by_rank, still_active
+from demandops.model.demand.application import Application, InputTopic
+from demandops.model.demand.claim import UNSTARTED, Claim, ClaimKey
+from demandops.model.ledger.claim_file import minute_of
+from demandops.model.ledger.records import (
+    Instance,
+    KeptReplicas,
+    RecentShutdown,
+    RecentShutdowns,
+    WaitingDemands,
+)
+
+_ENDS = "ends"
+_DEMAND = attrgetter("demand")
+
+Entry: TypeAlias = "tuple[str, ...]"
+Index: TypeAlias = "HashTrieMap[Entry, HashTrieSet[ClaimKey]]"
+
+
+@dataclass(frozen=True, slots=True)
+class Ledger:
+    """All claims, an index of them, and the ledger's other records."""
+
+    # The claims on each subject, sorted by demand id. The generator books only claims that agree
+    # about the subject's type and nodes. If a person writes one that disagrees, the first decides.
+    # They are a tuple, because the planner asks for all of them at each join, and a persistent map
+    # would make and sort them anew each time.
+    claims: HashTrieMap[Subject, tuple[Claim, ...]] = field(default_factory=HashTrieMap)
+    # The keys of the claims that have an entry. What a request costs then depends on its claims and
+    # not on all claims.
+    index: Index = field(default_factory=HashTrieMap)
+    # each minute in which a lease and its slack end: the next end is found without a scan of claims
+    minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
+    # the end that each ended override had when it ended, by name
+    ended: Mapping[str, str] = field(default_factory=dict)
+    shutdowns: RecentShutdowns = field(default_factory=RecentShutdowns)
+    # For how many applications each node was chosen, also if only for one of their services. The
+    # choice of nodes takes the emptiest, and must not count all claims for each demand.
+    applications_on: HashTrieMap[str, int] = field(default_factory=HashTrieMap)
+    waiting: WaitingDemands = field(default_factory=HashTrieMap)
+    kept: KeptReplicas = field(default_factory=KeptReplicas)
+
+    def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
+        return self.claims.get(subject) or ()
+
+    def first_claim(self, subject: Subject) -> Claim | None:
+        """Return the claim on ``subject`` with the lowest demand id, or ``None``."""
+        held = self.claims.get(subject)
+        return held[0] if held else None
+
+    def held(self, subject: Subject) -> Application | Connection | None:
+        """Return the application or connection in the first claim on ``subject``."""
+        first = self.first_claim(subject)
+        return first.held if first else None
+
+    def application_claims(self, application: str) -> tuple[Claim, ...]:
+        return self.claims_on(Subject(SubjectKind.APPLICATION, application))
+
+    def connection_claims(self, connection: str) -> tuple[Claim, ...]:
+        return self.claims_on(Subject(SubjectKind.CONNECTION, connection))
+
+    def application(self, id: str) -> Application | None:
+        """Return an application as its first claim has it."""
+        first = self.first_claim(Subject(SubjectKind.APPLICATION, id))
+        return first.application if first else None
+
+    def connection(self, id: str) -> Connection | None:
+        """Return a connection as its first claim has it."""
+        first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
+        return first.connection if first else None
+
+    def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
+        """Return the ``known`` versions and channels that claims on an application ask for.
+
+        An empty text stands for claims that ask for no version, or for an unknown one.
+        """
+        by_version = {word: self.index.get(("version", application, word)) for word in known}
+        counts = {word: len(keys) for word, keys in by_version.items() if keys}
+        others = len(self.application_claims(application)) > sum(counts.values())
+        return {*counts, ""} if others else {*counts}
+
+    def subjects(self, kind: SubjectKind) -> list[str]:
+        return sorted(subject.id for subject in self.claims if subject.kind is kind)
+
+    def claims_reading(self, source: str, topic: str) -> tuple[Claim, ...]:
+        """Return the claims with ``topic`` of ``source`` as an input, by application and demand."""
+        return self._claims("takes", source, topic)
+
+    def each_reading(self, source: str, topic: str) -> Iterator[Claim]:
+        """Yield the claims of :meth:`claims_reading` in no order, without the cost of sorting."""
+        for key in self.index.get(("takes", source, topic)) or ():
+            claim = self.get(key)
+            if claim is not None:
+                yield claim
+
+    def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
+        """Return the booked input with this topic and source in ``role``."""
+        for claim in self.each_reading(source, topic):
+            if inputs := claim.application.inputs_from(role, source, topic):
+                return inputs[0]
+        return None
+
+    def has_usual_topic(self, role: str, source: str, *, except_demand: str | None = None) -> bool:
+        """Return whether a claim has the usual topic of ``source`` as an input in ``role``."""
+        keys = self.index.get(("usual", source, role)) or ()
+        return any(key.demand != except_demand for key in keys)
+
+    def usual_topics(self, role: str, source: str, *, excluded: str) -> Iterator[str]:
+        """Yield each usual topic of ``source`` that is booked in ``role``, except ``excluded``."""
+        keys = self.index.get(("usual", source, role)) or ()
+        if len(keys) == len(self.index.get(("usual", source, role, excluded)) or ()):
+            return  # all these claims have the topic ``excluded``
+        claims = (claim for key in keys if (claim := self.get(key)))
+        inputs = (each for claim in claims for each in claim.application.inputs.get(role, ()))
+        usual = {each.topic for each in inputs if each.source == source and not each.further}
+        yield from sorted(usual - {excluded})
+
+    def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
+        """Yield (input, version of a separate instance) for each input that topic names show as
+        ``part``.
+        """
+        for claim in self._claims("further", part):
+            app = claim.application
+            yield from ((topic, app.own_version) for topic in app.further_inputs(role, part))
+
+    def connections_bringing(self, target: str, topic: str) -> tuple[str, ...]:
+        return self._ids("brings", target, topic)
+
+    def is_carried_to(self, target: str, topic: str) -> bool:
+        return ("brings", target, topic) in self.index
+
+    def claims_of_demand(self, demand: str) -> tuple[Claim, ...]:
+        return self._claims("demand", demand)
+
+    def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
+        """Return the claims that overrides keep on ``subject``; without it, on all subjects."""
+        return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
+
+    def moved_applications(self) -> tuple[str, ...]:
+        return self._ids("moved")
+
+    def is_only_kept(self, subject: Subject) -> bool:
+        return len(self.claims_on(subject)) == len(self.kept_claims(subject))
+
+    def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
+        return self._claims("requester", requester)
+
+    def claims_held_by(self, requester: str, subject: Subject) -> tuple[Claim, ...]:
+        return self._claims("holder", requester, subject.kind.value, subject.id)
+
+    def count_of_requester(self, requester: str) -> int:
+        return len(self.index.get(("requester", requester)) or ())
+
+    def claims_of_definition(self, appdef: str) -> tuple[Claim, ...]:
+        return self._claims("definition", appdef)
+
+    def claims_at(self, node: str) -> tuple[Claim, ...]:
+        """Return the claims on applications that run on, read from or deliver to a node."""
+        return self._claims("node", node)
+
+    def applications_at(self, node: str) -> tuple[str, ...]:
+        """Return the ids of applications that run on, read from or deliver to a node."""
+        return self._ids("node", node)
+
+    def applications_in_topics(self, part: str) -> tuple[str, ...]:
+        """Return the ids of the applications for which ``part`` replaces ``{instance}``."""
+        return self._ids("topics", part)
+
+    def next_lease_end(self) -> datetime | None:
+        """Return when the first lease and its slack end, which is :data:`UNSTARTED` if none
+        started.
+        """
+        claims = (claim for key in self.first_to_end() or () if (claim := self.get(key)))
+        return min((claim.lease.expires_at for claim in claims if claim.lease), default=None)
+
+    def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
+        """Return the keys of the claims whose leases, with their slack, end in the earliest minute.
+
+        Each call returns the same object until a claim enters the set, leaves it or gets another
+        lease.
+        """
+        return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
+
+    def unstarted_claims(self) -> tuple[Claim, ...]:
+        """Return the approved claims whose lease the generator has not started yet."""
+        later = (minute for minute in self.minutes if minute >= minute_of(UNSTARTED))
+        claims = (claim for minute in sorted(later) for claim in self._claims(_ENDS, minute))
+        return tuple(claim for claim in claims if claim.lease and not claim.lease.has_started)
+
+    def ended_claims(self, now: datetime) -> tuple[Claim, ...]:
+        """Return the claims whose lease and slack ended before ``now``, the earliest end first."""
+        over = (minute for minute in self.minutes if minute <= minute_of(now))
+        ended = [
+            (claim.lease.expires_at, claim)
+            for minute in over
+            for claim in self._claims(_ENDS, minute)
+            if claim.lease and claim.lease.has_ended(now)
+        ]
+        return tuple(claim for _, claim in sorted(ended, key=lambda pair: pair[0]))
+
+    def _ids(self, *entry: str) -> tuple[str, ...]:
+        return tuple(sorted({key.subject.id for key in self.index.get(entry) or ()}))
+
+    def _claims(self, *entry: str) -> tuple[Claim, ...]:
+        keys = sorted(
+            self.index.get(entry) or (),
+            key=lambda key: (key.subject.kind.value, key.subject.id, key.demand),
+        )
+        return tuple(claim for key in keys if (claim := self.get(key)))
+
+    def connections_at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
+        """Return the ids of the connections of a type from or to ``node``."""
+        return self._ids("link", kind.name, node)
+
+    def connections_needing(self, node: str) -> tuple[str, ...]:
+        """Return the ids of the connections from or to a node, or that name its broker."""
+        ids = set(self._ids("broker", node))
+        for kind in connection_types.CONNECTION_TYPES:
+            ids |= {*self.connections_at(kind, node)}
+        return tuple(sorted(ids))
+
+    def indexed_names(self, entry: str) -> set[str]:
+        """Return the last text of each index entry that begins with ``entry``; scans the index."""
+        return {key[-1] for key in self.index if key[0] == entry}
+
+    def get(self, key: ClaimKey) -> Claim | None:
+        held = self.claims_on(key.subject)
+        place = bisect_left(held, key.demand, key=_DEMAND)
+        return held[place] if place < len(held) and held[place].demand == key.demand else None
+
+    def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
+        """Return the ledger with ``claim`` at ``key``; ``None`` removes the claim at ``key``."""
+        held, old = self.claims_on(key.subject), self.get(key)
+        if old == claim:
+            return self
+        place = bisect_left(held, key.demand, key=_DEMAND)
+        held = held[:place] + ((claim,) if claim else ()) + held[place + (old is not None) :]
+        claims = self.claims.insert(key.subject, held) if held else self.claims.remove(key.subject)
+        before, after = index_entries(old), index_entries(claim)
+        index, minutes = self.index, self.minutes
+        for entry in before - after:
+            others = index[entry].remove(key)
+            index = index.insert(entry, others) if others else index.remove(entry)
+            if not others and entry[0] == _ENDS:
+                minutes = minutes.remove(entry[1])
+        added = after - before
+        if old and claim and old.lease != claim.lease:
+            # so that first_to_end returns a new object, by which the expiry sees the change
+            added |= {entry for entry in after if entry[0] == _ENDS}
+        for entry in added:
+            index = index.insert(entry, index.get(entry, HashTrieSet()).insert(key))
+            if entry[0] == _ENDS:
+                minutes = minutes.insert(entry[1])
+        counts = self.applications_on
+        if key.subject.kind is SubjectKind.APPLICATION:
+            counts = _counted(counts, self.first_claim(key.subject), held[0] if held else None)
+        return replace(self, claims=claims, index=index, minutes=minutes, applications_on=counts)
+
+    def without(self, claims: Iterable[Claim]) -> Ledger:
+        ledger = self
+        for claim in claims:
+            ledger = ledger.replace(claim.key, None)
+        return ledger
+
+    def without_waiting(self, demands: Iterable[str]) -> Ledger:
+        waiting = self.waiting
+        for demand in demands:
+            waiting = waiting.discard(demand)
+        return replace(self, waiting=waiting)
+
+    def __iter__(self) -> Iterator[Claim]:
+        for claims in self.claims.values():
+            yield from claims
+
+    def __len__(self) -> int:
+        return sum(len(claims) for claims in self.claims.values())
+
+
+def _counted(
+    counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
+) -> HashTrieMap[str, int]:
+    # Of all claims on the application, the first decides where it runs. These are the first before
+    # and after a change.
+    old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
+    for nodes, change in ((old - new, -1), (new - old, 1)):
+        for node in nodes:
+            count = (counts.get(node) or 0) + change
+            counts = counts.insert(node, count) if count else counts.remove(node)
+    return counts
+
+
+def index_entries(claim: Claim | None) -> set[Entry]:
+    entries = set(claim.index_entries()) if claim else set()
+    if claim and claim.lease:
+        entries.add((_ENDS, minute_of(claim.lease.expires_at)))
+    return entries
+
+
+# ---- claim changes ----
+#
+# What a request changes in the ledger: claims, before and after the change, and other records.
+
+
+@dataclass(frozen=True, slots=True)
+class ClaimChange:
+    """One claim before and after a change: it is new without ``before``, released without
+    ``after``.
+    """
+
+    before: Claim | None
+    after: Claim | None
+
+    @property
+    def key(self) -> ClaimKey:
+        claim = self.after or self.before
+        assert claim is not None  # noqa: S101 - a change has at least one side
+        return claim.key
+
+    @property
+    def only_renews(self) -> bool:
+        """Whether the claim existed before and at most its lease changed."""
+        before, after = self.before, self.after
+        return bool(before and after and replace(after, lease=before.lease) == before)
+
+
+@dataclass(frozen=True, slots=True)
+class Changes:
+    """What a request changed in the ledger."""
+
+    claims: tuple[ClaimChange, ...] = ()
+    # in words, what a shutdown lists, but its requesters do not hold
+    not_held: tuple[str, ...] = ()
+    # the digests of shutdowns that the ledger now records or forgets
+    shutdowns: tuple[str, ...] = ()
+    # the earlier shutdown that the request repeats
+    repeats: RecentShutdown | None = None
+    # the service instances whose kept replicas changed
+    kept: tuple[Instance, ...] = ()
+    # the ids of the demands that begin or cease to wait, or that now wait with another goal
+    waiting: tuple[str, ...] = ()
+
+    def subjects(self) -> tuple[Subject, ...]:
+        return tuple(dict.fromkeys(change.key.subject for change in self.claims))
+
+
+def changes_on(
+    before: Ledger, after: Ledger, subjects: Iterable[Subject]
+) -> tuple[ClaimChange, ...]:
+    keys = (
+        claim.key
+        for subject in subjects
+        for ledger in (before, after)
+        for claim in ledger.claims_on(subject)
+    )
+    return claim_changes(before, after, keys)
+
+
+def claim_changes(
+    before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
+) -> tuple[ClaimChange, ...]:
+    """Return the claims at ``keys`` that differ between two ledgers."""
+    changes = (ClaimChange(before.get(key), after.get(key)) for key in dict.fromkeys(keys))
+    return tuple(change for change in changes if change.before != change.after)
+
+
+# ---- the world: the configuration and the ledger in effect at one time, as one value ----
+
+
+@dataclass(frozen=True, slots=True)
+class World:
+    """The configuration and the ledger."""
+
+    config: Config
+    ledger: Ledger
+    # the overrides that have not ended, in the order in which they apply
+    overrides: tuple[Override, ...] = field(init=False, compare=False, repr=False)
+
+    def __post_init__(self) -> None:
+        active = by_rank(still_active(self.config.overrides, self.ledger.ended))
+        object.__setattr__(self, "overrides", active)

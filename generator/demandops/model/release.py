@@ -1,0 +1,239 @@
+"""The number of replicas of a service; the service's definition derives it from the demands."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass
+
+from demandops.base import strict_yaml
+from demandops.base.errors import Refused, suggestion
+from demandops.connections.connection_type import Client
+from demandops.model.config.appdef import Resource, Scaling, Scope, Service
+from demandops.model.config.config import CHARTS_FILE, VERSIONS_FILE, Config
+from demandops.model.config.inventory import Node
+from demandops.model.config.override import UNSHAPED, Shaping, format_time
+from demandops.model.config.policy import AccessDomain
+from demandops.model.config.registry import ApplicationVersion, ChartSource, Image
+from demandops.model.demand.application import InputTopic
+from demandops.model.demand.claim import Claim
+from demandops.model.ledger import records
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.ledger.records import Instance, Kept, Steps
+
+
+@dataclass(frozen=True, slots=True)
+class Autoscaler:
+    """A HorizontalPodAutoscaler, which chooses a number of replicas from ``min`` to ``max``.
+
+    ``targets`` has the usage of each resource, in percent, that the autoscaler aims at.
+    """
+
+    min: int
+    max: int
+    targets: Mapping[Resource, int]
+
+    def __str__(self) -> str:
+        by = ", ".join(f"{name} {percent} %" for name, percent in self.targets.items())
+        return f"{self.min} to {self.max} by an autoscaler ({by})"
+
+    def values(self) -> dict[str, int]:
+        targets = {str(name): percent for name, percent in self.targets.items()}
+        return {"min": self.min, "max": self.max} | targets
+
+
+def replicas_of(
+    scaling: Scaling,
+    parameters: Mapping[str, object],
+    topics: Collection[InputTopic],
+    claims: Collection[Claim],
+    requesters: Collection[str],
+) -> int | Autoscaler:
+    """Return how many replicas a service needs, or the autoscaler that chooses the number."""
+    if scaling.autoscaler:
+        return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
+    if scaling.sizes:
+        name = scaling.sizes.parameter
+        replicas = scaling.sizes.replicas_for(parameters[name])
+        if replicas is None:
+            value = parameters[name]
+            message = f"{strict_yaml.short_repr(value)} is not a size" + suggestion(
+                str(value), scaling.sizes.replicas
+            )
+            raise Refused.at(f"parameters.{name}", message)
+        return replicas
+    for measure, share in (scaling.per or {}).items():
+        sources = {topic.source for topic in topics}
+        counted = {"topics": topics, "sources": sources, "claims": claims, "requesters": requesters}
+        needed = -(-len(counted[measure]) // share)  # rounded up
+        return max(scaling.min, min(scaling.max, needed))
+    return scaling.min
+
+
+def with_kept(
+    needed: int | Autoscaler, scaling: Scaling, steps: Steps
+) -> tuple[int | Autoscaler, Kept | None]:
+    """Return how many replicas a service has, and the step that decides this number.
+
+    The step is ``None`` if ``needed`` decides the number. ``steps`` say how many replicas the
+    service keeps for a while (:mod:`.records`).
+    """
+    if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
+        return needed, None
+    kept = min(steps[0].replicas, scaling.most)  # a person may have lowered the limit meanwhile
+    return (kept, steps[0]) if kept > needed else (needed, None)
+
+
+def overridden(replicas: int | Autoscaler, number: int) -> int | Autoscaler:
+    """Return the replicas of a service for which an override sets the number."""
+    # Where an autoscaler owns the number, the GitOps controller ignores ``spec.replicas``. So the
+    # number is set as both bounds of the autoscaler.
+    if isinstance(replicas, Autoscaler):
+        return Autoscaler(number, number, replicas.targets)
+    return number
+
+
+def most_replicas(replicas: int | Autoscaler) -> int:
+    """Return the highest number of replicas that may run."""
+    return replicas.max if isinstance(replicas, Autoscaler) else replicas
+
+
+# ---- release ----
+#
+# Releases: the planner returns one for each service instance and each communication client.
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceKey:
+    """The identity of one instance of a service.
+
+    ``application`` is set if the service runs once for each application. ``source`` and ``topic``
+    are set if the service runs once for each topic; then the applications that need the service on
+    this node for this topic share the instance. If none of these is set, the applications that need
+    the service on this node share the instance. With ``for_cluster``, the applications in the
+    node's cluster share it. ``version`` is set if the service runs for each topic and belongs to a
+    separate instance of an application.
+    """
+
+    service: str
+    node: str
+    application: str | None = None
+    source: str | None = None
+    topic: str | None = None
+    version: str = ""
+    for_cluster: bool = False
+
+    @property
+    def scope(self) -> Scope:
+        if self.application is not None:
+            return "application"
+        if self.for_cluster:
+            return "cluster"
+        return "node" if self.source is None else "topic"
+
+    @property
+    def instance(self) -> Instance:
+        """The key of the record of kept replicas in the ledger."""
+        named = (self.service, self.node, self.application, self.source, self.topic, self.version)
+        scope = "cluster" if self.for_cluster else ""
+        return ("replicas", *(name or "" for name in named), scope)
+
+    @classmethod
+    def of(cls, instance: Instance) -> ServiceKey:
+        """Return the key whose :attr:`instance` is ``instance``."""
+        service, node, *others, version, scope = instance[1:]
+        application, source, topic = (name or None for name in others)
+        return cls(service, node, application, source, topic, version, scope == "cluster")
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceRelease:
+    """The desired state of one service instance: one Helm release.
+
+    ``chart`` is the chart of ``version``, unless an override pins another chart version. ``keeps``
+    is set while the service keeps more replicas than its demands need.
+    """
+
+    key: ServiceKey
+    name: str
+    node: Node
+    domain: AccessDomain
+    service: Service
+    version: ApplicationVersion
+    chart: ChartSource
+    inputs: Mapping[str, tuple[InputTopic, ...]]
+    outputs: Mapping[str, str]
+    parameters: Mapping[str, object]
+    replicas: int | Autoscaler
+    keeps: Kept | None
+    applications: tuple[str, ...]
+    requesters: tuple[str, ...]
+    shaping: Shaping = UNSHAPED
+
+    @property
+    def autoscaler(self) -> Autoscaler | None:
+        return self.replicas if isinstance(self.replicas, Autoscaler) else None
+
+    @property
+    def images(self) -> tuple[str, ...]:
+        return self.service.images
+
+    def image(self, name: str, config: Config) -> Image:
+        return self.shaping.image(name, self.version.image(name, config.images[name]))
+
+    @property
+    def description(self) -> str:
+        """What runs, where and for whom, as commit messages say it."""
+        for_whom = self.key.source or self.key.application
+        what = f"{self.key.service} {self.key.version}".rstrip()
+        return f"{what} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
+
+    def facts(self) -> list[str]:
+        """Return what the release runs with, as lines; commit messages show changed lines.
+
+        Outputs, images that the version does not pin, and patches of Helm values are left out.
+        """
+        until = f" until {format_time(self.keeps.until)}" if self.keeps else ""
+        return [
+            *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
+            *(f"{name} = {value}" for name, value in self.parameters.items()),
+            f"replicas {self.replicas}{until}",
+            *([f"version {self.version.name}"] if self.version.name else []),
+            f"chart {self.chart.version}",
+            *(
+                f"image {name} {pin.digest or pin.tag or pin.repository}"
+                for name, pin in sorted(self.version.images.items())
+                if name in self.images
+            ),
+        ]
+
+    def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
+        """Yield (file, entry, what the entry decides) for entries that shape the release.
+
+        An empty ``entry`` stands for the whole file.
+        """
+        folder = f"appdefs/{self.service.folder}"
+        entry = "" if self.service.shared else f"services.{self.key.service}"
+        yield self.service.file, entry, "its definition"
+        if self.service.place:
+            yield self.service.file, f"{entry}.place".lstrip("."), "what its node must have"
+        yield config.values_template(self.service), "", "its Helm values"
+        if self.version.name:
+            entry = f"applications.{self.version.appdef}.versions.{self.version.name}"
+            yield config.file_of(VERSIONS_FILE, self.version.appdef), entry, "its version"
+        if self.keeps:
+            what = f"{self.replicas} replicas until {format_time(self.keeps.until)}"
+            yield records.replicas_path(self.key.instance), "keeps", what
+        chart, name = self.chart, self.service.chart
+        where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
+        file = config.file_of(CHARTS_FILE, name)
+        yield file, f"charts.{name}", f"version {chart.version} from {where}"
+
+
+Release = ServiceRelease | Client
+
+
+def claims_of(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
+    """Return the claims on a release's applications or connections."""
+    if isinstance(release, ServiceRelease):
+        return tuple(c for id in release.applications for c in ledger.application_claims(id))
+    return tuple(c for id in release.connections for c in ledger.connection_claims(id))

@@ -1,1 +1,0 @@
-"""Checks of what a booking would deploy: denials, quotas, topic clashes and version differences."""

@@ -1,1 +1,0 @@
-"""The manifests that a GitOps controller reads: Flux's or Argo CD's."""

@@ -1,0 +1,1 @@
+"""The state repo. Nothing else knows Git."""

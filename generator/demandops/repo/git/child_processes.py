@@ -1,0 +1,63 @@
+"""Ends git, ssh and other programs that this process has started, if this process is killed.
+
+A killed process cannot end its children, and git may wait for a silent server for long. So a shell
+waits beside this process, and ends all processes that inherited a mark in their environment: git,
+and what git has started in turn. A mark needs no list of processes, which a kill could find
+incomplete.
+"""
+
+from __future__ import annotations
+
+import atexit
+import os
+import subprocess
+from contextlib import suppress
+from functools import cache
+
+from demandops.base.runtime import REAL
+
+# The input ends without a line only if this process was killed. A process that is just being
+# started has no mark yet, so the shell looks again for two seconds. grep has -z, because the
+# kernel ends each variable in environ with a NUL byte.
+_WATCH = r"""
+read -r _ && exit
+for round in 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16 17 18 19 20; do
+  for file in $(grep -Fsxlz -e "$1" /proc/[0-9]*/environ); do
+    pid=${file#/proc/}
+    kill -KILL "${pid%/environ}" 2>/dev/null
+  done
+  sleep 0.1
+done
+"""
+
+
+def mark() -> dict[str, str]:
+    """Return environment variables for programs that must end if this process is killed."""
+    return _mark(os.getpid())
+
+
+@cache  # by process: a fork is a process of its own, which may live longer
+def _mark(pid: int) -> dict[str, str]:
+    name, value = "_DEMANDOPS_PROCESS", REAL.fresh_id()
+    watch = subprocess.Popen(
+        ["sh", "-c", _WATCH, "demandops-watch", f"{name}={value}"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        bufsize=0,
+        cwd="/",
+        start_new_session=True,  # so that Ctrl-C does not end it
+    )
+    pipe = watch.stdin
+    assert pipe is not None  # noqa: S101 - it was asked for
+
+    def finish() -> None:
+        with suppress(OSError, ValueError):  # after a fork, the pipe is the parent's
+            pipe.write(b"\n")
+            pipe.close()
+            watch.wait()
+
+    # the pipe must end with this process, also if a fork of it lives on
+    os.register_at_fork(after_in_child=pipe.close)
+    atexit.register(finish)
+    return {name: value}

@@ -1,0 +1,239 @@
+"""The state repo as a bare repository on this disk, written in place and fsynced."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pygit2
+from pygit2 import Oid, Repository
+
+from demandops.base.errors import StateRepoError, Unsound
+from demandops.base.settings import MAIN_BRANCH
+from demandops.repo.git.objects import NewObjects, sync_folder
+from demandops.repo.git.repository import (
+    MAIN,
+    PushDenied,
+    StateRepository,
+    Unavailable,
+    disk_error,
+    git_environment,
+    missing_main,
+    unopened,
+)
+
+# From this age on, a branch's lock counts as left behind by a killed process: Git locks a branch
+# only for milliseconds.
+_STALE_LOCK_S = 5.0
+
+log = logging.getLogger("demandops")
+
+
+class LocalRepository(StateRepository):
+    """A repository on this disk, written in place and fsynced; nobody may have main checked out."""
+
+    always_current = True
+
+    def __init__(self, path: Path) -> None:
+        self.address = str(path)
+        self._lock_seen: tuple[tuple[int, int], float] | None = None
+        try:
+            self.objects = Repository(str(path))
+        except pygit2.GitError as error:
+            if reason := unopened(path, error):
+                raise reason from None
+            remedy = f"make one with `demandops init {path} --bare`"
+            if any(path.iterdir()):  # `demandops init` would refuse this folder
+                remedy = (
+                    "name another folder, or make one in a new folder with `demandops init DIR "
+                    "--bare`"
+                )
+            raise StateRepoError(f"{path} is not a Git repository; {remedy}") from None
+        self.new = NewObjects(self.objects)
+        try:
+            self._require_usable(path)
+            _ = self.objects[self.tip()].peel(pygit2.Commit).tree
+        except (pygit2.GitError, KeyError, OSError) as error:
+            raise disk_error(error, self.address) or self._unreadable(str(error)) from None
+
+    def _unreadable(self, what: str) -> StateRepoError:
+        return StateRepoError(
+            f"{self.address} cannot be read: {what}; check its disk, and if "
+            f"`git -C {self.address} fsck` finds it broken, restore it from a backup or a clone"
+        )
+
+    def renew_if_damaged(self) -> bool:
+        """Raise StateRepoError if git finds damage: there is no remote to clone from."""
+        checked = subprocess.run(
+            ["git", "fsck", "--no-dangling", "--no-progress"],
+            cwd=self.objects.path,
+            env=os.environ | git_environment(),
+            capture_output=True,
+            text=True,
+            errors="replace",
+            check=False,
+        )
+        if checked.returncode:
+            lines = [*(checked.stderr + checked.stdout).strip().splitlines(), "git fsck fails"]
+            # other lines name only objects that point to the missing one
+            missing = (line for line in lines if line.startswith("missing "))
+            raise self._unreadable(next(missing, lines[0]))
+        return False
+
+    def _require_usable(self, path: Path) -> None:
+        borrowed = Path(self.objects.path) / "objects" / "info" / "alternates"
+        if borrowed.exists():
+            raise StateRepoError(
+                f"{path} borrows objects of another repository, which may remove them; copy them "
+                f"with `git -C {path} repack -a -d`, then remove {borrowed}"
+            )
+        self.new.clean()
+        self.tip()
+        # what `git clone --filter` writes into the configuration
+        filtered = (".promisor", ".partialclonefilter")
+        is_partial = any(entry.name.endswith(filtered) for entry in self.objects.config)
+        if self.objects.is_shallow or is_partial:
+            raise StateRepoError(
+                f"{path} is a clone that lacks a part of the history or of the files; clone the "
+                "state repo again, without --depth and --filter"
+            )
+        if self.objects.branches.local[MAIN_BRANCH].is_checked_out():
+            raise StateRepoError(
+                f"{path} has '{MAIN_BRANCH}' checked out, so its files would become outdated; "
+                f"use a bare clone: git clone --bare {path} {path}.git"
+            )
+        if self.tip() not in self.objects:
+            raise self._unreadable(f"its commit {self.tip()} is missing")
+
+    def tip(self) -> Oid:
+        """Return the newest commit of main, or raise StateRepoError if main is no plain branch."""
+        main = self.objects.references.get(self.main_reference)
+        if main is None:
+            raise missing_main(self.address)
+        if not isinstance(main.target, Oid):
+            raise StateRepoError(
+                f"the branch '{MAIN_BRANCH}' of {self.address} is only another name of "
+                f"{main.target}; make it a branch: git -C {self.address} update-ref --no-deref "
+                f"{MAIN} {main.target}"
+            )
+        return main.target
+
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
+        return self.tip()
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        if self.tip() != expected:
+            return False
+        reference = self.objects.references[MAIN]
+        try:
+            with self.new.packed(commit):
+                reference.set_target(commit, "demandops")
+        except (pygit2.GitError, OSError) as error:
+            reason = disk_error(error, self.address)
+            if isinstance(reason, PushDenied) and self.tip() != expected:
+                return False  # even if the new tip is ``commit``: it may not be synced
+            if reason is not None:
+                raise reason from None
+            self._break_stale_lock()
+            if self._lock_seen is None and self.tip() == expected:
+                raise Unavailable(f"{self.address} cannot be written: {error}") from None
+            return False  # another writer holds the lock or was first; the caller tries again
+        return True
+
+    def write_anew(self, since: str) -> None:
+        branch = Path(self.objects.path) / MAIN
+        lock = branch.with_name(f"{branch.name}.lock")
+        try:
+            with self.new.packed_anew(self.tip(), since), lock.open("x") as file:
+                file.write(f"{self.tip()}\n")
+                file.flush()
+                os.fsync(file.fileno())
+                lock.replace(branch)
+                sync_folder(branch.parent)
+        except (pygit2.GitError, OSError) as error:
+            self._break_stale_lock()
+            reason = disk_error(error, self.address)
+            # PushDenied would be wrong, because the commits are on main
+            if not isinstance(reason, Unsound | Unavailable):
+                reason = Unavailable(str(reason or f"{self.address} cannot be written: {error}"))
+            raise reason from None
+
+    def _break_stale_lock(self) -> None:
+        """Remove the branch's lock if it is so old that a killed process must have left it.
+
+        The age counts from the time when this process first saw the lock, by the monotonic clock.
+        """
+        lock = Path(self.objects.path) / f"{MAIN}.lock"
+        try:
+            status = lock.lstat()
+        except FileNotFoundError:
+            self._lock_seen = None
+            return
+        identity, now = (status.st_ino, status.st_mtime_ns), self.runtime.monotonic()
+        if self._lock_seen is None or self._lock_seen[0] != identity:
+            self._lock_seen = (identity, now)
+        elif now - self._lock_seen[1] > _STALE_LOCK_S:
+            log.warning("removing %s, which a killed process left behind", lock)
+            try:
+                lock.unlink()
+            except OSError as error:
+                raise Unavailable(
+                    f"{self.address} cannot be written: {lock} cannot be removed "
+                    f"({error.strerror}); remove it"
+                ) from None
+
+
+# ---- state repos that are only read: a person's checkout, and the last fetch of a URL ----
+
+
+def is_checkout(folder: Path) -> bool:
+    return (folder / ".git").exists() and (folder / "demandops.yaml").is_file()
+
+
+def checkout_around(folder: Path) -> Path | None:
+    """Return the nearest checkout of a state repo, from ``folder`` upwards."""
+    return next(filter(is_checkout, (folder, *folder.parents)), None)
+
+
+def origin_of(checkout: Path) -> str | None:
+    try:
+        remotes = {remote.name: remote.url for remote in Repository(str(checkout)).remotes}
+    except pygit2.GitError:
+        return None
+    return remotes.get("origin")
+
+
+class Checkout(LocalRepository):
+    """A checkout: its tip is the commit that is checked out, on any branch."""
+
+    main_reference = "HEAD"
+    branches = "refs/remotes/origin/"
+
+    def tip(self) -> Oid:
+        target = self.objects.head.target
+        assert isinstance(target, Oid)  # noqa: S101 - HEAD is resolved
+        return target
+
+    def _require_usable(self, path: Path) -> None:
+        if self.objects.is_empty or self.objects.head_is_unborn:
+            raise StateRepoError(f"{path} has no commit yet; commit its files first")
+
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        # a person may be editing the files, and would commit back what a demand has changed
+        raise PushDenied(
+            f"{self.address} is a checkout, and no command writes to a checkout; name the "
+            "checkout's remote instead"
+        )
+
+
+class LastFetch(LocalRepository):
+    """The clone of a URL at its last fetch, for readers that must not wait for the network."""
+
+    main_reference = f"refs/remotes/origin/{MAIN_BRANCH}"
+    branches = "refs/remotes/origin/"
+
+    def _require_usable(self, path: Path) -> None:
+        pass  # the process that made the clone has checked it

@@ -1,0 +1,346 @@
+"""Writes and syncs a pack and its index in Git's format.
+
+Each object is compressed and stored whole, not as a delta, because the search for deltas would take
+longer than the rest of a demand's commit. Git's housekeeping makes deltas later.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import os
+import re
+import shutil
+import struct
+import subprocess
+import weakref
+import zlib
+from bisect import bisect_right
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from tempfile import mkdtemp
+from typing import NamedTuple
+
+import pygit2
+from pygit2 import Oid, Repository, Tree
+from pygit2.enums import ObjectType
+
+_KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
+# The level of compression. A pack is short-lived, so speed counts more than size.
+_LEVEL = 1
+# An index has a separate table for offsets of at least this value.
+_SHORT_OFFSETS = 1 << 31
+
+
+class Packed(NamedTuple):
+    """An object in a pack: its id, and the checksum and the offset of its packed bytes."""
+
+    oid: bytes
+    crc: int
+    offset: int
+
+
+def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -> Path:
+    """Write a pack and its index into a folder, sync both, and return the pack's path."""
+    parts = [b"PACK" + struct.pack(">II", 2, len(objects))]
+    packed, offset = list[Packed](), len(parts[0])
+    for oid, kind, data in objects:
+        part = _header(_KINDS[kind], len(data)) + zlib.compress(data, _LEVEL)
+        packed.append(Packed(oid.raw, zlib.crc32(part), offset))
+        parts.append(part)
+        offset += len(part)
+    checksum = _sha1_of_parts(parts)
+    path = folder / f"pack-{checksum.hex()}.pack"
+    _write_synced(path, [*parts, checksum])
+    _write_synced(path.with_suffix(".idx"), index_of(packed, checksum))
+    return path
+
+
+def _header(kind: int, size: int) -> bytes:
+    # 4 bits of the size are beside the type, and 7 in each further byte; the top bit means more
+    byte, size = kind << 4 | size & 0xF, size >> 4
+    header = bytearray()
+    while size:
+        header.append(byte | 0x80)
+        byte, size = size & 0x7F, size >> 7
+    header.append(byte)
+    return bytes(header)
+
+
+def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
+    """Return the bytes of the index (version 2) of a pack with this checksum, in parts."""
+    packed = sorted(packed)
+    firsts = [item.oid[0] for item in packed]
+    far = [item.offset for item in packed if item.offset >= _SHORT_OFFSETS]
+    places = {offset: _SHORT_OFFSETS | place for place, offset in enumerate(far)}
+    parts = [
+        b"\xfftOc" + struct.pack(">I", 2),
+        # git looks an id up by its first byte: how many ids begin with at most this byte
+        struct.pack(">256I", *(bisect_right(firsts, first) for first in range(256))),
+        b"".join(item.oid for item in packed),
+        struct.pack(f">{len(packed)}I", *(item.crc for item in packed)),
+        struct.pack(f">{len(packed)}I", *(places.get(i.offset, i.offset) for i in packed)),
+        struct.pack(f">{len(far)}Q", *far),
+        checksum,
+    ]
+    return [*parts, _sha1_of_parts(parts)]
+
+
+def _sha1_of_parts(parts: Iterable[bytes]) -> bytes:
+    digest = hashlib.sha1()  # noqa: S324 - Git's checksums
+    for part in parts:
+        digest.update(part)
+    return digest.digest()
+
+
+def _write_synced(path: Path, parts: Iterable[bytes]) -> None:
+    # read-only, like git's packs
+    handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o444)
+    with open(handle, "wb") as file:  # noqa: PTH123 - opens a file descriptor
+        file.writelines(parts)
+        file.flush()
+        os.fsync(handle)
+
+
+# ---- new objects of a state repo: kept in memory, then written to the disk as one pack ----
+#
+# A pack needs a few syncs for all commits of a batch. Loose objects would need some syncs each.
+# Every new object that the commits need goes into the pack, even if the repository already has a
+# loose copy of the object. The copy may not be on the disk yet, or git may soon prune it.
+
+_TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
+# The prefix of the folders in which packs are built.
+UNFINISHED = "demandops-pack-"
+# The errors raised if a file system has no hard links, or a file has too many.
+_NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
+# The first bytes of the index of a pack.
+_INDEX = b"\xfftOc"
+
+# An entry of a tree object: the mode, the name and the raw id.
+_ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0.{20})", re.DOTALL)
+_ID = re.compile(rb"[0-7]+ [^\0]+\0(.{20})", re.DOTALL)
+_FOLDER = b"40000"
+
+# Name → raw entry of a folder. The name of a subfolder ends in a slash, so that sorting by name
+# gives Git's order.
+Entries = dict[bytes, bytes]
+# How many folders to remember. The newest are kept, because demands often change these again. A
+# remembered folder never becomes outdated, because an id always means the same content.
+_REMEMBERED = 32
+
+
+class NewObjects(pygit2.OdbBackend):
+    """Objects that are in memory and not in a pack yet. The repository can read them."""
+
+    def __init__(self, repo: Repository) -> None:
+        super().__init__()
+        # a strong reference would leak the repository and this object: Python does not know that
+        # libgit2 refers to this object, so it could not free the cycle
+        self._repo = weakref.ref(repo)
+        self._unpacked: dict[Oid, tuple[ObjectType, bytes]] = {}
+        self._folders: dict[Oid, Entries] = {}
+        # the lowest priority, because most objects are read from the disk
+        repo.odb.add_backend(self, 0)
+
+    @property
+    def repo(self) -> Repository:
+        repo = self._repo()
+        assert repo is not None  # noqa: S101 - its writer has a strong reference
+        return repo
+
+    def add(self, kind: ObjectType, data: bytes) -> Oid:
+        """Keep an object in memory until it is packed, and return its id."""
+        content = b"%s %d\0%s" % (_TYPES[kind], len(data), data)
+        oid = Oid(raw=hashlib.sha1(content).digest())  # noqa: S324 - Git's object ids
+        self._unpacked[oid] = (kind, data)
+        return oid
+
+    def folder(self, oid: Oid) -> Entries:
+        """Return the entries of a folder, to change and pass to :meth:`add_folder`."""
+        remembered = self._folders.pop(oid, None)
+        if remembered is not None:
+            return remembered
+        return {
+            name + b"/" if mode == _FOLDER else name: entry
+            for entry, mode, name in _ENTRY.findall(self.repo[oid].peel(Tree).read_raw())
+        }
+
+    def add_folder(self, entries: Entries) -> Oid:
+        """Keep a folder in memory until it is packed, and return its id.
+
+        The caller must not change ``entries`` afterwards.
+        """
+        oid = self.add(ObjectType.TREE, b"".join(map(entries.__getitem__, sorted(entries))))
+        self._folders[oid] = entries
+        if len(self._folders) > _REMEMBERED:
+            del self._folders[next(iter(self._folders))]
+        return oid
+
+    def forget(self) -> None:
+        self._unpacked.clear()
+
+    @contextmanager
+    def packed(self, commit: Oid) -> Iterator[None]:
+        """Write a synced pack with all new objects that a commit needs, then run the block.
+
+        While the block runs, git's housekeeping does not remove the pack, although no reference
+        leads to its commits yet.
+        """
+        needed = self._needed_by(commit)
+        if not needed:
+            yield
+            return
+        objects = [(oid, *self._unpacked[oid]) for oid in needed]
+        with self._placed(lambda folder: write_pack(folder, objects)):
+            for oid in needed:
+                del self._unpacked[oid]
+            yield
+
+    @contextmanager
+    def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
+        """Write a new synced pack with the objects that ``commit`` has and ``since`` lacks.
+
+        If ``since`` is no commit of the repository, the pack has all objects of ``commit``. The
+        repository has these objects, but an earlier sync of them may have failed.
+        """
+        without = f"^{since}\n" if since and since in self.repo else ""
+        with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n{without}")):
+            yield
+
+    @contextmanager
+    def _placed(self, build: Callable[[Path], Path]) -> Iterator[None]:
+        """Build a pack, move it into place, and protect it from git while the block runs."""
+        packs = self._packs
+        with _locked(packs, fcntl.LOCK_SH), _new_folder(self.repo.path) as folder:
+            built = build(folder)
+            placed = packs / built.name
+            keep = placed.with_suffix(".keep")
+            keep.unlink(missing_ok=True)
+            try:
+                # git removes no pack that has a .keep file
+                _link_or_write(keep, built.with_suffix(".idx"))
+                # the pack comes first, because git removes an index without a pack
+                built.replace(placed)
+                built.with_suffix(".idx").replace(placed.with_suffix(".idx"))
+                sync_folder(packs)
+                yield
+            finally:
+                with suppress(OSError):  # the next start removes the .keep file
+                    keep.unlink(missing_ok=True)
+
+    @property
+    def _packs(self) -> Path:
+        return Path(self.repo.path) / "objects" / "pack"
+
+    def clean(self) -> None:
+        """Remove files that killed processes left, unless another process writes a pack now."""
+        with suppress(OSError), _locked(self._packs, fcntl.LOCK_EX | fcntl.LOCK_NB):
+            for folder in Path(self.repo.path).glob(f"{UNFINISHED}*"):
+                shutil.rmtree(folder, ignore_errors=True)
+            for keep in self._packs.glob("*.keep"):
+                with keep.open("rb") as file:  # a person's .keep does not begin like an index
+                    is_ours = file.read(len(_INDEX)) == _INDEX
+                if is_ours:
+                    keep.unlink()
+
+    def _copy_to_pack(self, folder: Path, revisions: str) -> Path:
+        done = subprocess.run(
+            # packing each object anew reads and checks it
+            ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
+             "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
+            cwd=self.repo.path,
+            input=revisions,
+            capture_output=True,
+            text=True,
+            check=False,
+        )  # fmt: skip
+        if done.returncode:
+            raise pygit2.GitError(done.stderr.strip())
+        # iterdir, because glob would hide that the folder cannot be read
+        (pack,) = [path for path in folder.iterdir() if path.suffix == ".pack"]
+        return pack
+
+    def _needed_by(self, commit: Oid) -> list[Oid]:
+        unpacked = {oid.raw: oid for oid in self._unpacked}
+        needed, queue = dict[Oid, None](), [commit]
+        while queue:
+            oid = queue.pop()
+            if oid in needed or oid not in self._unpacked:
+                continue
+            needed[oid] = None
+            kind, data = self._unpacked[oid]
+            if kind is ObjectType.COMMIT:
+                parsed = self.repo[oid].peel(pygit2.Commit)
+                queue += [parsed.tree_id, *parsed.parent_ids]
+            elif kind is ObjectType.TREE:
+                queue += [unpacked[raw] for raw in _ID.findall(data) if raw in unpacked]
+        return list(needed)
+
+    # ---- called by libgit2 ----
+
+    def __iter__(self) -> Iterator[Oid]:
+        return iter(self._unpacked)
+
+    def exists_cb(self, oid: Oid) -> bool:
+        return oid in self._unpacked
+
+    def read_cb(self, oid: Oid) -> tuple[int, bytes]:
+        return self._unpacked[oid]
+
+    def read_header_cb(self, oid: Oid) -> tuple[int, int]:
+        kind, data = self._unpacked[oid]
+        return kind, len(data)
+
+    def read_prefix_cb(self, oid: Oid) -> tuple[int, bytes, Oid]:
+        kind, data = self._unpacked[oid]  # a shortened id finds nothing
+        return kind, data, oid
+
+    def refresh_cb(self) -> None:
+        pass  # memory is always current
+
+
+@contextmanager
+def _new_folder(parent: str) -> Iterator[Path]:
+    folder = mkdtemp(dir=parent, prefix=UNFINISHED)
+    try:
+        yield Path(folder)
+    finally:
+        # For the folder itself, rmtree raises some errors nevertheless. A folder that stays is
+        # removed at the next start.
+        with suppress(OSError):
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+@contextmanager
+def _locked(folder: Path, operation: int) -> Iterator[None]:
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(handle, operation)
+        yield
+    finally:
+        os.close(handle)
+
+
+def _link_or_write(keep: Path, index: Path) -> None:
+    try:
+        keep.hardlink_to(index)  # which is synced already, so this costs no sync
+    except OSError as error:
+        if error.errno not in _NO_LINKS:
+            raise
+        unplaced = index.with_suffix(".keep")
+        with unplaced.open("wb") as file:
+            file.write(_INDEX)
+            file.flush()
+            os.fsync(file.fileno())
+        unplaced.replace(keep)
+
+
+def sync_folder(folder: Path) -> None:
+    # without this, a power loss may take the names of new files, though not their content
+    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -1,0 +1,261 @@
+"""The base class of state repos: Git objects, and a tip that only moves forward.
+
+A state repo is on this disk or behind a URL. Each of the two has a subclass, and
+:mod:`.open_repository` chooses between them.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import re
+import subprocess
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pygit2
+from pygit2 import Oid, Repository, Tree
+
+from demandops.base.errors import StateRepoError, Unsound
+from demandops.base.runtime import REAL, Runtime
+from demandops.base.settings import MAIN_BRANCH
+from demandops.repo.git import child_processes
+from demandops.repo.git import tree as trees
+from demandops.repo.git.objects import NewObjects
+from demandops.repo.git.signing import Signer
+
+MAIN = f"refs/heads/{MAIN_BRANCH}"
+TIMEOUT_S = 120
+_ENVIRONMENT = {
+    # git fails instead of asking for a password, because nobody may be there to answer
+    "GIT_TERMINAL_PROMPT": "0",
+    # git's errors are recognized by their English text
+    "LC_ALL": "C",
+    # git ends an HTTP transfer with less than 1 byte a second for 60 seconds
+    "GIT_HTTP_LOW_SPEED_LIMIT": "1",
+    "GIT_HTTP_LOW_SPEED_TIME": "60",
+}
+
+
+def git_environment() -> dict[str, str]:
+    return _ENVIRONMENT | child_processes.mark()
+
+
+class Unavailable(StateRepoError):
+    """Raised when the state repo cannot be read or written now, but perhaps later.
+
+    Then a generator keeps its demands in the journal and tries again.
+    """
+
+
+class RemoteAway(Unavailable):
+    """Raised without network or rights to fetch, or if a push fails for a temporary reason."""
+
+
+class DiskFull(Unavailable):
+    """Raised when the disk of the state repo, or of its clone, has no room."""
+
+
+class FetchInterrupted(StateRepoError):
+    """Raised when a fetch was stopped for more urgent work, like a new demand."""
+
+
+class PushDenied(StateRepoError):
+    """Raised when a write fails for a reason that another attempt does not change.
+
+    Examples are a hook, a protected branch, missing rights and a read-only file system.
+    """
+
+
+_NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+_NOT_ALLOWED = (errno.EACCES, errno.EPERM, errno.EROFS)
+_BROKEN = (errno.EIO, errno.EUCLEAN, errno.ENODEV, errno.ENXIO, errno.ESTALE)
+_NUMBERS = {os.strerror(number): number for number in (*_NO_ROOM, *_NOT_ALLOWED, *_BROKEN)}
+_NUMBERS["failed to refresh packfiles"] = errno.EIO  # libgit2 could not list objects/pack
+
+
+def disk_error(error: Exception, address: str) -> StateRepoError | Unsound | None:
+    """Return the error to raise if ``error`` of a read or write came from the disk, else None."""
+    number = getattr(error, "errno", None)
+    if number is None:  # libgit2 gives the system's error only as text
+        what = next((text for text in _NUMBERS if str(error).endswith(text)), "")
+        number = _NUMBERS.get(what)
+    else:
+        what = os.strerror(number)
+    if number in _NO_ROOM:
+        return DiskFull(f"{address} cannot be written: its disk has no room ({what}); free some")
+    if number == errno.EROFS:
+        return PushDenied(f"{address} cannot be written: {what}; make its file system writable")
+    if number in _NOT_ALLOWED:
+        return PushDenied(
+            f"{address} cannot be used: {what}; give the user of this program the right to read "
+            "and write all files and folders there"
+        )
+    if number in _BROKEN:  # what is on the disk now is unknown, so the program must end
+        return Unsound(f"{address} cannot be used: {what}; check its disk, then start again")
+    return None
+
+
+def missing_main(address: str) -> StateRepoError:
+    return StateRepoError(
+        f"{address} has no branch '{MAIN_BRANCH}'; if it was renamed or deleted, restore it; if "
+        "there is no state repo yet, push one made by `demandops init DIR`"
+    )
+
+
+def unopened(folder: Path, error: Exception) -> StateRepoError | None:
+    """Return the error to raise if Git cannot open a folder; None if it is no Git repository."""
+    if not ((folder / ".git").exists() or (folder / "HEAD").is_file()):
+        return None
+    return StateRepoError(
+        f"{folder} is a Git repository that cannot be opened: {error}; if it belongs to another "
+        f"user, run `git config --global --add safe.directory {folder.resolve()}`"
+    )
+
+
+def access_error(error: Exception, address: str, objects: Repository | None = None) -> Exception:
+    """Return the error to raise if reading or writing ``address`` failed with ``error``.
+
+    An error that is neither of the system nor of libgit2 is returned unchanged. With ``objects``,
+    the text names the file and the commit of an object that cannot be read.
+    """
+    is_missing = isinstance(error, KeyError) and isinstance(error.args[0], Oid)
+    if not (is_missing or isinstance(error, OSError | pygit2.GitError)):
+        return error
+    # the text of a KeyError would have quotes
+    what = str(error.args[0]) if isinstance(error, KeyError) else str(error)
+    if objects is not None and (oid := re.search("[0-9a-f]{40}", what)):
+        place = trees.place_of(Repository(objects.path), Oid(hex=oid[0]))
+        what = f"{place}, Git object {oid[0]}, is missing or damaged" if place else what
+    return disk_error(error, address) or StateRepoError(
+        f"{address} cannot be read: {what}; check its disk and its files with `git fsck`, then "
+        "fetch or clone the missing files again, or restore them from a backup"
+    )
+
+
+@contextmanager
+def reading(address: str, objects: Repository) -> Iterator[None]:
+    """Raise StateRepoError if an object is missing or damaged; see :func:`access_error`."""
+    try:
+        yield
+    except (pygit2.GitError, KeyError, OSError) as error:
+        if getattr(error, "errno", None) is not None:  # not from libgit2, so about another file
+            raise
+        raise access_error(error, address, objects) from None
+
+
+class StateRepository(ABC):
+    """A state repo: Git objects to read and write, and a tip.
+
+    :meth:`publish` only moves the tip forward. :meth:`refresh` may move it back, if somebody has
+    rewritten main.
+    """
+
+    objects: Repository
+    new: NewObjects
+    address: str
+    signer: Signer | None = None
+    runtime: Runtime = REAL
+    # called again and again while this waits for git
+    while_waiting: Callable[[], object] = staticmethod(lambda: None)
+    # whether the tip needs no fetch, as in a repository on this disk
+    always_current: bool
+    _tidying: subprocess.Popen[bytes] | None = None
+    # of the tip: main, its remote-tracking branch, or HEAD of a checkout
+    main_reference = MAIN
+    # the prefix of the references of branches
+    branches = "refs/heads/"
+
+    def tip(self) -> Oid:
+        """Return the newest published commit that is known here, without asking the remote."""
+        target = self.objects.references[self.main_reference].target
+        assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
+        return target
+
+    @abstractmethod
+    def refresh(self, urgent: Callable[[], bool] = lambda: False) -> Oid:
+        """Fetch and return the newest published commit.
+
+        If ``urgent`` returns true before the fetch ends, git is ended and FetchInterrupted is
+        raised, so that a demand need not wait. Raises Unavailable if git cannot fetch now, and
+        StateRepoError if the state repo has no main.
+        """
+
+    @abstractmethod
+    def publish(self, expected: Oid, commit: Oid) -> bool:
+        """Make ``commit``, a descendant of ``expected``, the tip, durably, and return true.
+
+        If the current tip is not ``expected``, or another writer holds the lock of main, change
+        nothing and return false.
+
+        Raises:
+            Unavailable: the commit was not published, or nobody knows whether the remote got it. So
+                look for the commit before you publish it again.
+            PushDenied: the commit was not published, and another attempt would fail too.
+            Unsound: the disk failed, and nobody knows whether the commit was published.
+        """
+
+    def write_anew(self, since: str) -> None:  # noqa: B027 - a remote confirms what it stored
+        """Write the commits after ``since`` again, so that they are durable."""
+
+    def reopened(self) -> Repository:
+        # two threads must not use one Repository; this one has no objects that are only in memory
+        return Repository(self.objects.path)
+
+    def includes(self, commit: str, other: str) -> bool:
+        """Return whether ``commit`` is ``other`` or descends from it, as far as known here."""
+        if commit == other:
+            return True
+        try:
+            return self.reopened().descendant_of(commit, other)
+        except (pygit2.GitError, KeyError, ValueError):
+            return False
+
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Return whether ``path`` exists and is equal in two commits that are known here."""
+        pair = self._trees(commit, other)
+        if pair is None:
+            return False
+        if path in ("", "."):
+            return pair[0].id == pair[1].id
+        return trees.entry(pair[0], path) is not None and not trees.differ(*pair, (path,))
+
+    def changed_paths(self, since: str, commit: str) -> list[str] | None:
+        """Return the sorted paths of the files that differ; None if a commit is unknown here."""
+        pair = self._trees(since, commit)
+        return None if pair is None else sorted(path for path, _ in trees.differences(*pair))
+
+    def _trees(self, commit: str, other: str) -> tuple[Tree, Tree] | None:
+        objects = self.reopened()
+        try:
+            return trees.commit_of(objects, commit).tree, trees.commit_of(objects, other).tree
+        except StateRepoError:
+            return None
+
+    @abstractmethod
+    def renew_if_damaged(self) -> bool:
+        """Let git check the files, and replace a damaged clone; return whether it was replaced.
+
+        Raises Unavailable if damaged files cannot be replaced now, and StateRepoError if there is
+        nothing to replace them from.
+        """
+
+    def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
+        """End the running transfer with a remote, if any; later ones raise RemoteAway."""
+
+    def tidy(self) -> None:
+        """Start git in the background to join the packs, unless it is still joining them."""
+        if self._tidying is not None and self._tidying.poll() is None:
+            return
+        self._tidying = subprocess.Popen(
+            # --geometric joins a pack only with those of about its size, so that a demand's small
+            # pack does not let git write the whole history again
+            ["git", "repack", "--geometric=2", "-d", "-l", "--quiet"],
+            cwd=self.objects.path,
+            env=os.environ | git_environment(),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,  # so that Ctrl-C does not end it
+        )

@@ -1,0 +1,249 @@
+"""Git trees: looking up a path, reading files, comparing trees, writing only the changed parts."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
+
+import pygit2
+from pygit2 import Blob, Commit, Object, Oid, Repository, Tree
+from pygit2.enums import FileMode, ObjectType, SortMode
+
+from demandops.base.errors import StateRepoError
+from demandops.base.quoting import quoted
+from demandops.repo.git.objects import Entries, NewObjects
+
+# Sync the files that libgit2 writes, so that a commit is on the disk before anybody learns of it.
+pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
+# By default libgit2 does not cache trees over 4 KiB and parses them at every look-up.
+pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
+
+
+# How many folders deep a file may be; deeper folders are not read.
+MAX_DEPTH = 64
+
+
+def commit_of(repo: Repository, commit: str | Oid) -> Commit:
+    """Return the commit with a whole id, or raise StateRepoError.
+
+    An id as text may come from a trailer or the journal, so it may be any text. What people write
+    is read by :func:`.revisions.resolve`.
+    """
+    try:
+        if isinstance(commit, str) and not re.fullmatch("[0-9a-f]{40}", commit):
+            raise StateRepoError(f"{quoted(commit)} is no commit's id of 40 hexadecimal digits")
+        return repo[commit].peel(Commit)
+    except pygit2.InvalidError as error:
+        raise StateRepoError(
+            f"commit {error}; set the branch back to the commit before it"
+        ) from None
+    except (KeyError, ValueError, pygit2.GitError):
+        raise StateRepoError(
+            f"the commit {commit} cannot be read; check the disk of the state repo and of its "
+            "clone, then try again"
+        ) from None
+
+
+def place_of(repo: Repository, wanted: Oid) -> str | None:
+    """Return which file or folder of which of the newest commits has an object.
+
+    The object itself may be missing.
+    """
+    seen = set[Oid]()
+
+    def path_in(tree: Tree, prefix: str) -> str | None:
+        seen.add(tree.id)
+        for child in tree:
+            path = prefix + _printable(child.raw_name or b"")
+            if child.id == wanted:
+                return path
+            if isinstance(child, Tree) and child.id not in seen and path.count("/") < MAX_DEPTH:
+                inner = path_in(child, f"{path}/")
+                if inner is not None:
+                    return inner
+        return None
+
+    try:
+        walker = repo.walk(None, SortMode.TIME)
+        for name in repo.references:
+            walker.push(repo.references[name].peel(Commit).id)
+        for commit in islice(walker, 10_000):  # each reads folders, and a history may be long
+            path = "the top folder" if commit.tree_id == wanted else path_in(commit.tree, "")
+            if path is not None:
+                return f"{path} of commit {str(commit.id)[:10]}"
+    except (KeyError, ValueError, pygit2.GitError):  # more is damaged
+        pass
+    return None
+
+
+def parent_tree(commit: Commit) -> Tree | None:
+    return commit.parents[0].tree if commit.parents else None
+
+
+def entry(tree: Tree | None, path: str) -> Object | None:
+    try:
+        return tree[path] if tree is not None else None
+    except KeyError:
+        return None
+
+
+def entry_id(tree: Tree | None, path: str) -> Oid | None:
+    child = entry(tree, path)
+    return child.id if child is not None else None
+
+
+def read_text(tree: Tree | None, path: str) -> str | None:
+    blob = entry(tree, path)
+    return text_of(blob) if isinstance(blob, Blob) else None
+
+
+def text_of(blob: Object) -> str:
+    """Return the text of a file, or an empty text for any other object."""
+    # a person's file in another encoding must give a fault of its content, not an exception
+    return blob.data.decode("utf-8", "replace") if isinstance(blob, Blob) else ""
+
+
+def entries(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Object]]:
+    """Yield (path, object) of each file, link or submodule at or below the paths ``roots``.
+
+    The order is Git's. A folder that is deeper than :data:`MAX_DEPTH` is yielded like a file. In a
+    name, a byte that is not UTF-8 is shown as ``\\xff``.
+    """
+    for root in roots:
+        child = entry(tree, root)
+        if isinstance(child, Tree):
+            yield from _entries_below(child, f"{root}/", root.count("/") + 1)
+        elif child is not None:
+            yield root, child
+
+
+def _entries_below(tree: Tree, prefix: str, depth: int) -> Iterator[tuple[str, Object]]:
+    for child in tree:
+        path = prefix + _printable(child.raw_name or b"")
+        if isinstance(child, Tree) and depth < MAX_DEPTH:
+            yield from _entries_below(child, f"{path}/", depth + 1)
+        else:
+            yield path, child
+
+
+def _printable(name: bytes) -> str:
+    return name.decode("utf-8", "backslashreplace")
+
+
+def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
+    """Yield (path, file) of every file and link at or below the paths ``roots``, in Git's order."""
+    for path, child in entries(tree, roots):
+        if isinstance(child, Blob):
+            yield path, child
+
+
+def is_file(child: Object) -> bool:
+    """Return whether an entry is a file, not a link, submodule or folder."""
+    return isinstance(child, Blob) and child.filemode != FileMode.LINK
+
+
+def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
+    """Return all files at or below the paths ``roots``, as path → text.
+
+    The text of a link is the path that it points to.
+    """
+    return {path: text_of(blob) for path, blob in blobs(tree, roots)}
+
+
+def differ(one: Tree | None, other: Tree | None, paths: Iterable[str]) -> bool:
+    return any(entry_id(one, path) != entry_id(other, path) for path in paths)
+
+
+def differences(
+    before: Tree | None, after: Tree | None, roots: Iterable[str] = ()
+) -> Iterator[tuple[str, Oid | None]]:
+    """Yield (path, new id) of each file that differs between two trees.
+
+    The new id is the file's id in ``after``, or None if the file was removed. Only files at or
+    below the paths ``roots`` are compared; by default all files. A file whose mode alone changed,
+    and a file deeper than :data:`MAX_DEPTH`, is left out. Equal subtrees are not read.
+    """
+    if not roots:
+        yield from _differences_below(before, after, "")
+    for root in roots:
+        yield from _differences_at(entry(before, root), entry(after, root), root)
+
+
+def _differences_below(
+    before: Tree | None, after: Tree | None, prefix: str
+) -> Iterator[tuple[str, Oid | None]]:
+    old = {_printable(child.raw_name or b""): child for child in before or ()}
+    new = {_printable(child.raw_name or b""): child for child in after or ()}
+    for name in sorted({*old, *new}):
+        yield from _differences_at(old.get(name), new.get(name), f"{prefix}{name}")
+
+
+def _differences_at(
+    old: Object | None, new: Object | None, path: str
+) -> Iterator[tuple[str, Oid | None]]:
+    if old is not None and new is not None and old.id == new.id:
+        return
+    if path.count("/") < MAX_DEPTH and (isinstance(old, Tree) or isinstance(new, Tree)):
+        before, after = (child if isinstance(child, Tree) else None for child in (old, new))
+        yield from _differences_below(before, after, f"{path}/")
+    if new is not None and not isinstance(new, Tree):
+        yield path, new.id
+    elif old is not None and not isinstance(old, Tree):
+        yield path, None
+
+
+def is_readme(path: str) -> bool:
+    return path.rsplit("/", 1)[-1] == "README.md"
+
+
+def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
+    """Write the tree ``base`` with the changes in ``files``, and return the new tree's id.
+
+    ``files`` maps paths to new texts; None removes the file or folder. Only the folders above a
+    changed file are written again. A folder that becomes empty is removed, because Git has no empty
+    folders.
+    """
+    return _write(objects, base.id if base is not None else None, files) or objects.add_folder({})
+
+
+def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None]) -> Oid | None:
+    """Write a folder with all below it; return its id, or None if the folder is empty."""
+    entries = objects.folder(base) if base is not None else {}
+    below: dict[bytes, dict[str, str | None]] = {}
+    here: dict[bytes, str | None] = {}
+    for path, text in files.items():
+        folder_name, _, inner_path = path.partition("/")
+        raw_name = _raw_name(folder_name, entries)
+        if inner_path:
+            below.setdefault(raw_name, {})[inner_path] = text
+        else:
+            here[raw_name] = text
+    for name, inner in below.items():
+        folder = name + b"/"
+        kept = folder in entries and here.get(name, "") is not None
+        old = Oid(raw=entries[folder][-20:]) if kept else None  # an entry ends with the raw id
+        subtree = _write(objects, old, inner)
+        if subtree is not None:
+            entries.pop(name, None)
+            entries[folder] = b"40000 %s\0%s" % (name, subtree.raw)
+        elif kept:
+            del entries[folder]
+    for name, text in here.items():  # after the folders, so that a file can replace a folder
+        if text is not None:
+            entries.pop(name + b"/", None)
+            blob = objects.add(ObjectType.BLOB, text.encode())
+            entries[name] = b"100644 %s\0%s" % (name, blob.raw)
+        elif not any(inner is not None for inner in below.get(name, {}).values()):
+            entries.pop(name, None)
+            entries.pop(name + b"/", None)
+    return objects.add_folder(entries) if entries else None
+
+
+def _raw_name(name: str, entries: Entries) -> bytes:
+    """Return the raw name of the entry that the program shows as ``name``; if none, in UTF-8."""
+    raw = name.encode()
+    if raw in entries or b"\\" not in raw:  # a backslash may stand for a byte that is not UTF-8
+        return raw
+    raw_names = (key.removesuffix(b"/") for key in entries)
+    return next((known for known in raw_names if _printable(known) == name), raw)

@@ -1,0 +1,1 @@
+"""Commits: their log, their messages and authors, and how people name them."""

@@ -1,0 +1,1 @@
+"""A commit is read as configuration and ledger."""

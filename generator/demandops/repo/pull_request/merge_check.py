@@ -1,0 +1,402 @@
+"""The check of a pull request: whether an edit can be merged, and the effect of the merge.
+
+All files must be valid, and the generator must be able to render the desired state. Generated files
+must not have manual edits. A changed chart must have a new version, because Flux and Argo CD
+compare only versions. The edit is compared with the commit that it started from. The result also
+shows how the merge would change desired state and bookkeeping.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+from itertools import chain, count
+from pathlib import Path
+
+from demandops.base import strict_yaml
+from demandops.base.errors import Fault, InvalidInput, fault
+from demandops.base.runtime import REAL
+from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from demandops.base.strict_yaml import with_lines
+from demandops.decide import warnings
+from demandops.decide.changes import merge_preview
+from demandops.decide.changes.merge_preview import MergePreview
+from demandops.decide.claim_edit import faults_of_edit
+from demandops.decide.override_lifecycle import expired_overrides, update_ledger
+from demandops.decide.state import State, rendered_files, try_configuration
+from demandops.decide.warnings import missing_inputs
+from demandops.model.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
+from demandops.model.config.load import load
+from demandops.model.config.override import OVERRIDES_ROOT, format_time
+from demandops.model.config.repo_settings import ROOT_FILE
+from demandops.model.ledger import claim_file, records
+from demandops.model.ledger.ledger import Ledger, World, changes_on
+from demandops.render.paths import BOOTSTRAP_ROOT, path_of
+from demandops.repo.git import tree as trees
+from demandops.repo.load import ledger_files
+from demandops.repo.pull_request import edited_checkout, rendered_charts
+from demandops.repo.pull_request.edited_checkout import Base, author_of, base_of, files_of
+from demandops.repo.pull_request.rendered_charts import RenderedCharts
+from demandops.templating import chart_files
+from demandops.templating.evaluator import EVALUATE
+from demandops.views import override_report
+from demandops.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
+
+_MOST_LEFT = 5
+
+
+@dataclass(frozen=True, slots=True)
+class Suggestion:
+    """A suggested override that replaces the manual edit of a generated file."""
+
+    # the path of the edited file
+    instead_of: str
+    # path and content of the override
+    file: str
+    text: str
+    # the parts of the edit that the override leaves out
+    not_covered: tuple[str, ...]
+    # the other releases to which the override also applies
+    other_releases: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CheckResult:
+    """The result of checking a checkout before it is merged.
+
+    What the merge changes leaves out claims that are not valid. It is None if the configuration is
+    not valid or the desired state cannot be rendered.
+    """
+
+    faults: tuple[Fault, ...]
+    suggestions: tuple[Suggestion, ...] = ()
+    preview: MergePreview | None = None
+    # also None if the base's bookkeeping is not known; empty if there is no base
+    bookkeeping: tuple[EntryChange, ...] | None = None
+    # the commit that the checkout is compared with
+    base: str | None = None
+    # if not, the last valid versions of its files are compared
+    base_valid: bool = True
+    # the name of the merge target, and how many commits it has that the checkout lacks
+    target: str = ""
+    newer: int = 0
+    # likely mistakes, and what a person has to do after the merge
+    warnings: tuple[Fault, ...] = ()
+    charts: RenderedCharts | None = None
+
+
+def check(
+    folder: Path,
+    base: str | None = None,
+    now: datetime | None = None,
+    *,
+    require_helm: bool = False,
+) -> CheckResult:
+    """Check the files of a state repo, and return the faults and the effect of a merge.
+
+    Args:
+        folder: a checked-out state repo, or its files without Git.
+        base: the merge target; by default ``origin/main``, else ``main``. The edit is compared
+            with the common ancestor of HEAD and the merge target. If there is no merge target, the
+            edit is compared with HEAD.
+        now: the time of the check, by default the current time. Overrides that ended before this
+            time do not apply.
+        require_helm: whether a missing helm is a fault.
+    """
+    files, faults = files_of(folder)
+    start = base_of(folder, base)
+    edit = _Edit(files, start, now or REAL.now())
+    claims = ledger_files.read_claims(sorted(files.items()))
+    faults += claims.faults
+    edited = [path for path in edit.changed if _is_written_by_generator(path)]
+    result = CheckResult(
+        (),
+        base=start.commit if start else None,
+        base_valid=start is None or start.valid,
+        target=start.target if start else "",
+        newer=start.newer if start else 0,
+    )
+    try:
+        config = edit.config()
+        faults += edit.unversioned_charts(config)
+        state = edit.merged_state(config, claims.ledger())
+        faults += edit.refused_claims(state)
+        wanted = edit.rendered(state)
+    except InvalidInput as error:
+        faults += error.faults
+    else:
+        # a proposal or an upgrade has files as the generator renders them, so they are no manual
+        # edits
+        edited = [
+            path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
+        ]
+        new = merge_preview.planned_releases(state)
+        preview = merge_preview.preview(
+            new if start is None else start.releases(), new, edit.before_merge(wanted), wanted
+        )
+        charts = rendered_charts.render_charts(
+            state,
+            edit.changed if start else None,
+            {file.path for file in preview.files},
+        )
+        faults += charts.faults
+        if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
+            faults.append(fault("", rendered_charts.NO_HELM))
+        idle = override_report.warnings(override_report.override_report(state, edit.now))
+        # a topic that was lacking before is not of this edit
+        old = missing_inputs(start.state) if start and start.state else ()
+        lacking = {(topic.application, topic.reason) for topic in old}
+        result = replace(
+            result,
+            preview=preview,
+            charts=charts,
+            bookkeeping=_bookkeeping_changes(start, state),
+            warnings=(
+                *(fault("", text).within(path) for path, text in idle),
+                *warnings.policy_warnings(state),
+                *warnings.unmatched_pattern_warnings(state.config),
+                *warnings.misspelled_topic_warnings(state),
+                *edit.changed_bootstraps(wanted),
+                *(
+                    topic.warning
+                    for topic in missing_inputs(state)
+                    if (topic.application, topic.reason) not in lacking
+                ),
+                *charts.warnings,
+            ),
+        )
+    if start is not None and edited:
+        suggestions = _suggestions(files, start, edited, author_of(folder))
+        faults += [
+            fault(
+                "", _remedy(path, start.files.get(path), files.get(path), suggestions.get(path))
+            ).within(path)
+            for path in edited
+        ]
+        result = replace(result, suggestions=tuple(suggestions.values()))
+    ordered = sorted(dict.fromkeys(faults), key=lambda fault: fault.file)
+    # an InvalidInput has only so many faults of one file
+    return replace(
+        result,
+        faults=tuple(with_lines(InvalidInput(ordered).faults, files.get)),
+        warnings=tuple(with_lines(InvalidInput(result.warnings).faults, files.get)),
+    )
+
+
+def _generated(path: str) -> bool:
+    return path.split("/", maxsplit=1)[0] in GENERATED_ROOTS
+
+
+def _is_written_by_generator(path: str) -> bool:
+    root = path.split("/", maxsplit=1)[0]
+    if trees.is_readme(path):
+        return False
+    if root == claim_file.LEDGER_ROOT:  # people may edit claims and waiting demands
+        is_waiting = path.startswith(f"{records.WAITING_ROOT}/")
+        return claim_file.kind_of(path) is None and not is_waiting
+    return root in (*GENERATED_ROOTS, NOTES_ROOT)
+
+
+def _suggestions(
+    files: Mapping[str, str], start: Base, edited: Iterable[str], owner: str
+) -> dict[str, Suggestion]:
+    releases = {path_of(release): release for release in start.releases().values()}
+    suggestions, taken = dict[str, Suggestion](), set(files)
+    for path in edited:
+        release, before, after = releases.get(path), start.files.get(path), files.get(path)
+        if start.state is None or release is None or before is None or after is None:
+            continue
+        effects, left = edited_checkout.effects_of(before, after, release, start.state.config)
+        if not effects:
+            continue
+        names = chain([release.name], (f"{release.name}-{number}" for number in count(2)))
+        file = next(f for name in names if (f := f"{OVERRIDES_ROOT}/{name}.yaml") not in taken)
+        taken.add(file)
+        others = [r.name for r in releases.values() if edited_checkout.also_applies(release, r)]
+        text = edited_checkout.override_text(effects, release, owner)
+        suggestions[path] = Suggestion(path, file, text, tuple(left), tuple(sorted(others)))
+    return suggestions
+
+
+def _remedy(path: str, before: str | None, after: str | None, suggestion: Suggestion | None) -> str:
+    lost = "is generated, so a manual edit is lost; revert it"
+    root = path.split("/", maxsplit=1)[0]
+    if suggestion is not None:
+        left = suggestion.not_covered
+        listed = ", ".join(left[:_MOST_LEFT]) + (", …" if len(left) > _MOST_LEFT else "")
+        unchanged = f" (this override does not change {listed})" if left else ""
+        return f"{lost}, and merge {suggestion.file} as shown{unchanged}"
+    if root == NOTES_ROOT:
+        return "is written by the generator, which would undo the edit; revert the edit"
+    if root == claim_file.LEDGER_ROOT:
+        if before is not None:
+            return "is written only by the generator; revert the edit"
+        return (
+            "is not the path of a claim, and people may add only claims and waiting demands to "
+            "ledger/; remove the file"
+        )
+    if before is None:
+        if root == BOOTSTRAP_ROOT:
+            return (
+                "is in a generated folder, from which the generator removes other files; delete it"
+            )
+        return (
+            "is in a generated folder, from which the generator removes what no demand needs; "
+            "delete it, and demand what you need with `demandops request`"
+        )
+    if root == BOOTSTRAP_ROOT:
+        return f"{lost}, and change demandops.yaml, inventory/ or policy/ instead"
+    if "/_charts/" in path:
+        return f"{lost}, and change registry/ instead"
+    if path.endswith("/_domain.yaml"):
+        return f"{lost}, and change policy/ instead"
+    if after is None:
+        return (
+            f"{lost}; to stop the release, delete its claims in ledger/, or deny it by an override "
+            "(docs/overrides.md)"
+        )
+    return f"{lost}, and change the configuration or write an override instead (docs/overrides.md)"
+
+
+@dataclass(frozen=True, slots=True)
+class _Edit:
+    files: Mapping[str, str]
+    start: Base | None
+    now: datetime
+
+    @property
+    def before(self) -> Mapping[str, str]:
+        return self.start.files if self.start else self.files
+
+    @property
+    def changed(self) -> list[str]:
+        before, after = self.before, self.files
+        return sorted(path for path in {*before, *after} if before.get(path) != after.get(path))
+
+    @property
+    def generated_before(self) -> dict[str, str]:
+        return {
+            path: text
+            for path, text in self.before.items()
+            if _generated(path) and not trees.is_readme(path)
+        }
+
+    def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
+        """Return the generated files before the merge, which makes those in ``wanted`` of them."""
+        files, merged = self.generated_before, self.start.merged if self.start else {}
+        for path in {*merged, *files} if merged else ():
+            # what the merge target has already is no effect of this merge
+            if merged.get(path) == wanted.get(path):
+                files.pop(path, None)
+                files |= {path: wanted[path]} if path in wanted else {}
+        return files
+
+    def config(self) -> Config:
+        files = {p: text for p, text in self.files.items() if p.split("/")[0] in CONFIG_ROOTS}
+        config = load(files)
+        version = config.repo_settings.render_version
+        if version < RENDER_VERSION:
+            message = (
+                f"is {version}, but this program renders version {RENDER_VERSION}; run this "
+                "check with the same program version as the generator, or run `demandops upgrade` "
+                "to render everything again"
+            )
+            raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
+        return config
+
+    def merged_state(self, config: Config, ledger: Ledger) -> State:
+        root = f"{records.MARKERS_ROOT}/"
+        markers = {path: text for path, text in self.files.items() if path.startswith(root)}
+        ended = records.read_ended_override(markers)
+        root = f"{records.REPLICAS_ROOT}/"
+        kept = {path: text for path, text in self.files.items() if path.startswith(root)}
+        ledger = replace(ledger, kept=records.read_all_replicas(kept))
+        expired = expired_overrides(World(config, replace(ledger, ended=ended)), self.now)
+        ended |= {override.name: format_time(override.end) for override in expired if override.end}
+        state = State(config, replace(ledger, ended=ended), EVALUATE)
+        try_configuration(state)
+        if self.start is None or self.start.state is None:
+            return state
+        old = self.start.state
+        subjects = ledger_files.changed_subjects(old.ledger, ledger)
+        applied = update_ledger(old, state, subjects, markers, self.now)
+        return replace(state, ledger=applied.ledger)
+
+    def refused_claims(self, state: State) -> Iterator[Fault]:
+        """Yield the reasons why the generator would refuse claims that the edit changes."""
+        old = self.start.state if self.start else None
+        if old is not None:
+            subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
+            changes = changes_on(old.ledger, state.ledger, subjects)
+            by_path = {claim_file.path_of(change.key): change for change in changes if change.after}
+            # an override may change claims too, but not their files in the checkout
+            written = {path: change for path, change in by_path.items() if path in self.files}
+            for path, change in written.items():
+                if path in self.before:
+                    yield from ledger_files.owner_faults(change.after, path, old.ledger)
+            yield from faults_of_edit(old, state, written.values())
+
+    def rendered(self, state: State) -> dict[str, str]:
+        try:
+            return rendered_files(state, self.generated_before)
+        except InvalidInput as error:
+            faults = merge_preview.render_faults(state, state.evaluate, self.changed)
+            raise InvalidInput(faults or error.faults) from None
+
+    def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
+        """Yield a warning for each bootstrap file that a person must apply after the merge."""
+        before = self.before_merge(wanted)
+        for path, text in sorted(wanted.items()):
+            if path.startswith(f"{BOOTSTRAP_ROOT}/") and before.get(path) != text:
+                cluster = path.removeprefix(f"{BOOTSTRAP_ROOT}/").removesuffix(".yaml")
+                change = "changes" if path in before else "is new"
+                message = (
+                    f"{change} with the merge, but no controller applies bootstrap files; after "
+                    f"the merge, an administrator of cluster '{cluster}' must run: "
+                    f"git show main:{path} | kubectl apply -f -"
+                )
+                yield fault("", message).within(path)
+
+    def unversioned_charts(self, config: Config) -> Iterator[Fault]:
+        sources = {
+            source.folder: (name, source)
+            for name, chart in sorted(config.charts.items())
+            for source in chart.sources()
+            if source.folder
+        }
+        edited = self.changed
+        for folder, (name, source) in sorted(sources.items()):
+            metadata = f"{folder}/Chart.yaml"
+            folders = chart_files.folders(folder, self.files)
+            changed = sorted(path for part in folders for path in chart_files.below(part, edited))
+            if not changed or metadata not in self.before:
+                continue
+            if _chart_version(self.before[metadata]) == source.version:
+                first = changed[0].removeprefix(f"{folder}/")
+                yield fault(
+                    "version",
+                    f"is still {source.version}, but {first} changed; raise the version here and "
+                    f"at charts.{name} in {config.file_of(CHARTS_FILE, name)}, or no cluster "
+                    "applies the change",
+                ).within(metadata)
+
+
+def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange, ...] | None:
+    if start is None:
+        return ()
+    if start.state is None:
+        return None
+    try:
+        old = bookkeeping(start.state)
+    except InvalidInput:
+        return None
+    return bookkeeping_changes(old, bookkeeping(state))
+
+
+def _chart_version(text: str) -> object:
+    try:
+        data = strict_yaml.load(text)
+    except InvalidInput:
+        return None
+    return data.get("version") if isinstance(data, dict) else None

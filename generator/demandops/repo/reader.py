@@ -1,0 +1,301 @@
+"""Reads a state repo for the command line and the web page: commits, states and history."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import pygit2
+from pygit2 import Oid, Tree
+
+from demandops.base import settings
+from demandops.base.errors import Fault, InvalidInput, StateRepoError
+from demandops.base.runtime import REAL
+from demandops.base.strict_yaml import FieldLines, with_lines
+from demandops.decide.booking.restoration import Restoration
+from demandops.decide.changes.changeset import FileReader
+from demandops.decide.state import rendered_files
+from demandops.model.config.config import Config
+from demandops.repo import verification
+from demandops.repo.git import tree as trees
+from demandops.repo.git.local_repository import LastFetch
+from demandops.repo.git.open_repository import connect, is_url
+from demandops.repo.git.repository import StateRepository, access_error, reading
+from demandops.repo.history import commit_log, commit_message, revisions
+from demandops.repo.history.commit_log import LogEntry, PathHistory
+from demandops.repo.history.commit_message import Person
+from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
+from demandops.repo.load.snapshot import Progress, Snapshot
+from demandops.repo.verification import Verdict
+from demandops.repo.write.journal import Slot
+
+
+class Reader:
+    """Reads a state repo at its newest commit, or a checkout at the commit that is checked out."""
+
+    def __init__(self, repository: StateRepository, tip: Oid, slot: Slot | None = None) -> None:
+        self.repository, self._tip, self._slot = repository, tip, slot
+        self._objects = repository.objects
+
+    @classmethod
+    def of(cls, address: str, *, only_read: bool = True) -> Reader:
+        """Return a reader of the state repo at an address; of a checkout only if ``only_read``."""
+        try:
+            # The clone of a URL stays on the disk for later readers. It is in a folder of readers,
+            # so that none takes over a generator's journal.
+            slot = Slot(settings.data_home(address) / "reader") if is_url(address) else None
+        except OSError as error:
+            raise access_error(error, f"the data folder of {address}") from None
+        try:
+            repository = connect(address, slot.folder if slot else Path(), only_read=only_read)
+            return cls(repository, repository.refresh(), slot)
+        except BaseException as error:
+            if slot is not None:
+                slot.close()
+            if isinstance(error, Exception):
+                raise access_error(error, address) from None
+            raise
+
+    def close(self) -> None:
+        """Release the clone of a URL, so that another process may use it."""
+        if self._slot is not None:
+            self._slot.close()
+
+    def refresh(self) -> str:
+        """Fetch and return the newest commit, and let this reader read that commit from now on."""
+        try:
+            self._tip = self.repository.refresh()
+        except (pygit2.GitError, KeyError, OSError) as error:
+            raise StateRepoError(f"{self.repository.address} cannot be read: {error}") from None
+        return str(self._tip)
+
+    def for_another_thread(self) -> Reader:
+        """Return a new reader at the same commit, without a fetch, for use in another thread."""
+        other = Reader(self.repository, self._tip)
+        try:
+            other._objects = self.repository.reopened()
+        except (pygit2.GitError, OSError) as error:
+            raise StateRepoError(f"{self.repository.address} cannot be read: {error}") from None
+        return other
+
+    def refuse_other_render_version(self) -> None:
+        last_valid_config.refuse_other_render_version(self._objects, self._tip)
+
+    def commit(self, revision: str | None = None) -> str:
+        """Return the id of the commit that a revision or a time names; by default the newest."""
+        if not revision:
+            return str(self._tip)
+        return str(revisions.resolve(self._objects, self._tip, revision, REAL.now()).id)
+
+    def snapshot(
+        self, revision: str | None = None, progress: Progress = lambda done, total: None
+    ) -> Snapshot:
+        """Return the state in effect at a commit (:func:`state_in_effect.snapshot_at`).
+
+        The faults of the InvalidInput that this may raise have the numbers of their lines.
+        """
+        commit = self.commit(revision)
+        try:
+            return state_in_effect.snapshot_at(self._objects, commit, progress)
+        except InvalidInput as error:
+            raise InvalidInput(with_lines(error.faults, self.file_reader(commit))) from None
+
+    def last_valid_snapshot(
+        self, revision: str, progress: Progress = lambda done, total: None
+    ) -> Snapshot:
+        """Return the snapshot of a commit, with the last valid versions of invalid files.
+
+        Unlike :meth:`snapshot`, this works before a generator has quarantined the files.
+        """
+        try:
+            return self.snapshot(revision, progress)
+        except InvalidInput:
+            return state_in_effect.state_at(self._objects, self.commit(revision), progress)
+
+    def snapshot_after(self, before: Snapshot) -> Snapshot:
+        """Return :meth:`last_valid_snapshot` of the newest commit, if possible from ``before``."""
+        is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
+        if before.problems or is_recorded:
+            return self.last_valid_snapshot(str(self._tip))
+        return state_in_effect.state_after(self._objects, before, self._tip)
+
+    def problems(self, revision: str | None = None) -> tuple[last_valid_config.Problem, ...]:
+        read = self.file_reader(revision)
+        lines = FieldLines(read)
+        return tuple(
+            replace(problem, line=lines.of(problem.file, problem.field))
+            for problem in last_valid_config.read(read(last_valid_config.PATH))
+        )
+
+    def problems_of(self, snapshot: Snapshot) -> tuple[last_valid_config.Problem | Fault, ...]:
+        """Return the problems that the generator reports, else those found while loading."""
+        return self.problems(str(snapshot.commit)) or snapshot.problems
+
+    def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
+        """Return the paths of the generated files that a generator has yet to write or remove."""
+        # only a person's commit may leave such files, and rendering everything takes time
+        commit = trees.commit_of(self._objects, snapshot.commit)
+        if commit_log.is_by_generator(self._objects, commit):
+            return frozenset()
+        try:
+            return self._unlike_rendered(snapshot)
+        except InvalidInput:
+            return frozenset()
+
+    def _unlike_rendered(self, snapshot: Snapshot) -> frozenset[str]:
+        tree = trees.commit_of(self._objects, snapshot.commit).tree
+        texts = trees.texts(tree, settings.GENERATED_ROOTS)
+        current = {path: text for path, text in texts.items() if not trees.is_readme(path)}
+        wanted = rendered_files(snapshot.state, current)
+        return frozenset(
+            path for path in {*current, *wanted} if current.get(path) != wanted.get(path)
+        )
+
+    def edited_files(self, before: str, after: Snapshot) -> list[str]:
+        """Return the files that differ between two commits and are more than demands, sorted."""
+        # Files that are as rendered from the claims are left out, whoever committed them: anybody
+        # can commit under the generator's name.
+        old, new = self._tree(before), self._tree(str(after.commit))
+        changed = trees.differences(old, new, settings.GENERATED_ROOTS)
+        as_rendered = set[str]()
+        with suppress(InvalidInput):
+            unlike = self._unlike_rendered(after)
+            as_rendered = {path for path, _ in changed if not trees.is_readme(path)} - unlike
+        claims = {
+            path
+            for path in ledger_files.changed_files(old, new)
+            if (trees.entry(old, path) is None and ledger_files.valid_claim_at(new, path))
+            or (trees.entry(new, path) is None and ledger_files.valid_claim_at(old, path))
+        }
+        return sorted({path for path, _ in trees.differences(old, new)} - as_rendered - claims)
+
+    def _tree(self, revision: str | None = None) -> Tree:
+        return trees.commit_of(self._objects, self.commit(revision)).tree
+
+    def file_reader(self, revision: str | None = None) -> FileReader:
+        tree = self._tree(revision)
+        return lambda path: trees.read_text(tree, path)
+
+    def config(self) -> Config:
+        return last_valid_config.config_at(self._tree())
+
+    def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
+        """Yield commits, newest first.
+
+        ``spec`` is ``REV`` for the commits up to REV, ``A..B`` for those after A up to B, or None
+        for all. With ``path``, yield only the commits that changed this file or folder.
+        """
+        since, until = self._sides(spec or "")
+        if path is not None:
+            changes = commit_log.changes_to(self._objects, until, path, since)
+            return (change.entry for change in changes)
+        return (entry for _, entry in commit_log.commits(self._objects, until, since))
+
+    def revisions(self, spec: str | None) -> list[str]:
+        """Return the ids of the commits that ``spec`` names, oldest first.
+
+        ``spec`` is ``REV`` for one commit, ``A..B`` for the commits after A up to B, or None for
+        the newest commit.
+        """
+        since, until = self._sides(spec or "")
+        if since is None:
+            return [until]
+        walked = commit_log.commits(self._objects, until, since)
+        return [entry.commit for _, entry in walked][::-1]
+
+    def _sides(self, spec: str) -> tuple[str | None, str]:
+        first, dots, last = spec.partition("..")
+        if not dots:
+            return None, self.commit(first)
+        if not first:
+            raise StateRepoError(f"'{spec}' has no start; write A..B")
+        return self.commit(first), self.commit(last)
+
+    def verify(
+        self,
+        commits: Sequence[str],
+        *,
+        whole: bool = False,
+        progress: Progress = lambda done, total: None,
+    ) -> list[Verdict]:
+        """Return a verdict on the files and the signature of each of ``commits``, oldest first."""
+        verdicts = list[Verdict]()
+        for verdict in verification.verify(self._objects, commits, whole=whole):
+            verdicts.append(verdict)
+            progress(len(verdicts), len(commits))
+        return verification.with_signatures(self._objects, verdicts)
+
+    def history(self, path: str, revision: str, most: int) -> PathHistory:
+        return commit_log.history_of(self._objects, revision, path, most)
+
+    def release_path(self, name: str, revision: str) -> str | None:
+        return commit_log.release_path(self._objects, revision, name)
+
+    def stopped_release_names(self, revision: str) -> set[str]:
+        return commit_log.stopped_release_names(self._objects, revision)
+
+    def changed_files(self, before: str, after: str, roots: Sequence[str] = ()) -> list[str]:
+        changed = trees.differences(self._tree(before), self._tree(after), roots)
+        return sorted(path for path, _ in changed)
+
+    def base_of(self, commit: str) -> str:
+        """Return the commit at which another commit, of a proposal, left main."""
+        base = self._objects.merge_base(self._tip, trees.commit_of(self._objects, commit).id)
+        return str(base or self._tip)
+
+    def changed_roots(self, commit: str) -> tuple[str, ...]:
+        opened = trees.commit_of(self._objects, commit)
+        before = {entry.name: entry.id for entry in trees.parent_tree(opened) or ()}
+        after = {entry.name: entry.id for entry in opened.tree}
+        return tuple(
+            sorted(str(name) for name in {*before, *after} if before.get(name) != after.get(name))
+        )
+
+    def files_changed_by(self, commit: str) -> list[str]:
+        after = trees.commit_of(self._objects, commit)
+        return sorted(path for path, _ in trees.differences(trees.parent_tree(after), after.tree))
+
+    def changes_node(self, commit: str, node: str) -> bool:
+        return ledger_files.changes_node(self._objects, commit, node)
+
+    def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
+        """Return the newest commits by people that the generator's commit ``entry`` renders."""
+        since, follows = entry.first("Since"), entry.first("Follows")
+        if not (entry.by_generator and since and follows):
+            return []
+        people = commit_log.person_commits(self._objects, follows, since)
+        return [commit_log.entry_of(commit) for commit in islice(people, most)]
+
+    def restoration(self, to: str, **more: object) -> Restoration:
+        return ledger_files.restoration(self._objects, to, **more)
+
+    def operator(self) -> Person:
+        return commit_message.operator(self._objects.path)
+
+
+@contextmanager
+def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
+    """Yield a reader, and raise StateRepoError or Unsound also for errors during the block."""
+    with (
+        closing(Reader.of(address, only_read=only_read)) as reader,
+        reading(address, reader.repository.objects),
+    ):
+        yield reader
+
+
+@contextmanager
+def opened_offline(address: str) -> Iterator[Reader | None]:
+    """Yield a reader that does not use the network; None for a URL that nobody has cloned here."""
+    if not is_url(address):
+        with opened(address) as reader:
+            yield reader
+        return
+    clones = sorted((settings.data_home(address) / "reader").glob("slot-*/clone.git"))
+    if not clones:
+        yield None
+        return
+    repository = LastFetch(clones[0])
+    yield Reader(repository, repository.tip())

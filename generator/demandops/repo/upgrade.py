@@ -1,0 +1,234 @@
+"""``demandops upgrade``: one commit in which this program renders everything again.
+
+The state repo changes to another render version or GitOps controller in this one commit, so two
+versions never undo each other's files. If the tip moves meanwhile, the commit is made again on the
+new tip. The commit is never pushed by force.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
+
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput, StateRepoError, fault
+from demandops.base.runtime import REAL
+from demandops.base.settings import LEDGER_API_VERSION, RENDER_VERSION
+from demandops.decide.changes.merge_preview import planned_releases
+from demandops.decide.claim_edit import faults_of_edit
+from demandops.decide.override_lifecycle import update_ledger
+from demandops.decide.planning.flows import with_booked_topics_marked
+from demandops.decide.state import State
+from demandops.model.config.config import CONFIG_ROOTS, Config
+from demandops.model.config.load import load
+from demandops.model.config.repo_settings import ROOT_FILE
+from demandops.model.demand.claim import ClaimKey
+from demandops.model.ledger import claim_file, records
+from demandops.model.ledger.claim_file import LEDGER_ROOT
+from demandops.model.ledger.ledger import Ledger
+from demandops.model.release import ServiceRelease
+from demandops.repo import reader
+from demandops.repo.git import tree as trees
+from demandops.repo.git.repository import StateRepository
+from demandops.repo.git.signing import Signer
+from demandops.repo.history import commit_log, commit_message
+from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
+from demandops.repo.load import snapshot as snapshots
+from demandops.repo.load.snapshot import Progress
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.templating.evaluator import EVALUATE
+
+_ATTEMPTS = 10
+_PAUSE_S = 0.1
+# The first render version whose claims mark the further topics of a source.
+_FIRST_WITH_MARKS = 2
+# How many parts the path ``clusters/<cluster>/<access domain>`` has.
+_FOLDER_DEPTH = 3
+_NAMES = {"flux": "Flux", "argocd": "Argo CD"}
+
+
+@dataclass(frozen=True, slots=True)
+class UpgradeRequest:
+    """What an upgrade changes, besides rendering everything again."""
+
+    # the new GitOps controller; None keeps the current one
+    gitops: str | None = None
+    # where a controller without a section in demandops.yaml fetches; None: as the current one does
+    url: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Upgrade:
+    """The files that an upgrade changes, and the configuration before and after it."""
+
+    # of the upgrade, or the tip if no commit was made
+    commit: str
+    old: Config
+    new: Config
+    files: Mapping[str, str | None]
+
+    @property
+    def switches(self) -> bool:
+        """Whether another GitOps controller reads the state repo from now on."""
+        return self.old.repo_settings.gitops != self.new.repo_settings.gitops
+
+
+def plan(
+    address: str,
+    request: UpgradeRequest,
+    now: datetime,
+    progress: Progress = lambda done, total: None,
+) -> Upgrade:
+    """Return what :func:`upgrade` would do, and write nothing."""
+    with reader.opened(address) as repo:
+        return _plan(repo.repository, request, now, progress)[0]
+
+
+def upgrade(
+    address: str,
+    request: UpgradeRequest,
+    now: datetime,
+    progress: Progress = lambda done, total: None,
+    signer: Signer | None = None,
+) -> Upgrade:
+    """Render everything again, and publish all changed files, if any, in one commit.
+
+    Raises InvalidInput if the state repo is not valid, or the request cannot be fulfilled.
+    ``progress`` is called with (files read, all files) while the ledger is read.
+    """
+    with reader.opened(address) as repo:
+        repository = repo.repository
+        repository.signer = signer
+        for attempt in range(1, _ATTEMPTS + 1):
+            planned, batch, state, keys = _plan(repository, request, now, progress)
+            if not planned.files:
+                return planned
+            who = commit_message.operator(repository.objects.path)
+            author = commit_message.signature(who.name, who.email, now)
+            text = _message(planned, keys)
+            commit = batch.commit_files(planned.files, state, text, author, now)
+            if batch.publish():
+                return replace(planned, commit=commit)
+            REAL.sleep(_PAUSE_S * attempt * REAL.uniform(0.5, 1.0))
+            repository.refresh()
+    raise StateRepoError(
+        f"{repository.address} got new commits, or another process locked it, during each of "
+        f"{_ATTEMPTS} attempts to render it; stop its generators and try again"
+    )
+
+
+def _plan(
+    repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
+) -> tuple[Upgrade, CommitBatch, State, tuple[ClaimKey, ...]]:
+    """Return the upgrade, the batch and the state to commit, and the claims that may change."""
+    objects, tip = repository.objects, repository.tip()
+    snapshot = snapshots.load(objects, tip, progress)
+    batch, old = CommitBatch(repository, snapshot), snapshot.state.config
+    tree = trees.commit_of(objects, tip).tree
+    files = trees.texts(tree, CONFIG_ROOTS)
+    before = files[ROOT_FILE]
+    files[ROOT_FILE] = _root(before, old, request)
+    config = load(files)
+    state = State(config, snapshot.state.ledger, EVALUATE)
+    # people's changes since the generator's last commit are applied too
+    start = state_in_effect.start_at(objects, tip)
+    edits = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, start.state.ledger)
+    refused = list(faults_of_edit(start.state, state, edits))
+    if refused:
+        raise InvalidInput(refused)
+    subjects = ledger_files.changed_subjects(start.state.ledger, state.ledger)
+    markers = last_valid_config.end_markers_at(tree)
+    applied = update_ledger(start.state, state, subjects, markers, now)
+    state = replace(state, ledger=applied.ledger)
+    if old.repo_settings.render_version < _FIRST_WITH_MARKS:
+        state = replace(state, ledger=with_booked_topics_marked(state.ledger, config))
+    if old.repo_settings.gitops != config.repo_settings.gitops:
+        # a held file would stay rendered for the old controller
+        held = [
+            fault(
+                "hold",
+                f"keeps the file of {release.name} as rendered for the old controller; remove the "
+                "hold, and add it again after the upgrade",
+            ).within(override.path)
+            for release in planned_releases(state).values()
+            if isinstance(release, ServiceRelease) and release.shaping.held
+            for override, effects in release.shaping.by
+            if "hold" in effects
+        ]
+        if held:
+            raise InvalidInput(held)
+    files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)
+    changed = dict(batch.render_all(state, {**files_of_ledger, **applied.files}).files)
+    if files[ROOT_FILE] != before:
+        changed[ROOT_FILE] = files[ROOT_FILE]
+    upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
+    return upgrade, batch, state, applied.keys
+
+
+def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
+    """Return the claim files and markers that change if this program writes them."""
+    written = {}
+    for path, text in files.items():
+        new = text
+        if claim_file.kind_of(path) is not None:
+            claim = ledger.get(claim_file.read(text, path).key)
+            new = claim_file.text_of(claim) if claim else text
+        elif records.read_ended_override({path: text}):
+            new = strict_yaml.set_key(text, "apiVersion", LEDGER_API_VERSION)
+        if new != text:
+            written[path] = new
+    return written
+
+
+def _root(text: str, config: Config, request: UpgradeRequest) -> str:
+    """Return the text of ``demandops.yaml`` with this render version and the requested changes."""
+    repository = config.repo_settings
+    gitops = request.gitops or repository.gitops
+    try:
+        if repository.render_version != RENDER_VERSION:
+            text = strict_yaml.set_key(text, "renderVersion", RENDER_VERSION)
+        if repository.gitops != gitops:
+            text = strict_yaml.set_key(text, "gitops", gitops)
+        section = getattr(repository, gitops)
+        if section is None:
+            # both controllers fetch the same repo, so the URL of the configured controller fits
+            current = getattr(repository, repository.gitops)
+            text = strict_yaml.set_key(text, gitops, {"url": request.url or current.url})
+        elif request.url not in (None, section.url):
+            what = f"is set to {section.url} already; change" if section.url else "is missing; add"
+            message = f"{what} it in this file, or leave out --url"
+            raise InvalidInput([fault(f"{gitops}.url", message)])
+    except InvalidInput as error:
+        raise InvalidInput(strict_yaml.faults_in(error, ROOT_FILE)) from None
+    return text
+
+
+def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
+    old, new = upgrade.old.repo_settings, upgrade.new.repo_settings
+    title = "Render everything again"
+    if upgrade.switches:
+        title += f", for {_NAMES[new.gitops]}"
+    why = f"with render version {new.render_version}"
+    if old.render_version != new.render_version:
+        why += f" instead of {old.render_version}"
+    if upgrade.switches:
+        why += f", for {_NAMES[new.gitops]} instead of {_NAMES[old.gitops]}"
+    counts = Counter("/".join(path.split("/")[:_FOLDER_DEPTH]) for path in upgrade.files)
+    trailers = [
+        ("Operation", "upgrade"),
+        ("From-Render-Version", str(old.render_version)),
+        ("From-Gitops", old.gitops if upgrade.switches else ""),
+        ("Gitops", new.gitops),
+        *commit_message.override_trailers(commit_message.keep_override_paths(keys)),
+        *commit_message.demand_trailers(keys),
+        ("Render-Version", str(new.render_version)),
+    ]
+    files = [f"  {count} in {folder}" for folder, count in sorted(counts.items())]
+    paragraphs = [
+        [title],
+        [f"Why: `demandops upgrade` renders everything {why}."],
+        ["Files written or removed:", *files],
+    ]
+    return commit_log.compose(paragraphs, trailers)

@@ -1,0 +1,332 @@
+"""Finds the files that a commit of the generator changed, but was not allowed to change.
+
+A commit of the generator may change generated files, reports, and the claims that its message
+names. Some operations may change further files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import pygit2
+from pygit2 import Commit, Oid, Repository, Tree
+
+from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from demandops.decide.planning.release_keys import ReleaseKey
+from demandops.decide.planning.traced_plan import TracedPlan
+from demandops.decide.state import State, rendered_files
+from demandops.model.config.config import CONFIG_ROOTS
+from demandops.model.config.repo_settings import ROOT_FILE
+from demandops.model.demand.claim import OVERRIDE_PREFIX
+from demandops.model.ledger import claim_file, records
+from demandops.model.ledger.ledger import ClaimChange, World
+from demandops.model.ledger.records import Instance
+from demandops.model.release import Release
+from demandops.render import manifests, release_file
+from demandops.render.paths import path_of
+from demandops.repo.git import tree as trees
+from demandops.repo.history import allowed_signers
+from demandops.repo.history.commit_log import PROPOSAL, LogEntry, entry_of
+from demandops.repo.load import ledger_files, state_in_effect
+from demandops.repo.load.snapshot import changed_kept_replicas
+
+_OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
+# Operations that may record or forget recent shutdowns.
+_RECORDING = ("shutdown", "join", "rollback")
+# The folders of the ledger that have records, such as recent shutdowns, instead of claims.
+_RECORDS = tuple(
+    f"{root}/"
+    for root in (
+        records.MARKERS_ROOT,
+        records.SHUTDOWNS_ROOT,
+        records.REPLICAS_ROOT,
+    )
+)
+# Operations that may rewrite a claim, to start its lease or to change its schema.
+_REWRITING = ("follow", "upgrade")
+# Operations that may add or remove the marker of an ended override.
+_ENDING = ("follow", "upgrade", "expire-override")
+
+
+def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
+    """Yield the files that a commit of the generator changed, but was not allowed to change.
+
+    These are files that people write, claims of demands that the message does not name, claims in
+    another format than the generator's, and records that the commit's operation must not change.
+    """
+    if not commit.parents:  # `demandops init` writes everything
+        return
+    before, operation = commit.parents[0].tree, entry.first("Operation")
+    demands = {*entry.trailers.get("Demand-Id", ())}
+    for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
+        demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
+    named = {f"{claim_file.segment(demand)}.yaml" for demand in demands}
+    for path, blob in trees.differences(before, commit.tree):
+        root = path.split("/", 1)[0]
+        if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
+            continue
+        if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
+            continue
+        if root != claim_file.LEDGER_ROOT:
+            yield path
+        elif path.startswith(_RECORDS):
+            if not _may_record(commit, path, operation):
+                yield path
+        elif path.rsplit("/", 1)[-1] in named:
+            if blob and not _is_canonical(commit, path):
+                yield path
+        elif operation not in _REWRITING or not _only_rewrites(commit, path):
+            yield path
+
+
+def _only_rewrites(commit: Commit, path: str) -> bool:
+    """Return whether a commit changed at most the schema of a claim and the start of its lease."""
+    before, after = (
+        ledger_files.valid_claim_at(tree, path) for tree in (commit.parents[0].tree, commit.tree)
+    )
+    if before is None or after is None:
+        return False
+    if before.lease and after.lease and after.lease.has_started > before.lease.has_started:
+        before = replace(before, lease=replace(before.lease, until=after.lease.until))
+    return before == after and _is_canonical(commit, path)
+
+
+def _is_canonical(commit: Commit, path: str) -> bool:
+    if path.startswith(f"{records.WAITING_ROOT}/"):
+        text = trees.read_text(commit.tree, path) or ""
+        waits = records.read_waiting(text, path)
+        return waits is not None and records.waiting_text(waits) == text
+    claim = ledger_files.valid_claim_at(commit.tree, path)
+    return claim is not None and claim_file.text_of(claim) == trees.read_text(commit.tree, path)
+
+
+def _may_record(commit: Commit, path: str, operation: str) -> bool:
+    text = trees.read_text(commit.tree, path) or ""
+    if path.startswith(f"{records.MARKERS_ROOT}/"):
+        return operation in _ENDING and (
+            not text or bool(records.read_ended_override({path: text}))
+        )
+    if path.startswith(f"{records.SHUTDOWNS_ROOT}/"):
+        return operation in _RECORDING
+    record = records.read_replicas(text, path)
+    is_canonical = record is not None and records.replicas_text(*record) == text
+    return operation not in (*_REWRITING, *_ENDING) and (not text or is_canonical)
+
+
+# ---- verification ----
+#
+# Verifies commits: renders their generated files again, and compares them with the committed ones.
+#
+# A commit is verified whole or by differences. To verify a commit whole, the program loads and
+# renders everything. It does so for the first and the last commit, for each commit that records
+# invalid files, and for each commit whose configuration differs from that of the commit before.
+#
+# To verify a commit by differences, the program starts from the commit that it verified before. It
+# assumes that equal object ids mean equal files, and that plans and rendered files depend only on
+# their input. It does not rely on the generator's choice of the affected releases. Instead, it
+# plans and renders a release again if any input of the release's plan changed
+# (:mod:`.traced_plan`). Then it compares the ids of all generated files.
+
+_CHARTS = "/_charts/"
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    commit: str
+    summary: str
+    # whether no fault was found, also in a commit that was skipped
+    holds: bool
+    # why the commit was not rendered again
+    skipped: str = ""
+    # the error of reading or rendering the commit again
+    fault: str = ""
+    # the generated files that differ from the rendered ones
+    differing: tuple[str, ...] = ()
+    # the files that the commit changed, but was not allowed to change
+    touched: tuple[str, ...] = ()
+    # whether the commit has a signature, valid or not
+    signed: bool = False
+    # who signed, if a signature is required and valid; else why it is not
+    signer: str = ""
+    signature: str = ""
+
+
+class _Proof:
+    """The files that a commit should have, rendered again to compare with its committed files."""
+
+    def __init__(self, state: State, commit: Commit) -> None:
+        self.state, self._commit = state, commit
+        self._plan = TracedPlan(state.config)
+        self._planned: dict[ReleaseKey, tuple[str, Oid]] = {}
+        # with an override that sets ``hold``: such a file's text depends on the parent commit
+        self._held: dict[ReleaseKey, Release] = {}
+        base_files = manifests.base_files(state.config)
+        self._undemanded = {path: _blob(text) for path, text in base_files.items()}
+        self._committed = _generated_files(commit.tree)
+        self._render(())
+
+    def can_advance_to(self, commit: Commit) -> bool:
+        # The configuration and ended overrides may affect all releases. With a problem report, some
+        # files are not in effect.
+        roots = (*CONFIG_ROOTS, NOTES_ROOT, records.MARKERS_ROOT)
+        return not trees.differ(self._commit.tree, commit.tree, roots)
+
+    def advance(self, commit: Commit) -> None:
+        before, after = self._commit.tree, commit.tree
+        try:
+            changes = [
+                ClaimChange(*(ledger_files.claim_at(tree, path) for tree in (before, after)))
+                for path in ledger_files.changed_files(before, after)
+            ]
+        except InvalidInput as error:
+            raise _Unreadable(error.faults[0]) from None
+        ledger = self.state.ledger
+        for change in changes:
+            ledger = ledger.replace(change.key, change.after)
+        kept = dict(changed_kept_replicas(before, after))
+        for instance, steps in kept.items():
+            ledger = replace(ledger, kept=ledger.kept.replace(instance, steps))
+        for path, blob in trees.differences(before, after, GENERATED_ROOTS):
+            self._committed.pop(path, None)
+            if blob is not None:
+                self._committed[path] = blob
+        self.state, self._commit = replace(self.state, ledger=ledger), commit
+        self._render(changes, kept)
+
+    def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
+        """Render what changed claims, or changed kept replicas of instances, affect."""
+        for key, release in self._plan.advance(self.state.ledger, changes, kept).items():
+            self._planned.pop(key, None)
+            self._held.pop(key, None)
+            if release is not None and release.shaping.held:
+                self._held[key] = release
+            elif release is not None:
+                self._planned[key] = self._rendered(release, None)
+        for key, release in self._held.items():
+            self._planned[key] = self._rendered(release, trees.parent_tree(self._commit))
+
+    def _rendered(self, release: Release, before: Tree | None) -> tuple[str, Oid]:
+        path, state = path_of(release), self.state
+        current = trees.read_text(before, path)
+        return path, _blob(
+            release_file.release_text(release, state.config, state.evaluate, current)
+        )
+
+    def differing(self) -> tuple[str, ...]:
+        wanted = self._undemanded | dict(self._planned.values())
+        before = trees.parent_tree(self._commit)
+        if before is not None and _holds(self.state):
+            charts = {
+                path: trees.text_of(blob)
+                for path, blob in trees.blobs(before, GENERATED_ROOTS)
+                if _CHARTS in path and path not in wanted
+            }
+            kept = release_file.kept_charts({}, charts, self.state)
+            wanted |= {path: _blob(text) for path, text in kept.items()}
+        return _differing(wanted, self._committed)
+
+
+def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
+    """Yield a verdict on each of ``commits``, whose oldest is first."""
+    proof: _Proof | None = None
+    for place, revision in enumerate(commits, 1):
+        commit = trees.commit_of(repo, revision)
+        entry = entry_of(commit)
+        verdict = Verdict(entry.commit, entry.summary, True, _skip_reason(entry))
+        if verdict.skipped:
+            yield verdict
+            continue
+        verdict = replace(verdict, touched=tuple(sorted(disallowed_files(commit, entry))))
+        before, proof = proof, None  # proof stays None if the commit cannot be read
+        try:
+            if whole or place == len(commits) or entry.first("In-Force"):
+                state = _loaded(repo, entry)
+                parent = trees.parent_tree(commit) if _holds(state) else None
+                held = trees.texts(parent, GENERATED_ROOTS) if parent is not None else {}
+                wanted = {path: _blob(t) for path, t in rendered_files(state, held).items()}
+                differing = _differing(wanted, _generated_files(commit.tree))
+            else:
+                if before is not None and before.can_advance_to(commit):
+                    before.advance(commit)
+                    proof = before
+                else:
+                    proof = _Proof(_loaded(repo, entry), commit)
+                differing = proof.differing()
+        except _Unreadable as error:
+            why = f"a file was not valid at this commit: {error}"
+            yield replace(verdict, skipped=why, holds=not verdict.touched)
+        except InvalidInput as error:  # the generator could render the commit, so this is a fault
+            yield replace(verdict, holds=False, fault=str(error.faults[0]))
+        except StateRepoError as error:
+            yield replace(verdict, holds=False, fault=str(error))
+        else:
+            holds = not (differing or verdict.touched)
+            yield replace(verdict, holds=holds, differing=differing)
+
+
+class _Unreadable(Exception):
+    """Raised when a commit cannot be verified because one of its files is not valid."""
+
+
+def _loaded(repo: Repository, entry: LogEntry) -> State:
+    try:
+        return state_in_effect.recorded_state(repo, entry).state
+    except InvalidInput as error:
+        raise _Unreadable(error.faults[0]) from None
+
+
+def _differing(wanted: Mapping[str, Oid], committed: Mapping[str, Oid]) -> tuple[str, ...]:
+    return tuple(
+        path
+        for path in sorted({*wanted, *committed})
+        if wanted.get(path) != committed.get(path) and not trees.is_readme(path)
+    )
+
+
+def _skip_reason(entry: LogEntry) -> str:
+    if not entry.by_generator:
+        return "merged by a person" if PROPOSAL in entry.trailers else "made by a person"
+    version = entry.first("Render-Version")
+    if version != str(RENDER_VERSION):
+        return f"rendered by version {version}, but this program renders version {RENDER_VERSION}"
+    return ""
+
+
+def _holds(world: World) -> bool:
+    return any(override.hold for override in world.overrides)
+
+
+def _generated_files(tree: Tree) -> dict[str, Oid]:
+    return {path: child.id for path, child in trees.entries(tree, GENERATED_ROOTS)}
+
+
+def _blob(text: str) -> Oid:
+    return pygit2.hash(text.encode())
+
+
+# ---- commit signatures ----
+#
+# Checks the signatures of the commits that ``demandops verify`` judges; adds to its verdicts.
+
+
+def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
+    """Return the verdicts; one of a generator's commit fails if it lacks a required signature."""
+    pairs = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
+    checks = allowed_signers.checks(
+        repo, [commit for _, commit in pairs if entry_of(commit).by_generator]
+    )
+    signed = []
+    for verdict, commit in pairs:
+        check = checks.get(verdict.commit, allowed_signers.Check())
+        signed.append(
+            replace(
+                verdict,
+                holds=verdict.holds and not check.fault,
+                signed=bool(allowed_signers.signature_of(commit)),
+                signer=check.signer,
+                signature=check.fault,
+            )
+        )
+    return signed

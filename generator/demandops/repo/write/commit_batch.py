@@ -1,0 +1,302 @@
+"""The commits of one batch, made on top of a snapshot and published together.
+
+Each demand that changes the ledger becomes one commit with the changed ledger and rendered files.
+:class:`CommitBatch` holds the commits until they are published. If another writer publishes first,
+the batch is dropped and its demands are evaluated again on the new tip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from datetime import datetime
+from itertools import islice
+from types import MappingProxyType
+
+import pygit2
+from pygit2 import Signature
+
+from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.quoting import one_line
+from demandops.base.settings import GENERATED_ROOTS
+from demandops.decide.booking.leaving import Drain
+from demandops.decide.changes.changeset import Change, Changeset, ReleaseChange
+from demandops.decide.claim_edit import changeset_of_edit
+from demandops.decide.decision import Decision, decide
+from demandops.decide.decision import scale_down as scaled_down
+from demandops.decide.override_lifecycle import (
+    changed_override_files,
+    end_override,
+    update_claims,
+    update_ledger,
+)
+from demandops.decide.state import State, rendered_files
+from demandops.model.config.config import NODES_FILE
+from demandops.model.config.override import Override
+from demandops.model.demand.claim import ClaimKey
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import claim_changes
+from demandops.model.ledger.records import Instance
+from demandops.repo.git import signing
+from demandops.repo.git import tree as trees
+from demandops.repo.git.repository import StateRepository
+from demandops.repo.history import commit_log, commit_message
+from demandops.repo.load import last_valid_config, ledger_files, state_in_effect
+from demandops.repo.load.snapshot import Advance, Snapshot
+from demandops.repo.write.journal import ProposalRecord
+
+_ATTEMPTS = 5
+_PAUSE_S = 0.02
+# The effect of people's changes: the snapshot, the changed files, and the keys of the claims that
+# overrides may have changed.
+_Followed = tuple[Snapshot, Changeset, tuple[ClaimKey, ...]]
+
+
+class CommitBatch:
+    """Commits on top of one published tip; :meth:`publish` publishes them together."""
+
+    def __init__(self, repository: StateRepository, start: Snapshot) -> None:
+        self._repository = repository
+        self._objects = repository.objects
+        repository.new.forget()
+        self._tree = trees.commit_of(self._objects, start.commit).tree
+        self._settled: list[tuple[str, str]] = []
+        self.start = start
+        self.head = start
+        # whether a demand freed room on a node since the caller last set this to false
+        self.frees = False
+        # the log line about the follow commit, which renders people's changes; empty if none
+        self.followed = ""
+
+    @property
+    def is_empty(self) -> bool:
+        return self.head.commit == self.start.commit
+
+    def read(self, path: str) -> str | None:
+        return trees.read_text(self._tree, path)
+
+    def commit(
+        self,
+        decision: Decision,
+        operation: str,
+        received: datetime,
+        now: datetime,
+        proposal: ProposalRecord | None = None,
+    ) -> str:
+        """Commit one demand, for its proposal if it needs approval, and return the commit's id."""
+        more = [*self._settled, *state_in_effect.trailers_of(self.head)]
+        if proposal:
+            more += [
+                (commit_log.PROPOSAL, proposal.branch),
+                (commit_log.REPLACES, proposal.replaces),
+                *((commit_log.REQUIRED_BY, reason) for reason in decision.approval),
+            ]
+        text = commit_message.of_decision(decision, operation, received, more)
+        self._settled = []
+        self.frees = self.frees or decision.frees
+        author = commit_message.author(decision, received)
+        return self.commit_files(decision.files, decision.state, text, author, now)
+
+    def commit_files(
+        self,
+        files: Mapping[str, str | None],
+        state: State,
+        text: str,
+        author: Signature,
+        now: datetime,
+    ) -> str:
+        committer = commit_message.generator_signature(now)
+        for attempt in range(1, _ATTEMPTS + 1):
+            try:
+                tree = trees.write(self._repository.new, self._tree, files)
+                commit = signing.create_commit(
+                    self._repository.new,
+                    self._repository.signer,
+                    (author, committer),
+                    text,
+                    tree,
+                    [self.head.commit],
+                )
+                self._tree = trees.commit_of(self._objects, commit).tree
+                break
+            except signing.SigningFailed:
+                raise
+            except (OSError, pygit2.GitError, KeyError, StateRepoError):
+                # a concurrent `git gc` may move an object to another file while it is read
+                if attempt == _ATTEMPTS:
+                    raise
+                self._repository.runtime.sleep(_PAUSE_S * attempt)
+        self.head = self.head.with_commit(commit, state)
+        return str(commit)
+
+    def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:
+        """Record the outcome of a demand that changed nothing, in the next commit of a demand."""
+        # The process may die before it answers the demand. After a restart, it must not evaluate
+        # the demand again, because later demands could change the outcome.
+        self._settled.append((commit_log.settled_trailer(outcome), operation))
+
+    def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
+        """Render people's changes, and commit the generated files that differ, if any.
+
+        What cannot be planned or rendered, for example because its node left the inventory, stays
+        in effect in its last valid version, and is a problem of ``head``.
+        """
+        self.head, change, keys = self._followed(advance, before, now)
+        state, tip, problems = self.head.state, self.head.commit, self.head.problems
+        files, reported = dict(change.files), self.read(last_valid_config.PATH)
+        origin = commit_message.fault_origin(
+            self._objects, before.last_valid_commit, self.start.commit
+        )
+        report = last_valid_config.write(
+            last_valid_config.with_origins(problems, last_valid_config.read(reported), origin)
+        )
+        if report != reported:
+            files[last_valid_config.PATH] = report
+        if not files:
+            return
+        overrides = [
+            *changed_override_files(before.state, state),
+            *change.overrides,
+            *commit_message.keep_override_paths(keys),
+        ]
+        causes = commit_message.person_commits_since(self._objects, before.last_valid_commit, tip)
+        text = commit_message.of_follow(
+            change.releases,
+            str(tip),
+            str(before.commit),
+            problems,
+            [
+                *commit_message.override_trailers(overrides),
+                *commit_message.demand_trailers(keys),
+                *commit_message.caused_by_trailers(causes),
+                *state_in_effect.trailers_of(self.head),
+            ],
+            reports=report != reported,
+        )
+        author = commit_message.follow_author(causes, now)
+        self.commit_files(files, state, text, author, now)
+        title = text.partition("\n")[0]
+        self.followed = one_line(", ".join([title, *sorted(set(overrides))]))
+
+    def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
+        judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
+        accepted = judgement.with_new_config()
+        if advance.config_changed:
+            try:
+                marked = last_valid_config.end_markers_at(self._tree)
+                state = accepted.snapshot.state
+                applied = update_ledger(before.state, state, accepted.subjects, marked, now)
+                state = replace(state, ledger=applied.ledger)
+                change = self.render_all(state, applied.files)
+                return self._with_started_leases(
+                    accepted.snapshot, state, change, applied.keys, now
+                )
+            except InvalidInput as error:
+                accepted = judgement.with_old_config(error.faults)
+        # with the configuration as before, only the subjects that people changed are rendered
+        state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
+        applied = update_claims(old, state, subjects, now)
+        touched = claim_changes(state.ledger, applied.ledger, applied.keys)
+        state = state.with_ledger(applied.ledger, touched)
+        subjects = tuple(dict.fromkeys((*subjects, *(change.key.subject for change in touched))))
+        change = changeset_of_edit(state, old, subjects, self.read)
+        change = replace(change, files={**applied.files, **change.files})
+        return self._with_started_leases(accepted.snapshot, state, change, applied.keys, now)
+
+    def _with_started_leases(
+        self,
+        snapshot: Snapshot,
+        state: State,
+        change: Changeset,
+        keys: Iterable[ClaimKey],
+        now: datetime,
+    ) -> _Followed:
+        # an approved claim's lease starts only now, because else it could end before the approval
+        ledger, files = state.ledger, dict(change.files)
+        for claim in ledger.unstarted_claims():
+            assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
+            path = claim_file.path_of(claim.key)
+            earlier = ledger_files.lease_before_approval(self._objects, snapshot.commit, path)
+            started = replace(claim, lease=claim.lease.started(now, earlier))
+            ledger = ledger.replace(claim.key, started)
+            files[path] = claim_file.text_of(started)
+        # a lease does not affect a release, so the usage of nodes need not be counted again
+        snapshot = replace(snapshot, state=state.with_ledger(ledger, ()))
+        return snapshot, replace(change, files=files), tuple(keys)
+
+    def end_override(self, override: Override, now: datetime) -> None:
+        """Commit the end of an expired override, with its effect on claims and releases.
+
+        Raises InvalidInput if the state without the override cannot be planned or rendered.
+        """
+        applied = end_override(self.head.state, override, now)
+        state = replace(self.head.state, ledger=applied.ledger)
+        change = self.render_all(state, applied.files)
+        more = state_in_effect.trailers_of(self.head)
+        text = commit_message.of_override_end(override, change.releases, applied.keys, more)
+        self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
+
+    def scale_down(self, instance: Instance, now: datetime) -> str:
+        """Commit the removal of replicas that a service no longer keeps; return the title.
+
+        Raises InvalidInput if the service cannot be planned or rendered.
+        """
+        state, change = scaled_down(self.head.state, instance, now, self.read)
+        more = state_in_effect.trailers_of(self.head)
+        text = commit_message.of_scale_down(instance, change, more)
+        self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
+        return text.partition("\n")[0]
+
+    def drain(self, node: str, after: str, operation: str, now: datetime) -> Decision:
+        """Commit the move of placed applications off a drained node, and return the decision.
+
+        It begins with the application that follows ``after`` (:class:`Drain`). If no application
+        can be moved, there is no commit.
+        """
+        decision = decide(self.head.state, Drain(node, after=after), now, self.read)
+        if decision.files:
+            # the author is the person who last changed the node's file, and so drained the node
+            config = decision.state.config
+            file = config.file_of(NODES_FILE, config.host_of(node))
+            changes = commit_log.changes_to(self._objects, self.start.commit, file)
+            by_people = (change.entry for change in changes if not change.entry.by_generator)
+            causes = [trees.commit_of(self._objects, e.commit) for e in islice(by_people, 1)]
+            caused_by = commit_message.caused_by_trailers(causes)
+            more = [*caused_by, *state_in_effect.trailers_of(self.head)]
+            text = commit_message.of_decision(decision, operation, now, more)
+            author = commit_message.follow_author(causes, now)
+            self.commit_files(decision.files, decision.state, text, author, now)
+        return decision
+
+    def render_all(
+        self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
+    ) -> Changeset:
+        """Render all files; return those that differ from the batch's newest commit, and ``more``.
+
+        Raises InvalidInput if a release cannot be planned or rendered.
+        """
+        generated = trees.texts(self._tree, GENERATED_ROOTS)
+        files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
+        changes = []
+        are_files = {
+            path: trees.is_file(child) for path, child in trees.entries(self._tree, GENERATED_ROOTS)
+        }
+        for path, is_file in are_files.items():
+            if path not in files and not (is_file and trees.is_readme(path)):
+                files[path] = None
+        for path in sorted(files):
+            old = generated.get(path)
+            # a link is replaced by a file, even if its text is the right one
+            if old == files[path] and are_files.get(path, True):
+                del files[path]
+                continue
+            kind: Change = "stop" if files[path] is None else "start" if old is None else "change"
+            name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
+            changes.append(ReleaseChange(name, path, path, kind))
+        return Changeset({**more, **files}, tuple(changes))
+
+    def publish(self) -> bool:
+        """Publish the commits, if any, like :meth:`StateRepository.publish`."""
+        if self.is_empty:
+            return True
+        return self._repository.publish(self.start.commit, self.head.commit)

@@ -1,0 +1,189 @@
+"""Commits that a command makes for a person: on main, or on a branch to be merged.
+
+The person is author and committer, so a generator reads the commit like any other edit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+
+from pygit2 import Blob, Commit, Oid, Tree
+from pygit2.enums import FileMode
+
+from demandops.base.errors import Fault, InvalidInput, StateRepoError
+from demandops.base.quoting import one_line
+from demandops.base.runtime import REAL
+from demandops.base.settings import MAIN_BRANCH
+from demandops.decide.changes.changeset import FileReader
+from demandops.repo.git import signing
+from demandops.repo.git import tree as trees
+from demandops.repo.git.repository import MAIN, StateRepository
+from demandops.repo.history import commit_message
+from demandops.repo.history.commit_log import compose
+from demandops.repo.history.commit_message import Person
+from demandops.repo.load import last_valid_config
+from demandops.repo.write.proposal_branch import PendingProposal, ProposalBranches
+
+_ATTEMPTS = 5
+_PAUSE_S = 0.2
+
+# Path → the new text; None removes the file.
+Files = Mapping[str, str | None]
+
+
+@dataclass(frozen=True, slots=True)
+class CommitDetails:
+    person: Person
+    now: datetime
+    summary: str
+    reason: str = ""
+
+    @property
+    def text(self) -> str:
+        # the person's reason is as written: it may close an issue
+        return compose([[self.summary]], []) + (
+            f"\n{one_line(self.reason)}\n" if self.reason else ""
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Published:
+    commit: str
+    branch: str
+    # the address of the branch's merge request, if the server printed it
+    link: str = ""
+
+
+def commit_to_main(
+    repository: StateRepository, make: Callable[[FileReader], Files], details: CommitDetails
+) -> Published:
+    """Commit the files that ``make`` returns to main.
+
+    The argument of ``make`` reads a file on main. If main gets other commits meanwhile, ``make`` is
+    called again. Raises InvalidInput if the files give the configuration new faults.
+    """
+    return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), details)
+
+
+def commit_to_branch(
+    repository: StateRepository,
+    files: Files,
+    details: CommitDetails,
+    branch: str,
+    options: Sequence[str],
+) -> Published:
+    """Commit files to a new branch on top of main, with push options if the server has them.
+
+    Raises InvalidInput if the files give the configuration new faults.
+    """
+    tip = trees.commit_of(repository.objects, repository.refresh())
+    commit = _commit(repository, tip, files, [tip.id], details)
+    branches = ProposalBranches(repository)
+    if branches.exists(branch):
+        raise StateRepoError(f"the branch {branch} exists already; merge or delete it first")
+    link = branches.put(branch, commit, "", options)
+    return Published(str(commit), branch, link)
+
+
+def merge(
+    repository: StateRepository, proposal: PendingProposal, details: CommitDetails
+) -> Published:
+    """Merge the commit of a proposal, which a person has seen, into main.
+
+    Raises InvalidInput if the proposal gives the configuration new faults, and StateRepoError if
+    the branch has moved, or main has other changes to the same files.
+    """
+    objects = repository.objects
+    head = trees.commit_of(objects, proposal.commit)
+
+    def make(tip: Commit) -> tuple[Files, list[Oid]]:
+        # If the branch moves only after this, its commit is merged all the same: a demand that was
+        # changed waits on another branch.
+        if ProposalBranches(repository).heads().branches.get(proposal.branch) != proposal.commit:
+            raise StateRepoError(
+                f"{proposal.branch} is no longer at commit {proposal.commit}, so nothing was "
+                "merged; look at the proposals again"
+            )
+        base = objects.merge_base(tip.id, head.id)
+        if base is None:
+            raise StateRepoError(
+                f"{proposal.branch} and {MAIN_BRANCH} have no commit in common; reject the "
+                "proposal with `demandops reject`, and send the demand again"
+            )
+        start = trees.commit_of(objects, base).tree
+        proposed = [path for path, _ in trees.differences(start, head.tree)]
+        if not {path for path, _ in trees.differences(start, tip.tree)}.isdisjoint(proposed):
+            raise StateRepoError(
+                f"{MAIN_BRANCH} and {proposal.branch} change the same files; wait until "
+                "a running generator has made the branch anew, then try again; if the branch has "
+                "commits by a person, the generator leaves it alone, so merge it with git"
+            )
+        for path in proposed:
+            # files are written anew from their text, so a link or another encoding would be lost
+            blob = trees.entry(head.tree, path)
+            is_text = isinstance(blob, Blob) and trees.text_of(blob).encode() == blob.data
+            if blob is not None and not (is_text and blob.filemode == FileMode.BLOB):
+                raise StateRepoError(
+                    f"{path} in {proposal.branch} is not a plain text file; merge the branch with "
+                    "git"
+                )
+        read = _reader(head.tree)
+        return {path: read(path) for path in proposed}, [tip.id, head.id]
+
+    return _publish(repository, make, details)
+
+
+def _publish(
+    repository: StateRepository,
+    make: Callable[[Commit], tuple[Files, list[Oid]]],
+    details: CommitDetails,
+) -> Published:
+    for attempt in range(1, _ATTEMPTS + 1):
+        tip = trees.commit_of(repository.objects, repository.refresh())
+        files, parents = make(tip)
+        commit = _commit(repository, tip, files, parents, details)
+        if repository.publish(tip.id, commit):
+            return Published(str(commit), MAIN_BRANCH)
+        repository.new.forget()
+        REAL.sleep(_PAUSE_S * attempt)
+    if repository.always_current and repository.tip() == tip.id:
+        raise StateRepoError(
+            f"another program locks {MAIN_BRANCH} of {repository.address}, so nothing was changed; "
+            f"try again; if no program writes there, remove {MAIN}.lock in it"
+        )
+    raise StateRepoError(
+        f"{repository.address} got new commits during each of {_ATTEMPTS} attempts, so nothing was "
+        "changed; try again"
+    )
+
+
+def _commit(
+    repository: StateRepository,
+    tip: Commit,
+    files: Files,
+    parents: list[Oid],
+    details: CommitDetails,
+) -> Oid:
+    tree = trees.write(repository.new, tip.tree, dict(files))
+    # faults that main has already do not stop a person, who may be mending them one by one
+    new_faults = _config_faults(repository.objects[tree].peel(Tree)) - _config_faults(tip.tree)
+    if new_faults:
+        raise InvalidInput(sorted(new_faults, key=str))
+    who = commit_message.signature(*details.person, details.now)
+    return signing.create_commit(
+        repository.new, repository.signer, (who, who), details.text, tree, parents
+    )
+
+
+def _config_faults(tree: Tree) -> set[Fault]:
+    try:
+        last_valid_config.config_at(tree)
+    except InvalidInput as error:
+        return {*error.faults}
+    return set()
+
+
+def _reader(tree: Tree) -> FileReader:
+    return lambda path: trees.read_text(tree, path)

@@ -1,0 +1,276 @@
+"""Proposals in the state repo: branches ``demand/…`` that a person merges to approve the demands.
+
+The generator rebuilds a branch if newer commits on main make the branch outdated, and deletes the
+branch in the end. If a person added commits to the branch, the generator neither rebuilds it nor
+deletes it after a merge. This module knows nothing of forges except GitLab's push options and the
+link that GitLab prints.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from functools import lru_cache
+
+import git
+from pygit2 import GitError, Oid, Repository, Tree
+
+from demandops.base import naming
+from demandops.base.errors import InvalidInput, StateRepoError
+from demandops.base.quoting import quoted
+from demandops.base.settings import MAIN_BRANCH
+from demandops.repo.git import tree as trees
+from demandops.repo.git.remote_repository import RemoteRepository
+from demandops.repo.git.repository import MAIN, PushDenied, StateRepository
+from demandops.repo.git.tree import commit_of
+from demandops.repo.history import commit_log
+from demandops.repo.load import ledger_files
+
+log = logging.getLogger("demandops")
+
+PREFIX = "demand/"
+_HEADS = "refs/heads/"
+_NO_OPTIONS = re.compile(r"does not support push options")
+_LINK = re.compile(r"https?://\S+")
+
+
+class BranchMoved(StateRepoError):
+    """Raised when a branch is not at the commit where the generator left it."""
+
+    def __init__(self, branch: str) -> None:
+        super().__init__(f"{branch} was changed by someone other than the generator")
+
+
+def branch_name(name: str, operation: str) -> str:
+    """Return the branch name for a demand: a slug of ``name``, and a hash of the operation id."""
+    return PREFIX + naming.slug_with_hash(name, operation, 12)
+
+
+@dataclass(frozen=True, slots=True)
+class BranchHeads:
+    """The newest commits of main, empty if there is none, and of the proposals' branches."""
+
+    main: str
+    branches: dict[str, str]
+
+
+class ProposalBranches:
+    """The branches ``demand/…`` of a state repo, on this disk or behind a URL."""
+
+    def __init__(self, repository: StateRepository) -> None:
+        self._repository = repository
+        self._remote = repository if isinstance(repository, RemoteRepository) else None
+
+    def heads(self) -> BranchHeads:
+        if self._remote is None:
+            repo = Repository(self._repository.objects.path)
+            names = [name for name in repo.references if name.startswith(f"{_HEADS}{PREFIX}")]
+            # another process may delete a branch meanwhile, so a name may have no reference
+            pairs = ((name, repo.references.get(name)) for name in [MAIN, *names])
+            commits = {name: str(ref.target) for name, ref in pairs if ref is not None}
+        else:
+            commits = self._remote.list_references(MAIN, f"{_HEADS}{PREFIX}*")
+        heads = {name.removeprefix(_HEADS): commit for name, commit in commits.items()}
+        return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
+
+    def exists(self, branch: str) -> bool:
+        """Return whether any branch exists, also one that does not begin with ``demand/``."""
+        reference = f"{_HEADS}{branch}"
+        if self._remote is None:
+            return reference in self._repository.objects.references
+        return reference in self._remote.list_references(reference)
+
+    def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
+        """Make a branch point to ``commit``, durably, and return the link that the server printed.
+
+        Args:
+            branch: the branch's name.
+            commit: a commit in this repository.
+            expected: the branch's commit now; empty if the branch must not exist.
+            options: push options; left out if the server supports none.
+
+        Raises:
+            BranchMoved: the branch is not at ``expected``.
+            Unavailable, PushDenied: the branch could not be pushed for another reason.
+            GitError, OSError: the repository on this disk could not be written.
+        """
+        with self._repository.new.packed(commit):
+            return self._move(branch, commit, expected, options)
+
+    def remove(self, branch: str, expected: str) -> None:
+        """Delete a branch, if it exists, with the errors of :meth:`put`."""
+        self._move(branch, None, expected)
+
+    def _move(
+        self, branch: str, commit: Oid | None, expected: str, options: Sequence[str] = ()
+    ) -> str:
+        reference, wanted = f"{_HEADS}{branch}", str(commit or "")
+        if self._remote is None:
+            try:
+                self._set_reference(reference, commit, expected)
+            except (GitError, OSError) as error:
+                raise self._why_denied(branch) or error from None
+            return ""
+        try:
+            spec, lease = f"{wanted}:{reference}", f"{reference}:{expected}"
+            output = self._remote.push(spec, lease, options)
+            lines = [line for line in output.splitlines() if line.startswith("remote:")]
+            links = [link[0] for line in lines if (link := _LINK.search(line))]
+            # GitLab prints how to make a merge request, or the one that exists
+            return next((link for link in links if "/merge_requests/" in link), "")
+        except git.GitCommandError as error:
+            if options and _NO_OPTIONS.search(str(error.stderr)):
+                return self._move(branch, commit, expected)
+            now = self.heads().branches.get(branch, "")
+            if now == wanted:
+                return ""  # the push succeeded, but the answer was lost
+            if now != expected:
+                raise BranchMoved(branch) from None
+            raise self._why_denied(branch) or self._remote.push_error(error) from None
+
+    def _why_denied(self, branch: str) -> PushDenied | None:
+        folders = (branch[:end] for end, letter in enumerate(branch) if letter == "/")
+        taken = next(filter(self.exists, folders), "")
+        # Git may store each branch as a file, so that a branch ``a`` takes the folder of ``a/b``
+        if not taken:
+            return None
+        return PushDenied(
+            f"{self._repository.address} cannot have the branch {branch}, because it has a branch "
+            f"{taken}; delete or rename {taken}, then try again"
+        )
+
+    def _set_reference(self, reference: str, commit: Oid | None, expected: str) -> None:
+        references = self._repository.objects.references
+        now = str(references[reference].target) if reference in references else ""
+        if commit is None and not now:
+            return
+        if now != expected:
+            raise BranchMoved(reference.removeprefix(_HEADS))
+        if commit is None:
+            references.delete(reference)
+        elif now:
+            references[reference].set_target(commit, "demandops")
+        else:
+            references.create(reference, commit)
+
+    def message(self, commit: str) -> str:
+        """Return a commit's message, empty if this repository lacks the commit."""
+        try:
+            return commit_of(self._repository.objects, commit).message
+        except StateRepoError:
+            return ""
+
+    def is_up_to_date(
+        self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
+    ) -> bool:
+        """Return whether a proposal merges into main cleanly, and changes exactly ``files``.
+
+        Args:
+            tip: the current commit of main.
+            commit: the proposal, on top of ``base``.
+            base: the commit of main that the proposal was made on.
+            files: path → text of the files that the demands would change on the current main.
+        """
+        if (compared := self._trees(tip, commit, base, files)) is None:
+            return False
+        old, proposal, now, new = compared
+        proposed = dict(trees.differences(old, proposal))
+        if proposed != dict(trees.differences(now, new)):
+            return False
+        return proposed.keys().isdisjoint(path for path, _ in trees.differences(old, now))
+
+    def books_the_same(
+        self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
+    ) -> bool:
+        """Return whether a proposal would book the same on the current main, leases aside.
+
+        The arguments are those of :meth:`is_up_to_date`. Return True for an unknown proposal.
+        """
+        if (compared := self._trees(tip, commit, base, files)) is None:
+            return True
+        old, proposal, now, new = compared
+        paths = {*ledger_files.changed_files(old, proposal), *ledger_files.changed_files(now, new)}
+        pairs = (map(ledger_files.valid_claim_at, (proposal, new), (path,) * 2) for path in paths)
+        return all((a and a.booked) == (b and b.booked) for a, b in pairs)
+
+    def _trees(
+        self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
+    ) -> tuple[Tree, Tree, Tree, Tree] | None:
+        objects = self._repository.objects
+        try:
+            old, proposal = commit_of(objects, base).tree, commit_of(objects, commit).tree
+        except StateRepoError:
+            return None  # the clone was made again, or `git gc` removed the commit
+        now = commit_of(objects, tip).tree
+        return old, proposal, now, objects[trees.write(self._repository.new, now, files)].peel(Tree)
+
+
+@dataclass(frozen=True, slots=True)
+class PendingProposal:
+    branch: str
+    # the newest of the branch, perhaps by a person
+    commit: str
+    summary: str
+    # when the first demand was received
+    since: datetime
+    requesters: tuple[str, ...]
+    demands: tuple[str, ...]
+    operations: tuple[str, ...]
+    required_by: tuple[str, ...] = ()
+    # the branch and the commit where the demand waited before it was changed
+    replaces: tuple[str, ...] = ()
+
+    def require(self, commit: str) -> None:
+        """Raise InvalidInput unless ``commit`` is the whole id of the newest commit."""
+        # whoever may push to the branch finds another commit with the same 10 digits in minutes
+        if commit != self.commit:
+            raise InvalidInput.at(
+                "",
+                f"{self.branch} is at commit {self.commit}, not at {quoted(commit)}; if it has "
+                "changed since, look at it again",
+            )
+
+
+def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
+    """Yield the proposals whose commits are not on main, sorted by branch.
+
+    Branches that cannot be read are logged and left out. Raises Unavailable if git cannot fetch.
+    """
+    if isinstance(repository, RemoteRepository):
+        repository.fetch_branches(PREFIX)
+    space = f"{repository.branches}{PREFIX}"
+    repo = Repository(repository.objects.path)
+    main = repository.tip()
+    for name in sorted(name for name in repo.references if name.startswith(space)):
+        try:
+            head = repo.references[name].resolve().target
+            commits = list(commit_log.commits(repo, head, main))
+        except (KeyError, ValueError, TypeError, GitError, StateRepoError):
+            _warn_of_unreadable(name)
+            continue
+        entries = [entry for _, entry in commits if commit_log.PROPOSAL in entry.trailers]
+        if not entries:
+            continue
+        yield PendingProposal(
+            branch=f"{PREFIX}{name.removeprefix(space)}",
+            commit=str(head),
+            summary=entries[0].summary,
+            since=entries[-1].authored or entries[-1].time,
+            requesters=_all_of(entries, "Requester"),
+            demands=_all_of(entries, "Demand-Id"),
+            operations=_all_of(entries, "Operation-Id"),
+            required_by=_all_of(entries, commit_log.REQUIRED_BY),
+            replaces=_all_of(entries, commit_log.REPLACES),
+        )
+
+
+@lru_cache(maxsize=100)  # a page lists the proposals again and again
+def _warn_of_unreadable(name: str) -> None:
+    log.warning("the branch %s points to no commit that can be read; delete the branch", name)
+
+
+def _all_of(entries: Iterable[commit_log.LogEntry], key: str) -> tuple[str, ...]:
+    return tuple(sorted({value for entry in entries for value in entry.trailers.get(key, ())}))

@@ -1,0 +1,1 @@
+"""The running generator: from a submitted demand to its receipt."""

@@ -1,0 +1,1 @@
+"""Demands that wait for a person: proposals, pull requests, answers."""

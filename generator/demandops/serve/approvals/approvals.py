@@ -1,0 +1,446 @@
+"""The proposals that await approval, and the answers to their demands.
+
+This code runs in the worker thread. A proposal is booked once main has its claims, whether by a
+merge commit, a squash or a rebase. Until then the worker rebuilds the branch if a new main makes
+it outdated, so that the branch has the files that the generator would render on that main. A branch
+to which a person has committed stays unchanged.
+:meth:`Proposal.verdict` decides what happens to the demands of a proposal, and this module carries
+that verdict out.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections import Counter, deque
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeAlias
+
+from demandops.base.errors import (
+    DemandOpsError,
+    InvalidInput,
+    Refused,
+    ShuttingDown,
+    Withdrawn,
+    fault,
+)
+from demandops.base.quoting import quoted
+from demandops.base.settings import PROPOSAL_LIMIT
+from demandops.decide.decision import Decision
+from demandops.decide.state import State
+from demandops.model.demand.claim import ClaimKey
+from demandops.model.demand.demand_request import DemandRequest, Put
+from demandops.repo.git.repository import PushDenied, StateRepository
+from demandops.repo.git.signing import SigningFailed
+from demandops.repo.history import commit_log
+from demandops.repo.history.commit_log import RecordedOutcome
+from demandops.repo.load import ledger_files
+from demandops.repo.load.snapshot import Snapshot
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.repo.write.journal import ProposalRecord
+from demandops.repo.write.proposal_branch import (
+    BranchHeads,
+    BranchMoved,
+    ProposalBranches,
+    branch_name,
+)
+from demandops.serve.approvals.forge_worker import CheckTimer, ForgeWorker
+from demandops.serve.approvals.proposal import (
+    Proposal,
+    Verdict,
+    admit_or_none,
+    code,
+    decide_in_turn,
+    is_release,
+    key_of,
+    pull_request_texts,
+    push_options,
+    releases,
+    waiting_text,
+)
+from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
+from demandops.serve.queue import Receipt, Ticket, receipt_of
+from demandops.serve.rollout_targets import targets_of_decision
+
+log = logging.getLogger("demandops")
+
+# How many seconds a check of all proposals may take before it pauses for a queued demand.
+_LONGEST_CHECK_S = 0.5
+
+RELEASED = "was released by a later request before it was approved"
+REPLACED = "was replaced by a later demand of the same id before it was approved"
+
+# A demand with its receipt, its error, or the decision that needs approval.
+Result: TypeAlias = tuple[Ticket, Receipt | DemandOpsError | Decision]
+
+
+class Approvals:
+    def __init__(
+        self,
+        repository: StateRepository,
+        state: State,
+        demands: Demands,
+        with_targets: bool,
+        token_file: Path | None,
+    ) -> None:
+        self._repository, self._runtime = repository, repository.runtime
+        self._demands = demands
+        self._with_targets = with_targets
+        self._branches = ProposalBranches(repository)
+        self._forge = ForgeWorker(token_file, self._on_forge_update, repository.runtime)
+        self._timer = CheckTimer(repository.runtime, local=repository.always_current)
+        self._proposals: dict[str, Proposal] = {}  # by branch
+        self._changed: deque[str] = deque()
+        for ticket in demands.proposed:  # of an earlier run
+            request = admit_or_none(state, ticket.goal)
+            record = replace(ticket.proposal or ProposalRecord(""), withdrawn="")
+            new = Proposal(record, searched_to=ticket.base)
+            proposal = self._proposals.setdefault(record.branch, new)
+            if ticket.state == "proposed":  # a withdrawn ticket has an older record
+                proposal.record = record
+            proposal.tickets.append(ticket)
+            proposal.requests += [request] if request else []
+            self._changed.append(proposal.branch)
+        for proposal in self._proposals.values():  # the last run may have ended in `add`
+            if old := self._proposals.get(proposal.record.replaced_branch):
+                self._replace(old, proposal.branch)
+
+    # ---- while a batch is evaluated ----
+
+    def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
+        """Withdraw each proposal that a demand of ``batch`` releases, and delete its branch."""
+        # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
+        # merged it earlier, the batch is evaluated on a tip that includes the merge.
+        for ticket in batch if self._proposals else ():
+            request = _release_request(ticket, state)
+            if request is None:
+                continue
+            for proposal in self._proposals.values():
+                if not releases(request, proposal.requests):
+                    continue
+                self._demands.withdraw_proposed(proposal.tickets, RELEASED)
+                if proposal.record.commits:
+                    self._delete_branch(proposal.branch, self._branches.heads())
+                # the next check answers the demands, because their branch may be merged already
+                self._changed.append(proposal.branch)
+                ticket.has_released = True
+
+    def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
+        """Withdraw each demand in ``earlier`` that needs approval and that ``by`` releases."""
+        request = _release_request(by, state) if earlier else None
+        for index, (ticket, result) in enumerate(earlier):
+            if request and isinstance(result, Decision) and releases(request, [result.request]):
+                earlier[index] = (ticket, Withdrawn(RELEASED))
+                by.has_released = True
+
+    def add(self, ticket: Ticket, decision: Decision) -> None:
+        """Add a demand to the proposal of the same demand, or to a new proposal.
+
+        The demand gets an error as its answer if other requesters own the earlier proposal, if a
+        requester has too many proposals, or if the demand was withdrawn.
+        """
+        request, waiting = decision.request, self._waiting(decision.request)
+        owners = {name for each in waiting for name in each.requesters()}
+        if owners and not owners & set(request.requesters()):
+            message = f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; "
+            message += "choose another demand id"
+            self._demands.fail([ticket], Refused([fault("demand", message, code="not-yours")]))
+            return
+        # What a person has seen on a branch never becomes another demand there. So a put with other
+        # content gets a branch of its own, and replaces the earlier proposal.
+        goal = json.dumps(ticket.goal)
+        proposal = next((each for each in waiting if goal in each.goals()), None)
+        replaced = waiting if isinstance(request, Put) and proposal is None else []
+        if proposal is None:
+            counts = Counter(
+                name
+                for each in self._proposals.values()
+                if each.waits
+                for name in each.requesters()
+            )
+            full = next(
+                (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT), ""
+            )
+            if full and not replaced:
+                message = (
+                    f"requester {quoted(full)} already has {PROPOSAL_LIMIT} proposals that await "
+                    "approval; release some of the demands in these proposals, or ask a person to "
+                    "approve or reject some of the proposals"
+                )
+                self._demands.fail([ticket], Refused([fault("", message, code="quota")]))
+                return
+            branch = branch_name(request.demand or request.id, ticket.operation)
+            if branch in self._proposals:
+                self._demands.fail([ticket], _belongs_to_another(branch))
+                return
+            replaces = next((each.record.as_replaced() for each in replaced), "")
+            proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
+        if not self._demands.propose(ticket, proposal.record):
+            self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
+            return
+        self._proposals[proposal.branch] = proposal
+        proposal.tickets.append(ticket)
+        proposal.requests.append(request)
+        self._changed.append(proposal.branch)
+        for old in replaced:
+            self._replace(old, branch)
+
+    def _waiting(self, request: DemandRequest) -> list[Proposal]:
+        """Return the proposals of the same demand, whatever its content."""
+        key = key_of(request)
+        waiting = (each for each in self._proposals.values() if each.waits)
+        return [each for each in waiting if key in map(key_of, each.requests)]
+
+    def withdraw_replaced(self, request: DemandRequest) -> None:
+        """Withdraw the open proposal that a put replaces which needs no approval."""
+        for proposal in self._waiting(request) if isinstance(request, Put) else ():
+            self._demands.withdraw_proposed(proposal.tickets, REPLACED)
+
+    def _replace(self, old: Proposal, branch: str) -> None:
+        self._demands.withdraw_proposed(old.tickets, f"{REPLACED}: {branch}")
+        self._changed.append(old.branch)  # the next check answers them: they may be merged already
+
+    # ---- after main was read ----
+
+    def is_due(self, tip: str) -> bool:
+        """Return whether to check the proposals now; ``tip`` is the newest commit of main."""
+        if not self._proposals:
+            return False
+        tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
+        withdrawn = any(ticket.state == "withdrawn" for ticket in tickets)
+        return self._timer.is_due(tip, has_news=bool(self._changed) or withdrawn)
+
+    def seconds_until_due(self, tip: str, longest: float) -> float:
+        if not self._proposals:
+            return longest
+        return min(longest, max(self._timer.seconds_until_due(tip), 0.05))
+
+    def fetch_heads(self) -> BranchHeads:
+        self._timer.began()  # this plans the next check, in case the fetch fails
+        return self._branches.heads()
+
+    def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
+        """Answer the demands that are decided or withdrawn, and update the other proposals.
+
+        ``snapshot`` is the state of main, at the commit ``heads.main`` or a later one. If an error
+        is raised, the next check handles the proposals that this check did not reach.
+        """
+        while self._changed:
+            if changed := self._proposals.get(self._changed.popleft()):
+                changed.checked_at = ""
+        began, proposals = self._runtime.monotonic(), list(self._proposals.values())
+        for number, proposal in enumerate(proposals):
+            is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
+            if number and is_long and self._demands.has_queued:
+                # make another check due, which begins with the rest
+                unchecked = {each.branch: each for each in proposals[number:]}
+                self._proposals = unchecked | self._proposals
+                self._changed.append(proposal.branch)
+                break
+            self._repository.while_waiting()
+            try:
+                if not proposal.is_unchanged(str(snapshot.commit), heads.branches):
+                    self._check(proposal, snapshot, heads)
+            except BranchMoved as error:
+                log.info("%s; checking again", error)
+                self._changed.append(proposal.branch)
+            except (SigningFailed, PushDenied) as error:
+                # while the branch exists, a person can still merge it
+                if proposal.tickets and proposal.branch in heads.branches:
+                    self._runtime.failed(f"rebuilding {proposal.branch}", error)
+                else:
+                    self._demands.fail(proposal.tickets, error)
+                    self._forget(proposal, str(error))
+        self._timer.ended(str(snapshot.commit))
+
+    def _check(self, proposal: Proposal, snapshot: Snapshot, heads: BranchHeads) -> None:
+        objects, tip = self._repository.objects, str(snapshot.commit)
+        on_main = commit_log.operations_since(objects, snapshot.commit, proposal.searched_to)
+        head, added = heads.branches.get(proposal.branch, ""), set[ClaimKey]()
+        if head and not proposal.record.commits:
+            self._demands.fail(proposal.tickets, _belongs_to_another(proposal.branch))
+            self._proposals.pop(proposal.branch, None)
+            return
+        # a person who edited or deleted the branch may have merged it without our operation ids
+        if proposal.record.pushed and head not in proposal.record.commits:
+            added = ledger_files.added_by_people(objects, proposal.searched_to, snapshot.commit)
+        proposal.searched_to = tip
+        read = CommitBatch(self._repository, snapshot).read
+        pull_request = self._forge.pull_request(proposal.branch)
+        verdict = proposal.verdict(snapshot.state, read, on_main, added, head, pull_request)
+        booked = [
+            (ticket, self._receipt(ticket, decision, snapshot, on_main.get(ticket.operation)))
+            for ticket, decision in verdict.booked
+        ]
+        self._demands.answer(booked)
+        proposal.drop(booked)
+        if verdict.unapproved:
+            if booked and not head:  # a person merged only some of the demands
+                proposal.record = replace(proposal.record, pushed=False)
+            # the branch is to contain only the demands that still need approval
+            before, is_updated = proposal.tickets, False
+            proposal.wait_for(verdict.unapproved)
+            try:
+                is_updated = self._update(proposal, verdict, snapshot, heads)
+            finally:
+                if not is_updated:  # the branch has them all still, and so has the next check
+                    proposal.tickets = [ticket for ticket in before if ticket.state != "done"]
+            if not is_updated:
+                self._changed.append(proposal.branch)
+                return
+            proposal.checked_at = tip
+        else:
+            if proposal.record.commits and (not booked or head in proposal.record.commits):
+                self._delete_branch(proposal.branch, heads)
+            self._delete_replaced(proposal, heads)
+        # the branch no longer has these demands, so nobody can merge them
+        self._demands.answer(verdict.failed)
+        self._demands.requeue(verdict.free)
+        if not verdict.unapproved:
+            proposal.wait_for([])
+            why = next((error for _, error in verdict.failed), "it needs no approval any more")
+            self._forget(proposal, "" if booked else str(why))
+
+    def _receipt(
+        self,
+        ticket: Ticket,
+        decision: Decision | InvalidInput,
+        snapshot: Snapshot,
+        recorded: RecordedOutcome | None,
+    ) -> Receipt:
+        commit = recorded.commit if recorded else str(snapshot.commit)
+        # a person merged the demand, but a later commit changed its files
+        if isinstance(decision, InvalidInput) or decision.files:
+            return Receipt(ticket.operation, ticket.name, "booked", commit)
+        before = snapshot.state
+        targets = targets_of_decision(before, decision) if self._with_targets else ()
+        return replace(receipt_of(ticket, decision, commit, targets), outcome="booked")
+
+    # ---- the branch and its pull request ----
+
+    def _update(
+        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
+    ) -> bool:
+        """Rebuild the branch if it is outdated, open its pull request and notify the requesters.
+
+        Return false if a demand was withdrawn meanwhile and the proposal must be checked again.
+        """
+        head = heads.branches.get(proposal.branch)
+        if head and head not in proposal.record.commits:
+            # a rebuild would throw away what a person has written
+            if not proposal.edited:
+                log.info("%s has commits by a person and stays unchanged", proposal.branch)
+            proposal.edited = True
+        elif not self._bring_up_to_date(proposal, verdict, snapshot, heads):
+            return False
+        forge = snapshot.state.config.repo_settings.proposals
+        if forge.forge in ("github", "gitea"):
+            message = self._branches.message(proposal.record.commits[-1])
+            title, body = pull_request_texts(message)
+            self._forge.open(forge, proposal.branch, title, body)
+            if not self._forge.was_queried(proposal.branch):
+                return True  # the requester is notified once the link is known
+        request = self._forge.pull_request(proposal.branch)
+        link = request.link if request else proposal.record.link
+        for ticket in proposal.tickets:
+            ticket.notify("proposed", waiting_text(proposal.branch, link, proposal.reasons))
+        return True
+
+    def _bring_up_to_date(
+        self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
+    ) -> bool:
+        """Rebuild the branch on main, with one commit for each demand, unless it is up to date.
+
+        Return false if a demand was withdrawn; the branch is then not pushed.
+        """
+        commits = CommitBatch(self._repository, snapshot)
+        steps, failed = decide_in_turn(verdict.unapproved, snapshot.state, commits.read)
+        verdict.failed.extend(failed)
+        proposal.drop(failed)
+        old, tip = proposal.record, snapshot.commit
+        head = heads.branches.get(old.branch, "")
+        files = {path: text for _, step in steps for path, text in step.files.items()}
+        if head and self._branches.is_up_to_date(tip, head, old.base, files):
+            return True
+        # If the demands would now book something else, such as another node that was chosen, the
+        # proposal moves to another branch: what was approved so far is not that.
+        if head and steps and not self._branches.books_the_same(tip, head, old.base, files):
+            request, ticket = proposal.requests[0], proposal.tickets[0]
+            branch = branch_name(request.demand or request.id, f"{ticket.operation} {head}")
+            self._forget(proposal, f"main has changed, so it is proposed anew: {branch}")
+            proposal.record = old = ProposalRecord(branch, replaces=f"{old.branch} {head}")
+            self._proposals[branch] = proposal
+            head = ""
+        now, branch = self._runtime.now(), old.branch
+        for ticket, step in steps:
+            if step.files:
+                commits.commit(step, ticket.operation, ticket.received, now, old)
+        commit = commits.head.commit
+        # Journal both commits before the push: after a crash either may be the branch's head, and
+        # a head that is not known here would be taken for a person's.
+        newest = (head, str(commit)) if head else (str(commit),)
+        record = replace(old, commits=newest, base=str(tip))
+        if not self._journal(proposal, record):
+            return False
+        if not head:
+            self._delete_replaced(proposal, heads)
+        forge, options = snapshot.state.config.repo_settings.proposals, []
+        if forge.forge == "gitlab":
+            message = self._branches.message(str(commit))
+            options = push_options(message, forge.labels)
+        link = self._branches.put(branch, commit, head, options)
+        self._journal(proposal, replace(record, pushed=True, link=link or old.link))
+        log.info("%s %s", branch, "was rebuilt" if head else "awaits approval")
+        return True
+
+    def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
+        """Journal ``record`` for each demand; return false if a demand was withdrawn."""
+        proposal.record = record
+        waiting = [self._demands.propose(ticket, record) for ticket in proposal.tickets]
+        return all(waiting)
+
+    def _delete_replaced(self, proposal: Proposal, heads: BranchHeads) -> None:
+        # a replaced proposal that is still here deletes its branch itself, with its answers
+        if proposal.record.replaced_branch not in self._proposals:
+            self._delete_branch(proposal.record.replaced_branch, heads)
+
+    def _delete_branch(self, branch: str, heads: BranchHeads) -> None:
+        if head := heads.branches.get(branch):
+            self._branches.remove(branch, head)
+            del heads.branches[branch]
+
+    # ---- the end ----
+
+    def _forget(self, proposal: Proposal, closed_as: str) -> None:
+        self._proposals.pop(proposal.branch, None)
+        self._forge.forget(proposal.branch, code(closed_as) if closed_as else "")
+
+    def _on_forge_update(self, branch: str) -> None:
+        self._changed.append(branch)  # in the forge's thread; appending to a deque needs no lock
+        self._demands.wake()
+
+    def suspend(self) -> None:
+        """Answer the demands that await approval with an error; the next start resumes them."""
+        error = ShuttingDown("the demand awaits approval, and is resumed at the next start")
+        for proposal in self._proposals.values():
+            self._demands.fail(proposal.tickets, error, keep=True)
+        self._proposals = {}
+        self._forge.close()
+
+
+def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
+    """Return the request of a ticket that ends demands, or None if it would be refused."""
+    if ticket.state == "withdrawn" or not is_release(ticket.goal):
+        return None
+    return admit_or_none(state, ticket.goal)
+
+
+def _belongs_to_another(branch: str) -> Refused:
+    # a branch has the digest of an operation id in its name, and digests may collide
+    message = (
+        f"needs the branch {branch}, which belongs to another proposal; send the demand again with "
+        "another operation id"
+    )
+    return Refused([fault("", message, code="conflict")])

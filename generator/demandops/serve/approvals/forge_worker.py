@@ -1,0 +1,180 @@
+"""When to check the proposals: soon after main has moved, and otherwise at an interval."""
+
+from __future__ import annotations
+
+import logging
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from demandops.base.runtime import Runtime, Thread
+from demandops.base.settings import MAIN_BRANCH
+from demandops.model.config.repo_settings import Proposals
+from demandops.repo.forge import Forge, ForgeError, PullRequest, forge_for
+
+# The seconds between two checks of the branches, as only a check detects a deleted branch.
+CHECK_LOCAL_S = 1.0
+CHECK_REMOTE_S = 5.0
+# How many times as long as the last check to pause before the check of a new main, so that checks
+# take at most a tenth of the worker's time while main moves.
+_PAUSE_FACTOR = 9
+
+
+class CheckTimer:
+    """Decides when the next check is due. A failed check is retried when the interval is over."""
+
+    def __init__(self, runtime: Runtime, *, local: bool) -> None:
+        self._runtime = runtime
+        self._interval = CHECK_LOCAL_S if local else CHECK_REMOTE_S
+        self._checked_at: str | None = ""
+        self._began = self._rest_until = self._next = 0.0
+
+    def is_due(self, tip: str, *, has_news: bool) -> bool:
+        # after a failed check, news wait for the interval: the remote is likely away
+        if has_news and self._checked_at is not None:
+            return True
+        return self.seconds_until_due(tip) <= 0
+
+    def seconds_until_due(self, tip: str) -> float:
+        has_moved = self._checked_at not in (tip, None)
+        due = min(self._next, self._rest_until) if has_moved else self._next
+        return due - self._runtime.monotonic()
+
+    def began(self) -> None:
+        """Record that a check begins, and plan the next one in case this one fails."""
+        self._began = self._runtime.monotonic()
+        self._next, self._checked_at = self._began + self._interval, None
+
+    def ended(self, tip: str) -> None:
+        now = self._runtime.monotonic()
+        self._checked_at = tip
+        self._rest_until = now + _PAUSE_FACTOR * (now - self._began)
+
+
+# ---- opens, watches and closes pull requests at a forge, in a thread of its own ----
+#
+# A slow or unreachable forge delays no demand and no proposal, because a branch can be merged
+# without a pull request.
+
+log = logging.getLogger("demandops")
+
+# The seconds between two queries to the forge, to learn which pull requests were closed.
+POLL_S = 30.0
+# How long to pause after a forge has answered that it got too many requests.
+_REST_S = 60.0
+
+
+@dataclass(frozen=True, slots=True)
+class _Task:
+    forge: Proposals
+    branch: str
+    title: str
+    body: str
+    closed_as: str = ""  # why to close the pull request; empty to open it
+
+
+class ForgeWorker:
+    """Opens, watches and closes pull requests; only the worker thread calls its public methods."""
+
+    def __init__(
+        self, token_file: Path | None, on_update: Callable[[str], None], runtime: Runtime
+    ) -> None:
+        self._token_file, self._on_update, self._runtime = token_file, on_update, runtime
+        self._tasks: deque[_Task] = deque()
+        self._due = runtime.event()
+        self._wanted: dict[str, _Task] = {}
+        self._pull_requests: dict[str, PullRequest | None] = {}
+        self._lock = runtime.lock()
+        self._thread: Thread | None = None
+        self._last_error = ""
+        self._closed = False
+
+    def close(self) -> None:
+        self._closed = True  # the thread still does its tasks; the pull requests stay
+        self._due.set()
+
+    def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
+        """Have the forge's thread open a pull request, unless the branch already has one."""
+        if branch not in self._wanted:
+            task = _Task(forge, branch, title, body)
+            with self._lock:
+                self._wanted[branch] = task
+            self._enqueue(task)
+
+    def was_queried(self, branch: str) -> bool:
+        """Return whether the forge was queried about a branch, or cannot be queried now."""
+        return branch in self._pull_requests
+
+    def pull_request(self, branch: str) -> PullRequest | None:
+        return self._pull_requests.get(branch)
+
+    def forget(self, branch: str, closed_as: str) -> None:
+        """Stop watching a branch; also close its pull request, if ``closed_as`` says why."""
+        with self._lock:
+            task = self._wanted.pop(branch, None)
+            pull_request = self._pull_requests.pop(branch, None)
+        # closed by a person
+        is_closed = pull_request is not None and pull_request.state == "closed"
+        if task is not None and closed_as and not is_closed:
+            self._enqueue(replace(task, closed_as=closed_as))
+
+    def _enqueue(self, task: _Task) -> None:
+        self._tasks.append(task)
+        self._due.set()
+        if self._thread is None:  # most state repos have no forge, and need no thread for it
+            self._thread = self._runtime.keep_running("forge", self._run)
+
+    # ---- in the forge's thread ----
+
+    def _run(self) -> None:
+        poll_at = self._runtime.monotonic() + POLL_S
+        while not self._closed:
+            self._due.wait(max(0.0, poll_at - self._runtime.monotonic()))
+            self._due.clear()
+            if self._runtime.monotonic() >= poll_at:
+                poll_at = self._runtime.monotonic() + POLL_S
+                with self._lock:
+                    self._tasks.extend(self._wanted.values())
+            while self._tasks:
+                task = self._tasks.popleft()
+                pull_request = self._pull_requests.get(task.branch)
+                try:
+                    forge = forge_for(task.forge, self._token_file)
+                    if forge is None:
+                        continue
+                    pull_request = self._handle(task, forge, pull_request)
+                except ForgeError as error:
+                    if str(error) != self._last_error:
+                        log.warning("%s: %s", task.branch, error)
+                    self._last_error = str(error)
+                    if error.asks_to_wait or error.status is None:
+                        # notify the requesters now, not only once the forge answers again
+                        for each in (task, *self._tasks):
+                            self._remember(each, self._pull_requests.get(each.branch))
+                    if error.asks_to_wait:
+                        self._tasks.appendleft(task)
+                        self._runtime.sleep(_REST_S)
+                        continue
+                except Exception as error:  # one pull request must not stop the others
+                    self._runtime.failed(f"forge of {task.branch}", error)
+                self._remember(task, pull_request)
+
+    @staticmethod
+    def _handle(task: _Task, forge: Forge, known: PullRequest | None) -> PullRequest | None:
+        if not task.closed_as and known is None:
+            return forge.open(task.branch, MAIN_BRANCH, task.title, task.body)
+        current = forge.find(task.branch, MAIN_BRANCH) or known
+        if task.closed_as and current is not None and current.state != "merged":
+            # the forge may have closed it already, because its branch is gone
+            forge.close(current, f"Closed: {task.closed_as}\n\n{task.body}")
+        return current
+
+    def _remember(self, task: _Task, pull_request: PullRequest | None) -> None:
+        with self._lock:
+            if task.closed_as or task.branch not in self._wanted:  # forgotten during the query
+                return
+            before = self._pull_requests.get(task.branch, "not queried")
+            self._pull_requests[task.branch] = pull_request
+        if before != pull_request:
+            self._on_update(task.branch)

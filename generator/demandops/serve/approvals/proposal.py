@@ -1,0 +1,253 @@
+"""A proposal: demands that wait together on one branch for a person's approval.
+
+Nothing here writes to the state repo or the journal. This module decides the verdict on a proposal,
+recognizes the requests that release a proposal, and composes the texts that describe it.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TypeAlias
+
+from demandops.base.errors import DemandOpsError, InvalidInput, TurnedDown, Withdrawn
+from demandops.base.quoting import harmless, one_line
+from demandops.base.settings import MAIN_BRANCH
+from demandops.decide.admission import permission
+from demandops.decide.admission.admitted_request import admit
+from demandops.decide.changes.changeset import FileReader
+from demandops.decide.decision import Decision, decide
+from demandops.decide.state import State
+from demandops.model.demand.claim import ClaimKey
+from demandops.model.demand.demand_request import DemandRequest, Release
+from demandops.repo.forge import PullRequest
+from demandops.repo.history import commit_log
+from demandops.repo.write.journal import ProposalRecord
+from demandops.serve.queue import Ticket
+
+Decided: TypeAlias = list[tuple[Ticket, Decision]]
+Failed: TypeAlias = list[tuple[Ticket, DemandOpsError]]
+
+_PREFIX = "awaiting approval: "
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    # Main has the claims of these, with the decision that each would get on the current main.
+    booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
+    # These were withdrawn or turned down, or can no longer be booked.
+    failed: Failed = field(default_factory=list)
+    # These no longer need approval.
+    free: list[Ticket] = field(default_factory=list)
+    unapproved: Decided = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class Proposal:
+    """A demand that awaits approval on a branch, with all goals that ask for it."""
+
+    record: ProposalRecord
+    tickets: list[Ticket] = field(default_factory=list)
+    requests: list[DemandRequest] = field(default_factory=list)
+    reasons: tuple[str, ...] = ()  # why approval is needed
+    searched_to: str = ""  # up to this commit, main was searched for merged demands
+    checked_at: str = ""  # main at the last check; empty to check again
+    edited: bool = False  # by a person who committed to the branch
+
+    @property
+    def branch(self) -> str:
+        return self.record.branch
+
+    @property
+    def waits(self) -> bool:
+        return any(ticket.state == "proposed" for ticket in self.tickets)
+
+    def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
+        """Return whether main, this proposal's branch and its demands are as at the last check."""
+        head = branches.get(self.branch)
+        all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
+        return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
+
+    def verdict(
+        self,
+        state: State,
+        read: FileReader,
+        on_main: Container[str],
+        added: Container[ClaimKey],
+        head: str,
+        pull_request: PullRequest | None,
+    ) -> Verdict:
+        """Return the verdict on the proposal's demands.
+
+        ``on_main`` has the operation ids in the commits of main since ``searched_to``. ``added``
+        has the claims that people added since then; it is empty unless a person edited or deleted
+        the branch. ``head`` is empty if the branch does not exist.
+        """
+        verdict = Verdict()
+        for ticket in self.tickets:
+            decision: Decision | InvalidInput
+            try:
+                decision = decide(state, ticket.goal, ticket.received, read)
+            except InvalidInput as error:
+                decision, is_merged = error, False
+            else:
+                # A squash merge may lose the trailer that names the operation. So a demand is
+                # booked also if it would change no file of main, or only claims that people added.
+                changes = decision.changes.claims
+                is_merged = not decision.files or (
+                    bool(changes) and all(change.key in added for change in changes)
+                )
+            if ticket.operation in on_main or is_merged:
+                verdict.booked.append((ticket, decision))
+            elif ticket.state == "withdrawn" and ticket.proposal:
+                verdict.failed.append((ticket, Withdrawn(ticket.proposal.withdrawn)))
+            elif isinstance(decision, InvalidInput):
+                verdict.failed.append((ticket, decision))
+            elif decision.approval:
+                verdict.unapproved.append((ticket, decision))
+            else:
+                verdict.free.append(ticket)
+        why_not = ""
+        if self.record.pushed and not head:
+            why_not = f"was turned down: {self.branch} is gone and was not merged"
+        elif pull_request is not None and pull_request.state == "closed":
+            why_not = f"was turned down: {pull_request.link} was closed"
+        # a branch is gone after a merge too, but then its demands are booked
+        if why_not and not verdict.booked:
+            verdict.failed.extend((ticket, TurnedDown(why_not)) for ticket, _ in verdict.unapproved)
+            verdict.unapproved.clear()
+        return verdict
+
+    def drop(self, answered: Iterable[tuple[Ticket, object]]) -> None:
+        gone = [ticket for ticket, _ in answered]
+        self.tickets = [ticket for ticket in self.tickets if ticket not in gone]
+
+    def wait_for(self, left: Decided) -> None:
+        self.tickets = [ticket for ticket, _ in left]
+        self.requests = [decision.request for _, decision in left]
+        self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
+
+    def goals(self) -> list[str]:
+        """Return the goals of the demands that were not withdrawn, as JSON: 1 is not true."""
+        return [json.dumps(each.goal) for each in self.tickets if each.state == "proposed"]
+
+    def requesters(self) -> set[str]:
+        return {name for request in self.requests for name in request.requesters()}
+
+
+def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
+    """Return whether a request releases all demands in ``pending``.
+
+    It has the key and a requester of one of them, and names all their subjects or is a Release.
+    """
+    requesters = {name for each in pending for name in each.requesters()}
+    if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
+        return False
+    subjects = {subject for each in pending for subject in each.subjects()}
+    return isinstance(request, Release) or subjects <= set(request.subjects())
+
+
+def key_of(request: DemandRequest) -> tuple[str, ...]:
+    """Return what tells a demand from others, whatever its content."""
+    if request.is_reference:  # the reference's goals have no demand id
+        return ("request", request.id, *sorted(request.requesters()))
+    return ("demand", request.demand)
+
+
+def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decided, Failed]:
+    """Decide each demand on the state after the previous one, with leases from approval on."""
+    written: dict[str, str | None] = {}
+    steps, failed = Decided(), Failed()
+    for ticket, decision in left:
+        request = permission.with_leases_from_approval(decision.request)
+        try:
+            step = decide(
+                state,
+                request,
+                ticket.received,
+                lambda path: written[path] if path in written else read(path),
+            )
+        except InvalidInput as error:
+            failed.append((ticket, error))
+            continue
+        state = step.state
+        written.update(step.files)
+        steps.append((ticket, step))
+    return steps, failed
+
+
+def is_release(goal: object) -> bool:
+    """Return whether a goal, as plain data, is a shutdown or the release of a demand."""
+    fields = goal if isinstance(goal, dict) else {}
+    return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
+
+
+def admit_or_none(state: State, goal: object) -> DemandRequest | None:
+    try:
+        return admit(state, goal)
+    except InvalidInput:
+        return None
+
+
+def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
+    branch_and_link = f"{branch} {link}" if link else branch
+    why = ", ".join(reasons)
+    return one_line(f"{_PREFIX}{branch_and_link}" + (f" (required by {why})" if why else ""))
+
+
+def parse_waiting_text(text: str) -> dict[str, str]:
+    """Return ``branch`` and ``link`` from a :func:`waiting_text`; the link may be empty."""
+    branch, _, rest = text.removeprefix(_PREFIX).partition(" ")
+    link = rest.split(" ")[0] if rest.startswith("http") else ""
+    return {"branch": branch, "link": link}
+
+
+def pull_request_texts(message: str) -> tuple[str, str]:
+    # Requesters choose the ids in the message. Outside of a code block, an id could become a link.
+    title, fence = message.partition("\n")[0], _fence(message, 3)
+    return title, (
+        f"{_head(message)} Merging approves the demand; closing this pull request or deleting the "
+        f"branch rejects the demand.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
+    )
+
+
+def push_options(message: str, labels: Iterable[str]) -> list[str]:
+    # GitLab opens a merge request for these; an option of git is one line
+    title = message.partition("\n")[0]
+    why = next((line for line in message.splitlines() if line.startswith("Why: ")), "")
+    description = (
+        f"{_head(message)} {code(why)} Merging approves the demand; deleting the branch rejects "
+        "the demand."
+    )
+    return [
+        "merge_request.create",
+        f"merge_request.target={MAIN_BRANCH}",
+        f"merge_request.title={title}",
+        f"merge_request.description={description}",
+        "merge_request.remove_source_branch",
+        *(f"merge_request.label={label}" for label in labels),
+    ]
+
+
+def _head(message: str) -> str:
+    trailers = commit_log.parse(message).trailers
+    reasons = ", ".join(trailers.get(commit_log.REQUIRED_BY, ()))
+    changed = "".join(
+        f"This has changed: it replaces {old}, and no approval of that counts here. "
+        for old in trailers.get(commit_log.REPLACES, ())
+    )
+    why = code(reasons) if reasons else "an access policy"
+    return f"{changed}This demand needs approval, as required by {why}."
+
+
+def code(text: str) -> str:
+    """Return text from outside as code in one line of Markdown."""
+    fence = _fence(text, 1)
+    return f"{fence} {harmless(one_line(text))} {fence}"
+
+
+def _fence(text: str, shortest: int) -> str:
+    """Return at least ``shortest`` backticks, and more than ``text`` has in a row."""
+    return "`" * max([shortest, *(len(run) + 1 for run in re.findall(r"`+", text))])

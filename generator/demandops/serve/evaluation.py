@@ -1,0 +1,145 @@
+"""Evaluates one demand on top of the commits of its batch.
+
+A demand that fails gets the error as its answer. The other demands of the batch continue.
+"""
+
+from __future__ import annotations
+
+import logging
+from math import inf
+
+from demandops.base.errors import DemandOpsError, InvalidInput, Refused, Withdrawn, fault, internal
+from demandops.decide.decision import Decision, Outcome, decide
+from demandops.model.demand.demand_request import Decommission
+from demandops.repo.git.repository import StateRepository, disk_error
+from demandops.repo.git.signing import SigningFailed
+from demandops.repo.history.commit_log import operations_since
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.serve import rollback_goal
+from demandops.serve.approvals.approvals import Approvals, Result
+from demandops.serve.approvals.proposal import is_release
+from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
+from demandops.serve.queue import Receipt, Ticket, receipt_of
+from demandops.serve.rollout_targets import targets_of_decision
+from demandops.serve.timing.limits import RateLimit, within
+from demandops.templating.evaluator import DEMAND_S, processor_time
+
+log = logging.getLogger("demandops")
+
+
+class Evaluator:
+    def __init__(
+        self,
+        repository: StateRepository,
+        demands: Demands,
+        approvals: Approvals,
+        with_targets: bool,
+    ) -> None:
+        self._repository, self._demands, self._approvals = repository, demands, approvals
+        self._with_targets = with_targets
+        self._rate_limit = RateLimit()
+
+    def evaluate(self, commits: CommitBatch, ticket: Ticket) -> Receipt | DemandOpsError | Decision:
+        """Decide a demand, commit it on the commit batch and return its result.
+
+        A demand that needs approval gets no commit; its result is the decision. A receipt is true
+        only once the commit batch is published. Unavailable, PushDenied and Unsound are raised:
+        they concern all demands.
+        """
+        if ticket.state == "withdrawn":
+            return Withdrawn(TAKEN_BACK)
+        try:
+            goal = ticket.goal
+            if rollback_goal.is_rollback(goal):
+                goal = rollback_goal.to_restoration(goal, self._repository, commits.start)
+            state = commits.head.state
+            # of all services, once for each configuration; that is not this demand's work
+            state.usage()
+            state.names()
+            adds_claims = (
+                isinstance(goal, dict) and not is_release(goal) and not Decommission.is_goal(goal)
+            )
+            # what was booked must be released or restored, however long all of it takes
+            with processor_time(each=DEMAND_S, together=DEMAND_S if adds_claims else inf):
+                decision = decide(
+                    state,
+                    goal,
+                    ticket.received,
+                    commits.read,
+                    lambda stage: ticket.notify(stage, stage),
+                    lambda request, config: self._rate_limit.faults(
+                        request, config, ticket.operation, ticket.received
+                    ),
+                    within(state.config.repo_settings.limits, self._repository.runtime),
+                )
+            if decision.approval:
+                return decision
+            # from here on the demand can no longer be taken back
+            if not self._demands.commit(ticket):
+                return Withdrawn(TAKEN_BACK)
+            self._approvals.withdraw_replaced(decision.request)
+            before = commits.head.state
+            targets = targets_of_decision(before, decision) if self._with_targets else ()
+            if decision.outcome == "waiting":
+                ticket.notify("waiting", f"waiting for room: {'; '.join(decision.warnings)}")
+            if decision.files:
+                now = self._repository.runtime.now()
+                commit = commits.commit(decision, ticket.operation, ticket.received, now)
+                ticket.notify("committed", f"committed {commit}")
+            else:
+                waits = decision.outcome == "waiting"  # the demand waited already
+                commits.record_in_next_commit(ticket.operation, "waiting" if waits else "unchanged")
+                commit = str(commits.head.commit)
+            return receipt_of(ticket, decision, commit, targets)
+        except InvalidInput as error:
+            if ticket.has_released:  # the demand released a proposal, which had no claims yet
+                commits.record_in_next_commit(ticket.operation, "released")
+                commit = str(commits.head.commit)
+                return Receipt(ticket.operation, ticket.name, "released", commit)
+            commits.record_in_next_commit(ticket.operation, "refused")
+            return error
+        except SigningFailed as error:
+            return error
+        except Exception as error:  # a bug that one demand triggers must not stop the others
+            reason = disk_error(error, self._repository.address)
+            if reason is not None:  # the state repo fails, so no demand can be evaluated
+                raise reason from None
+            log.exception("internal error while evaluating demand %s", ticket.operation)
+            return internal(error)
+
+    def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
+        """Return the results, oldest first, of the unanswered demands that main records already.
+
+        They have no answer because the process or the connection ended after the remote accepted
+        the push, or because an fsync failed.
+        """
+        sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
+        bases = dict.fromkeys(ticket.base for ticket in sought.values())
+        histories = [
+            (base, operations_since(self._repository.objects, tip, base)) for base in bases
+        ]
+        # all bases are ancestors of the tip, so the most outcomes are those since the oldest base
+        since, recorded = max(histories, key=lambda history: len(history[1]), default=("", {}))
+        published = [operation for operation in reversed(recorded) if operation in sought]
+        if published:
+            # after a failed fsync only files that are written anew are sure to be on the disk
+            self._repository.write_anew(since)
+        for operation in sought.keys() - published:
+            sought[operation].base = tip  # the next search begins here
+        results = list[Result]()
+        for ticket in (sought[operation] for operation in published):
+            record = recorded[ticket.operation]
+            if record.outcome == "refused":
+                message = "the demand was refused, but the reason was lost; send the demand again"
+                results.append((ticket, Refused([fault("", message, code="refused")])))
+                continue
+            outcome: Outcome = "booked"
+            if record.outcome != "changed":
+                outcome = record.outcome
+            elif rollback_goal.is_rollback(ticket.goal):
+                outcome = "restored"
+            elif is_release(ticket.goal) or Decommission.is_goal(ticket.goal):
+                outcome = "released"
+            receipt = Receipt(ticket.operation, ticket.name, outcome, record.commit)
+            results.append((ticket, receipt))
+        return results

@@ -1,0 +1,256 @@
+"""The generator: accepts demands from any thread and runs the worker thread."""
+
+from __future__ import annotations
+
+import json
+import logging
+import re
+from collections.abc import Callable
+from concurrent.futures import Future
+from pathlib import Path
+
+from demandops.base import settings, strict_yaml
+from demandops.base.errors import Refused, fault
+from demandops.base.runtime import REAL, Runtime
+from demandops.decide.admission import admission
+from demandops.model.config.config import Config
+from demandops.repo.git.open_repository import connect
+from demandops.repo.git.repository import access_error, reading
+from demandops.repo.git.signing import Signer
+from demandops.repo.history import revisions
+from demandops.repo.load import state_in_effect
+from demandops.repo.load.snapshot import Progress, Snapshot
+from demandops.repo.write.journal import Slot
+from demandops.serve.approvals.approvals import Approvals
+from demandops.serve.demand_lifecycle import Demands
+from demandops.serve.queue import Listener, Ticket
+from demandops.serve.status import RemoteStatus
+from demandops.serve.timing.timers import Heartbeat
+from demandops.serve.worker import Worker
+
+log = logging.getLogger("demandops")
+
+_STOP_TIMEOUT_S = 5.0
+# How much longer a stop waits for the threads; a running call of git or ssh-keygen ends in it.
+_GRACE_S = 5.0
+_OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
+
+
+class Generator:
+    """Turns demands into commits of one state repo; any thread may call all its methods."""
+
+    def __init__(  # noqa: PLR0913 - each is a setting of its own
+        self,
+        state_repo: str,
+        *,
+        data: Path | None = None,
+        queue_limit: int = settings.QUEUE_LIMIT,
+        # None is for a single client: without a limit, and all demands keep their order.
+        requester_limit: int | None = settings.REQUESTER_QUEUE_LIMIT,
+        start_offline: bool = True,
+        # Whether receipts list the releases that a demand needs or removes.
+        with_targets: bool = False,
+        # Seconds between two fetches while no demand arrives; 0 means none at an interval. A
+        # repository on this disk is checked each second, with 0 each minute.
+        fetch_interval: float = 0.0,
+        signing_key: Path | None = None,
+        progress: Progress = lambda done, total: None,
+        runtime: Runtime = REAL,
+    ) -> None:
+        """Open the state repo, start the worker and resume the demands in the journal.
+
+        StateRepoError or InvalidInput is raised if the state repo, the key or the journal cannot be
+        used, and Unsound if a disk failed.
+        """
+        heartbeat = Heartbeat(settings.alive_file())
+        signer = Signer(signing_key) if signing_key else None
+        try:
+            self._slot = Slot(data or settings.data_home(state_repo))
+        except OSError as error:
+            raise access_error(error, f"the data folder of {state_repo}") from None
+        try:
+            repository = connect(
+                state_repo, self._slot.folder, log.info, allow_offline=start_offline
+            )
+            repository.signer, repository.runtime = signer, runtime
+            try:
+                snapshot = state_in_effect.first_snapshot(repository, progress)
+            except Exception:  # a power cut may have damaged the clone, which is only a copy
+                if not repository.renew_if_damaged():
+                    raise
+                snapshot = state_in_effect.first_snapshot(repository, progress)
+        except BaseException as error:
+            self._slot.close()
+            if isinstance(error, Exception):
+                raise access_error(error, state_repo) from None
+            raise
+        self._repository, self._runtime = repository, runtime
+        self.address = repository.address
+        self._demands = Demands(self._slot.journal, queue_limit, requester_limit, runtime)
+        token_file = settings.forge_token_file()
+        self._worker = Worker(
+            repository,
+            snapshot,
+            self._demands,
+            Approvals(repository, snapshot.state, self._demands, with_targets, token_file),
+            with_targets,
+            fetch_interval,
+            heartbeat,
+        )
+        self._finished: Future[bool] | None = None
+        self._stop_lock = runtime.lock()
+        for operation in self.operations:
+            log.info("resuming demand %s from the journal", operation)
+        self._threads = [
+            runtime.keep_running("writer", self._worker.run),
+            runtime.keep_running("journal", self._demands.journal_arrivals),
+        ]
+
+    @property
+    def snapshot(self) -> Snapshot:
+        return self._worker.snapshot
+
+    def snapshot_at(self, revision: str) -> Snapshot:
+        """Return the state in effect at a commit or a time, without a fetch; this may take seconds.
+
+        Raises:
+            InvalidInput, StateRepoError: if there is no such commit, or it has files that are not
+                valid and that no generator has quarantined.
+        """
+        objects = self._repository.reopened()  # as libgit2's objects belong to one thread
+        tip, now = self.snapshot.commit, self._runtime.now()
+        with reading(self.address, objects):
+            commit = revisions.resolve(objects, tip, revision, now)
+            return state_in_effect.snapshot_at(objects, commit.id)
+
+    @property
+    def remote_status(self) -> RemoteStatus:
+        return self._worker.remote.status
+
+    @property
+    def unpublished(self) -> int:
+        return self._demands.unpublished
+
+    @property
+    def operations(self) -> tuple[str, ...]:
+        return self._demands.operations
+
+    @property
+    def failures(self) -> dict[str, str]:
+        return self._runtime.failures
+
+    def fetch_now(self) -> None:
+        self._worker.fetch_now()
+
+    def submit(
+        self,
+        goal: object,
+        operation: str | None = None,
+        listener: Listener = lambda stage, text: None,
+    ) -> Ticket:
+        """Queue a demand and return its ticket at once.
+
+        Every error of the demand is in the ticket's future. One that was not accepted has
+        ``ShuttingDown``, ``QueueFull``, ``Refused`` or ``StateRepoError``, and its listener is not
+        called. If the generator ends before the demand is published or approved, the error is
+        ``ShuttingDown`` or ``Unsound``, and the next start resumes the demand.
+
+        ``operation`` is an id that no other demand ever had; without one, an id is generated.
+        ValueError is raised if its characters are not allowed. ``listener`` is called in the worker
+        thread.
+        """
+        operation = operation or self._runtime.fresh_id()
+        if not _OPERATION.fullmatch(operation):
+            message = f"{operation!r} is not an operation id; use at most 100 letters, digits, "
+            message += "dashes, dots and underscores"
+            raise ValueError(message)
+        ticket = Ticket(operation, goal, self._runtime.now(), listener)
+        try:
+            # exactly what a restart would read from the journal, so that it decides the same
+            ticket.goal = json.loads(json.dumps(goal))
+            is_deep = _is_deeper(ticket.goal, strict_yaml.MAX_DEPTH)
+        except (TypeError, ValueError, RecursionError):
+            is_deep = True
+        if is_deep:
+            message = f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} "
+            message += "deep; give only text, numbers, true, false, null, lists and mappings"
+            ticket.refuse(Refused([fault("", message)]))
+            return ticket
+        # here, so that a huge goal is not journaled, and does not wait in the queue
+        limits = self.snapshot.state.config.repo_settings.limits
+        if large := list(admission.length_faults(ticket.goal, limits)):
+            ticket.refuse(Refused(large))
+            return ticket
+        ticket.base = str(self.snapshot.commit)
+        self._demands.arrive(ticket)
+        return ticket
+
+    def includes(self, commit: str, other: str) -> bool:
+        """Return whether ``other`` is ``commit`` or an ancestor; false if either is unknown."""
+        return self._repository.includes(commit, other)
+
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Return whether ``path`` exists in two known commits with equal content."""
+        return self._repository.unchanged(commit, other, path)
+
+    def changes_since(self, since: str) -> tuple[str, list[str] | None]:
+        """Return the newest published commit, and the paths that changed from ``since`` to it.
+
+        The paths are None if the commit ``since`` is unknown.
+        """
+        commit = str(self.snapshot.commit)
+        return commit, self._repository.changed_paths(since, commit)
+
+    def withdraw(self, operation: str) -> bool:
+        """Withdraw a demand that is not committed or answered; return whether it is withdrawn."""
+        return self._demands.withdraw(operation)
+
+    def on_publish(self, listener: Callable[[Config], None]) -> None:
+        """Have the worker call a listener, which must return at once, after each publication."""
+        self._worker.listeners.append(listener)
+
+    def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
+        """Refuse further demands, finish the queued ones and stop; return at once.
+
+        After ``timeout`` seconds, demands that are unpublished or await approval stay in the
+        journal for the next start, and their futures raise ``ShuttingDown``. Only the timeout of
+        the first call counts.
+
+        The future returns whether everything was published, apart from demands that await approval.
+        It returns false if the threads have not ended :data:`_GRACE_S` after the timeout.
+        """
+        with self._stop_lock:
+            if self._finished is not None:
+                return self._finished
+            self._finished = finished = Future[bool]()
+        self._demands.close()
+
+        def end() -> None:
+            if not self._have_ended(timeout):
+                self._worker.end_soon()
+            if not self._have_ended(_GRACE_S):  # a thread may still hold locks
+                log.error("the generator did not end; its demands stay in the journal")
+                finished.set_result(False)
+                return
+            unpublished = self._demands.unpublished
+            self._slot.close()
+            finished.set_result(not unpublished)
+
+        self._runtime.start_thread("stop", end)
+        return finished
+
+    def _have_ended(self, timeout: float) -> bool:
+        end = self._runtime.monotonic() + timeout
+        for thread in self._threads:
+            thread.join(max(0.0, end - self._runtime.monotonic()))
+        return not any(thread.is_alive() for thread in self._threads)
+
+    def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
+        return self.stop(timeout).result()
+
+
+def _is_deeper(value: object, levels: int) -> bool:
+    if not isinstance(value, dict | list):
+        return False
+    parts = value.values() if isinstance(value, dict) else value
+    return levels == 0 or any(_is_deeper(part, levels - 1) for part in parts)

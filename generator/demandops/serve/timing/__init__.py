@@ -1,0 +1,1 @@
+"""What the worker does when nobody demands anything, and when."""

@@ -1,0 +1,177 @@
+"""The delay until the next attempt to publish, and how many demands to publish at once.
+
+There are two kinds of delays: after another writer published first, and while the remote cannot be
+reached. Both kinds are jittered and bounded, so no writer starves, and the writers do not flood a
+remote that comes back.
+"""
+
+from __future__ import annotations
+
+import re
+from contextlib import suppress
+from pathlib import Path
+
+from demandops.base.runtime import Runtime
+from demandops.model.config.base_model import seconds_of
+
+FIRST_PAUSE_S = 0.05
+# While the remote cannot be reached.
+LONGEST_AWAY_S = 10.0
+# After another writer published first; a writer that waits longer loses again to the others.
+LONGEST_TURN_S = 0.4
+# The most demands to publish together. A push takes about 50 ms, but moving a branch of a
+# repository on this disk takes less than 1 ms.
+LIMIT_LOCAL = 20
+LIMIT_REMOTE = 200
+
+# After this time, what was evaluated of a batch is published, and the other demands go back to the
+# queue. There, requesters take turns, so a demand that arrived meanwhile may come first. So it
+# waits for this time and for one decision, which has a limit too (limits.decisionMilliseconds).
+LONGEST_EVALUATION_S = 0.25
+
+
+class Backoff:
+    def __init__(self, limit: int, runtime: Runtime) -> None:
+        self._limit, self._runtime = limit, runtime
+        self.published()
+
+    def published(self) -> None:
+        """Reset the delays and ``max_demands``, because commits were published."""
+        self.max_demands = self._limit
+        self._turn = self._away = FIRST_PAUSE_S
+
+    def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
+        """Return the seconds to wait if another writer published first; adjust ``max_demands``.
+
+        ``size`` counts the demands that the attempt tried to publish, and ``evaluating_s`` the
+        seconds until it had decided and committed them. ``pushing_s`` goes on until the rejection
+        of the push.
+        """
+        # a writer that evaluates for longer than its push takes always loses to faster writers
+        self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
+        wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
+        self._away = FIRST_PAUSE_S
+        return self._jittered(wait)
+
+    def unreachable(self) -> float:
+        """Return the seconds to wait after the remote could not be reached."""
+        wait, self._away = self._away, min(self._away * 2, LONGEST_AWAY_S)
+        return self._jittered(wait)
+
+    def _jittered(self, seconds: float) -> float:
+        return seconds * self._runtime.uniform(0.5, 1.0)
+
+
+# ---- a pause after an error: the worker does not fetch, but still publishes demands ----
+
+FIRST_S, LONGEST_S = 1.0, 60.0
+
+
+class Rest:
+    """A pause after an error; each further error doubles it until a success."""
+
+    def __init__(self, runtime: Runtime) -> None:
+        self._runtime = runtime
+        self._next, self._until = FIRST_S, runtime.monotonic()
+
+    def __bool__(self) -> bool:
+        return self._runtime.monotonic() < self._until
+
+    @property
+    def follows_success(self) -> bool:
+        return self._next == FIRST_S
+
+    def seconds_left(self) -> float:
+        return self._until - self._runtime.monotonic()
+
+    def begin(self) -> None:
+        self._until = self._runtime.monotonic() + self._next
+        self._next = min(2 * self._next, LONGEST_S)
+
+    def succeeded(self) -> None:
+        self._next = FIRST_S
+
+
+# ---- when to fetch from the state repo while no demand comes ----
+#
+# This module does not fetch; the caller fetches, and reports the end of each fetch.
+
+DEFAULT_INTERVAL = "30s"
+_LONGEST_BACKOFF_S = 60.0
+# A Git server may report many pushes at once; they share a fetch.
+_SHORTEST_GAP_S = 0.5
+# The longest interval for a repository on this disk, where a check is cheap: it reads one file.
+_LOCAL_S = 1.0
+
+
+def parse_interval(text: str) -> float:
+    """Return an interval in seconds, from a duration like ``30s`` or a number of seconds.
+
+    ValueError is raised if the text is neither of them.
+    """
+    if re.fullmatch(r"[0-9]{1,8}(\.[0-9]{1,6})?", text):
+        return float(text)
+    return float(seconds_of(text))
+
+
+class PollTimer:
+    """Decides when to fetch: on request, and at an interval that grows while fetches fail.
+
+    Any thread may call :meth:`request`. Only one thread may call the other methods.
+    """
+
+    def __init__(self, interval: float, runtime: Runtime, *, local: bool = False) -> None:
+        """Start the timer. With an interval of 0, only :meth:`request` makes a fetch due."""
+        self._interval = min(interval, _LOCAL_S) if local else interval
+        self._runtime = runtime
+        self._pause = self._interval
+        self._last = runtime.monotonic() - _SHORTEST_GAP_S
+        self._next = runtime.monotonic() if interval else None
+        self._requested = runtime.event()
+
+    def request(self) -> None:
+        """Make a fetch due now, or half a second after the last one, if that is later."""
+        self._requested.set()
+
+    def seconds_until_due(self) -> float | None:
+        times = [] if self._next is None else [self._next]
+        if self._requested.is_set():
+            times.append(self._last + _SHORTEST_GAP_S)
+        return max(min(times) - self._runtime.monotonic(), 0.0) if times else None
+
+    def start_if_due(self) -> bool:
+        due = self.seconds_until_due() == 0.0
+        if due:  # clear before the fetch: a later push needs another one
+            self._requested.clear()
+        return due
+
+    def finished(self, *, reached: bool) -> None:
+        """Plan the next fetch after a fetch or a push, which both tell of others' commits."""
+        longest = max(_LONGEST_BACKOFF_S, self._interval)
+        self._last = self._runtime.monotonic()
+        if self._next is not None:
+            self._pause = self._interval if reached else min(self._pause * 2, longest)
+            # a little less at random, so that generators do not fetch all at once
+            self._next = self._last + self._pause * self._runtime.uniform(0.8, 1.0)
+
+
+# ---- shows a supervisor, such as a pod's liveness probe, that the worker is not stuck ----
+
+
+class Heartbeat:
+    """Touches a file in each turn of the worker and at each wait for git."""
+
+    # So the file grows old only if the worker is stuck, and not because a remote is away.
+
+    def __init__(self, file: Path | None) -> None:
+        self._file = file
+        # an earlier process may have left one; until the first turn there is none, because a start
+        # may have to clone for long
+        if file is not None:
+            with suppress(OSError):
+                file.unlink()
+
+    def __call__(self) -> None:
+        if self._file is not None:
+            with suppress(OSError):
+                self._file.touch()

@@ -1,0 +1,426 @@
+"""The worker: follows the state repo, and publishes the demands as commits.
+
+The worker runs in one thread, the only one that writes to the state repo. Demands go first, so a
+fetch stops when a demand arrives. The push of the demand finds new commits just as the fetch would.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+
+from demandops.base.errors import (
+    DemandOpsError,
+    ShuttingDown,
+    StateRepoError,
+    Unsound,
+    Withdrawn,
+    internal,
+)
+from demandops.decide.decision import Decision
+from demandops.model.config.config import Config
+from demandops.repo.git.repository import (
+    FetchInterrupted,
+    PushDenied,
+    StateRepository,
+    Unavailable,
+    access_error,
+)
+from demandops.repo.load.snapshot import ReadAhead, Snapshot
+from demandops.repo.write.commit_batch import CommitBatch
+from demandops.serve.approvals.approvals import Approvals, Result
+from demandops.serve.demand_lifecycle import Demands
+from demandops.serve.evaluation import Evaluator
+from demandops.serve.queue import Ticket
+from demandops.serve.status import FaultLog, RemoteMonitor
+from demandops.serve.timing.limits import may_take_long
+from demandops.serve.timing.own_work import LONGEST_WAIT_S, LeaseExpiry, OwnWork
+from demandops.serve.timing.timers import (
+    LIMIT_LOCAL,
+    LIMIT_REMOTE,
+    LONGEST_EVALUATION_S,
+    Backoff,
+    Heartbeat,
+    PollTimer,
+    Rest,
+)
+from demandops.templating.evaluator import DEMAND_S, processor_time
+
+log = logging.getLogger("demandops")
+
+# How many new Git packs to collect before git joins them; each publication or fetch adds one.
+_TIDY_EVERY = 50
+# How often to carry out a change by a person while other generators, which do the same, are faster.
+_TRIES = 5
+_LONGEST_PAUSE_S = 0.05
+# The thread's name, under which a health check reports its failure.
+_NAME = "writer"
+
+
+class Worker:
+    """Follows the state repo and turns batches of demands into published commits.
+
+    Any thread may read ``remote`` and ``snapshot`` (the newest published state).
+    """
+
+    def __init__(
+        self,
+        repository: StateRepository,
+        snapshot: Snapshot,
+        demands: Demands,
+        approvals: Approvals,
+        with_targets: bool,
+        fetch_interval: float,
+        heartbeat: Heartbeat,
+    ) -> None:
+        self.snapshot = snapshot
+        self.listeners: list[Callable[[Config], None]] = []
+        self.remote = RemoteMonitor(repository.address, repository.runtime)
+        self._repository, self._demands, self._approvals = repository, demands, approvals
+        self._runtime = repository.runtime
+        self._heartbeat = repository.while_waiting = heartbeat
+        self._evaluator = Evaluator(repository, demands, approvals, with_targets)
+        self._timer = PollTimer(fetch_interval, repository.runtime, local=repository.always_current)
+        self._lease_expiry = LeaseExpiry(repository.runtime)
+        self._own_work = OwnWork(repository.runtime)
+        self._ahead = ReadAhead()
+        self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
+        self._must_fetch = self._tip_is_fresh = False
+        self._packs_since_tidy = 0
+        self._log = FaultLog(repository)
+        self._ends_soon = self._runtime.event()
+        self._rest = Rest(repository.runtime)
+        self._log.warn_if_unsigned(snapshot)
+
+    # ---- from any thread ----
+
+    def fetch_now(self) -> None:
+        """Have the worker fetch as soon as no demand is queued, even if no fetch is due."""
+        self._timer.request()
+        self._demands.wake()
+
+    def end_soon(self) -> None:
+        """End a running transfer and begin no other; what is unpublished stays in the journal."""
+        self._ends_soon.set()
+        self._repository.abort()
+        self._demands.wake()
+
+    # ---- the loop ----
+
+    def run(self) -> None:
+        with processor_time(each=DEMAND_S, meanwhile=self._heartbeat):
+            # people may have decided about proposals before the start: answer these demands first
+            if self._demands.proposed:
+                self._work()
+            while self._demands.wait(self._seconds_until_due()):
+                self._heartbeat()
+                self._work()
+        self._approvals.suspend()
+
+    def _work(self) -> None:
+        batch: list[Ticket] = []
+        try:
+            # demands before fetches: the push of a demand finds new commits just as a fetch would
+            self._demands.take(batch, self._batch_limit)
+            if batch or self._ended_leases(self.snapshot):
+                self._publish(batch)
+                if self.snapshot.problems:  # after a release, an invalid change may be valid
+                    self._try_to_carry_out_changes()
+            elif not self._rest:
+                self._follow()
+            if self._packs_since_tidy >= _TIDY_EVERY:
+                self._packs_since_tidy = 0
+                self._repository.tidy()
+            if not self._rest:
+                self._check_proposals()
+        except Exception as error:
+            self._fail(
+                batch, access_error(error, self._repository.address, self._repository.objects)
+            )
+        else:
+            if not self._rest:
+                self._rest.succeeded()
+                self._runtime.recovered(_NAME)
+
+    def _fail(self, batch: list[Ticket], error: Exception) -> None:
+        if isinstance(error, Unsound):  # the process must end; the next one reads the journal
+            self._demands.end(error)
+            raise error
+        if isinstance(error, ShuttingDown):
+            self._demands.fail(batch, error, keep=True)
+            return
+        # an expected error is in the answers to the demands, so only other errors are recorded
+        if not batch or not isinstance(error, DemandOpsError):
+            self._runtime.failed(_NAME, error)
+        if not batch:
+            # not at each failure in a row, because git then reads all objects
+            if self._rest.follows_success:
+                try:
+                    self._repository.renew_if_damaged()
+                except StateRepoError as damage:
+                    log.warning("%s", damage)
+            self._rest.begin()
+            self._timer.finished(reached=False)
+        if not isinstance(error, DemandOpsError):
+            error = internal(error)
+        self._demands.fail(batch, error)
+
+    def _seconds_until_due(self) -> float:
+        if self._rest:
+            return self._rest.seconds_left()
+        state, tip = self.snapshot.state, str(self.snapshot.commit)
+        seconds = self._approvals.seconds_until_due(tip, LONGEST_WAIT_S)
+        seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
+        seconds = self._own_work.seconds_until_due(state, seconds)
+        fetch = self._timer.seconds_until_due()
+        return seconds if fetch is None else min(seconds, fetch)
+
+    # ---- publishing demands ----
+
+    def _publish(self, batch: list[Ticket]) -> None:
+        """Publish a batch, the demands that arrive during retries, and the ends of leases.
+
+        The batch is empty afterwards; demands that there was no time to evaluate are queued again.
+        If an error is raised, the demands are still in the batch.
+        """
+        self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
+        backoff = Backoff(self._batch_limit, self._runtime)
+        while batch or self._ended_leases(self.snapshot):
+            self._heartbeat()
+            self._require_not_ending()
+            try:
+                wait = self._attempt(batch, backoff)
+            except Exception as failure:
+                reason = access_error(failure, self._repository.address, self._repository.objects)
+                if isinstance(reason, PushDenied):
+                    self.remote.record_push_denied(str(reason))
+                if not isinstance(reason, Unavailable):
+                    raise reason from None
+                # the connection may have ended after the remote accepted the push
+                for ticket in batch:
+                    ticket.mark_maybe_published(str(self.snapshot.commit))
+                self._record_unreachable(reason)
+                self._tip_is_fresh = self._repository.always_current
+                wait = backoff.unreachable()
+            if wait is None:
+                continue
+            # wait before the fetch, not after it, because the push must follow the fetch closely
+            self._wait_to_retry(batch, wait)
+            self._require_not_ending()
+            self._demands.take(batch, self._batch_limit)
+
+    def _require_not_ending(self) -> None:
+        if self._ends_soon.is_set():
+            reason = self._demands.blocked or "the generator stops"
+            raise ShuttingDown(
+                f"{reason}; the demand stays in the journal and is resumed at the next start"
+            )
+
+    def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
+        """Evaluate and publish a part of a batch.
+
+        Return the seconds to wait before the next attempt, or None to continue at once.
+        """
+        # fetch before a demand is committed, because after that it can no longer be withdrawn
+        if self._must_fetch or self.remote.status.unreachable:
+            self._repository.refresh()
+            self._must_fetch, self._tip_is_fresh = False, True
+        self._demands.answer_withdrawn(batch)
+        tip = self._repository.tip()
+        results = self._evaluator.published_before(str(tip), batch)
+        published = {ticket for ticket, _ in results}
+        independent = len(results)
+        left = [ticket for ticket in batch if ticket not in published]
+        part, left = left[: backoff.max_demands], left[backoff.max_demands :]
+        self._approvals.remove_released(part, self.snapshot.state)
+        commits = self._new_commit_batch()
+        # a person may have written to a repository on this disk since the tip was read, and the
+        # search for published demands and the deletion of released branches hold only for that tip
+        if commits.start.commit != tip:
+            return None
+        began = self._runtime.monotonic()
+        for number, ticket in enumerate(part):
+            self._require_not_ending()
+            is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
+            if number and (is_late or may_take_long(ticket.goal)):
+                part, left = part[:number], part[number:] + left
+                break
+            self._approvals.withdraw_released(results, ticket, commits.head.state)
+            results.append(self._evaluated(commits, ticket))
+            if commits.is_empty:
+                independent = len(results)
+        # leases end last, because a demand that is still left may renew one
+        if not left:
+            for ticket in self._ended_leases(commits.head)[: backoff.max_demands - len(part)]:
+                results.append(self._evaluated(commits, ticket))
+                if self._runtime.monotonic() - began > LONGEST_EVALUATION_S:
+                    break
+        evaluated = self._runtime.monotonic()
+        if commits.is_empty and not self._tip_is_fresh:
+            # nothing to push, so only a fetch shows whether the remote has moved
+            self._tip_is_fresh = True
+            if self._repository.refresh() != commits.start.commit:
+                return None
+        if self._publish_commits(commits, results, independent):
+            batch[:] = left
+            self._demands.put_back(batch, [ticket for ticket, _ in results])
+            backoff.published()
+            return None
+        log.info("another writer was first; evaluating %d demands again", len(results))
+        for ticket in part:
+            ticket.mark_maybe_published(str(commits.start.commit))
+        self._must_fetch = True
+        return backoff.overtaken(
+            len(results), evaluated - began, self._runtime.monotonic() - evaluated
+        )
+
+    def _evaluated(self, commits: CommitBatch, ticket: Ticket) -> Result:
+        self._heartbeat()
+        before = commits.head.state
+        result = ticket, self._evaluator.evaluate(commits, ticket)
+        # those that wait get the room that this demand frees before the next demand can take it
+        self._own_work.follow(commits, before)
+        return result
+
+    def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
+        """Return a ticket for each demand whose lease has ended, to release its claims."""
+        if self._rest or self._demands.has_queued:  # a queued demand may renew a lease
+            return []
+        return self._lease_expiry.tickets(snapshot.state.ledger)
+
+    def _publish_commits(
+        self, commits: CommitBatch, results: list[Result], independent: int
+    ) -> bool:
+        """Publish a commit batch and answer its demands.
+
+        Return false, without answers, if another writer was first or locks main. The first
+        ``independent`` results were decided before the batch had a commit, so they do not depend on
+        the push.
+        """
+        try:
+            published = commits.publish()
+        except PushDenied as error:
+            # a withdrawn demand gets its answer whatever the remote says
+            results[independent:] = [
+                (ticket, result if isinstance(result, Withdrawn) else error)
+                for ticket, result in results[independent:]
+            ]
+            self.remote.record_push_denied(str(error))
+        else:
+            if not published:
+                return False
+            self._record_reached(pushed=not commits.is_empty)
+            self._record_published(commits)
+        final = [(ticket, result) for ticket, result in results if not isinstance(result, Decision)]
+        self._demands.answer(final)
+        for ticket, result in results:
+            if isinstance(result, Decision):
+                self._approvals.add(ticket, result)
+        return True
+
+    def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
+        """Wait; meanwhile answer withdrawn demands, and tell the others what they wait for."""
+        end = self._runtime.monotonic() + seconds
+        to_notify = list(batch)
+        while not self._ends_soon.is_set():
+            unreachable = self.remote.status.unreachable
+            for ticket in to_notify if unreachable else ():
+                ticket.notify("away", f"waiting: {unreachable}")
+            self._demands.answer_withdrawn(batch)
+            left = end - self._runtime.monotonic()
+            if left <= 0:
+                return
+            to_notify = self._demands.new_demands(left)
+
+    # ---- following the state repo ----
+
+    def _follow(self) -> None:
+        """Fetch if a fetch is due, carry out people's changes, and do the work that is due."""
+        is_due = self._own_work.is_due(self.snapshot.state)
+        try:
+            if self._timer.start_if_due():
+                # a demand that arrives ends the fetch, because its push finds new commits too
+                self._repository.refresh(lambda: self._demands.must_not_wait)
+            # in a repository on this disk, each turn reads the tip, because that is cheap
+            elif not (self._repository.always_current or is_due):
+                return
+            new = is_due or self._repository.tip() != self.snapshot.commit
+            self._record_reached(pushed=new and self._carry_out_changes())
+        except FetchInterrupted:
+            self._timer.request()  # the fetch is still due
+        except StateRepoError as error:
+            self._record_unreachable(error)
+            self._own_work.postpone()
+
+    def _check_proposals(self) -> None:
+        if not self._approvals.is_due(str(self.snapshot.commit)):
+            return
+        try:
+            heads = self._approvals.fetch_heads()
+            if heads.main != str(self.snapshot.commit):
+                self._repository.refresh()
+                self._try_to_carry_out_changes()
+            # a deleted branch may have been merged, which only a main as new as ``heads`` shows
+            if self._repository.includes(str(self.snapshot.commit), heads.main):
+                self._approvals.check(self.snapshot, heads)
+        except (Unavailable, PushDenied) as error:
+            log.warning("%s; the demands that await approval keep waiting", error)
+
+    def _try_to_carry_out_changes(self) -> None:
+        try:
+            self._carry_out_changes()
+        except StateRepoError as error:
+            self._record_unreachable(error)
+
+    def _carry_out_changes(self) -> bool:
+        """Publish the effects of people's changes; return whether a commit was published."""
+        # the caller has fetched the changes
+        for _ in range(_TRIES):
+            commits = self._new_commit_batch()
+            if commits.publish():
+                self._record_published(commits)
+                return not commits.is_empty
+            self._repository.refresh()
+            # at random, so that generators which all saw the change do not collide again
+            self._ends_soon.wait(self._runtime.uniform(0, _LONGEST_PAUSE_S))
+        return False  # other generators are faster, and they carry out the same changes
+
+    def _new_commit_batch(self) -> CommitBatch:
+        """Return a commit batch on the newest known tip.
+
+        Its first commits render people's changes, and do the work of :class:`OwnWork` that is due.
+        """
+        tip = self._repository.tip()
+        before = self.snapshot
+        if tip == before.commit and not before.problems and before.is_rendered:
+            commits = CommitBatch(self._repository, before)
+        else:
+            advance = self._ahead.advance(self._repository.objects, before, tip)
+            commits = CommitBatch(self._repository, advance.snapshot)
+            commits.follow(advance, before, self._runtime.now())
+            self._log.log_changes(commits.head.problems)
+        self._own_work.commit_due(commits)
+        return commits
+
+    def _record_published(self, commits: CommitBatch) -> None:
+        if commits.followed:
+            log.info("%s", commits.followed)
+        before, self.snapshot = self.snapshot, commits.head
+        # also true after a person's merge that needs no commit of the generator
+        if self.snapshot.commit != before.commit:
+            self._packs_since_tidy += 1
+            self._log.warn_if_unsigned(self.snapshot)
+            for listener in self.listeners:
+                listener(self.snapshot.state.config)
+
+    def _record_reached(self, *, pushed: bool) -> None:
+        self._demands.blocked = ""
+        self.remote.record_reached(pushed=pushed)
+        self._timer.finished(reached=True)
+
+    def _record_unreachable(self, error: StateRepoError) -> None:
+        if self._ends_soon.is_set():  # there is no retry to report
+            return
+        self._demands.blocked = str(error)
+        self.remote.record_unreachable(str(error))
+        self._timer.finished(reached=False)

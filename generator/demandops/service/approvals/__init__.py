@@ -1,1 +1,0 @@
-"""Demands that wait until a person merges or rejects their branch."""

@@ -1,1 +1,0 @@
-"""When something is due: fetches, retries, ends of leases and overrides, and rate limits."""

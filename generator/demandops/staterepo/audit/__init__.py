@@ -1,1 +1,0 @@
-"""Audits commits: checks their signatures, their generated files, and which files they changed."""

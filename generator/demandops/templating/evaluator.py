@@ -1,0 +1,221 @@
+"""Computes the values of services in a child process, which can be killed.
+
+Templates, schemas and patterns that people merge may never end, or take all memory. So each is
+evaluated by a child with limits (:mod:`.child`) that knows neither the
+environment nor the open files of this process. The kernel ends a child that exceeds its limits;
+the demand is refused, and the next evaluation starts another child.
+
+A child serves one evaluation at a time. It keeps the files that it was sent, so that a demand sends
+only what changed since.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from contextvars import ContextVar
+from dataclasses import dataclass, fields
+from math import inf
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+from demandops.base import errors
+from demandops.base.errors import Fault, InvalidInput, OverLimit
+from demandops.templating.values import SchemaTask, ValuesTask
+
+log = logging.getLogger("demandops")
+
+# How many seconds of processor time the evaluations of one demand may take together. The values of
+# a service with 8,000 topics take half of it.
+DEMAND_S = 0.5
+MEMORY_MIB = 512
+_MOST_IDLE = 2  # the worker's and the page's
+_LONGEST_ANSWER = 64_000_000
+# Waiting for an answer is bounded too, in case the child is stopped. A busy machine runs it slowly.
+_LONGEST_WAIT_S = 60
+_START = (
+    "import sys, json; sys.path[:] = json.loads(sys.argv[1]); "
+    f"from demandops.evaluator import child; child.serve({MEMORY_MIB})"
+)
+
+
+@dataclass(slots=True)
+class _Limits:
+    """Seconds of processor time: for each evaluation, and left for all of them together."""
+
+    each: float
+    left: float
+    meanwhile: Callable[[], object] = lambda: None
+
+
+_limits: ContextVar[_Limits] = ContextVar("limits")
+
+
+@contextmanager
+def processor_time(
+    each: float, together: float = inf, meanwhile: Callable[[], object] = lambda: None
+) -> Iterator[None]:
+    """Limit the processor time of the evaluations in the block, in seconds.
+
+    ``meanwhile`` is called before each of them. Without a block, an evaluation may take 2 seconds.
+    """
+    token = _limits.set(_Limits(each, together, meanwhile))
+    try:
+        yield
+    finally:
+        _limits.reset(token)
+
+
+class Evaluator:
+    """Evaluates in child processes; threads may call it at the same time."""
+
+    def __init__(self) -> None:
+        self._idle: list[_Child] = []
+
+    def __call__(self, files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[str, Any]:
+        limits = _limits.get(None) or _Limits(2, inf)
+        limits.meanwhile()
+        seconds = min(limits.each, limits.left)
+        if seconds <= 0:
+            raise _over(task, "the evaluations before it took all the time of this demand")
+        while True:
+            try:
+                child, is_fresh = self._idle.pop(), False  # threads may share a list in CPython
+            except IndexError:
+                child, is_fresh = _Child(), True
+            try:
+                answer = child.answer(files, task, seconds)
+                break
+            except _Died as death:
+                # somebody may have ended an idle child, or it kept much of earlier evaluations
+                if is_fresh or death.is_late:
+                    limits.left -= seconds if death.is_late else 0
+                    raise _over(task, str(death)) from None
+            except BaseException:
+                child.kill()  # its answer was not read, so the next one would be taken for it
+                raise
+        if len(self._idle) < _MOST_IDLE:
+            self._idle.append(child)
+        else:
+            child.kill()
+        limits.left -= answer["seconds"]
+        if "faults" in answer:
+            raise InvalidInput(Fault(**fault) for fault in answer["faults"])
+        if "error" in answer:
+            raise RuntimeError(f"evaluation of {task.file} failed: {answer['error']}")
+        values: dict[str, Any] = answer["values"]
+        return values
+
+    def forget(self) -> None:
+        # without ending them, because a forked process has its parent's children here
+        self._idle = []
+
+
+def _over(task: ValuesTask | SchemaTask, reason: str) -> OverLimit:
+    message = f"{reason}; make it simpler, or its chart's values.schema.json"
+    error = OverLimit([errors.fault("", message, code="over-limit").within(task.file)])
+    log.warning("%s", error)
+    return error
+
+
+class _Died(Exception):
+    """Raised if a child ended, or was ended, before it answered, maybe for lack of time."""
+
+    def __init__(self, reason: str, *, is_late: bool = False) -> None:
+        super().__init__(reason)
+        self.is_late = is_late
+
+
+class _Child:
+    def __init__(self) -> None:
+        package = str(Path(__file__).parents[2])
+        # -S leaves out what packages run at each start; the path has all that it would add
+        self._process = subprocess.Popen(
+            [sys.executable, "-s", "-S", "-c", _START, json.dumps([package, *sys.path])],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            cwd="/",
+            env={"LC_ALL": "C.UTF-8", "PYTHONHASHSEED": "0"},
+            start_new_session=True,  # ctrl-c ends this process, which then ends the child
+        )
+        assert self._process.stdin is not None  # noqa: S101
+        os.set_blocking(self._process.stdin.fileno(), False)  # a stopped child reads nothing
+        self._files: Mapping[str, str] = MappingProxyType({})
+
+    def answer(
+        self, files: Mapping[str, str], task: ValuesTask | SchemaTask, seconds: float
+    ) -> dict[str, Any]:
+        """Return the child's answer; raise _Died if it ends or takes more than ``seconds``."""
+        changed: dict[str, str | None] = {}
+        if files is not self._files:
+            sent, self._files = self._files, files
+            changed = {path: text for path, text in files.items() if sent.get(path) != text}
+            changed |= dict.fromkeys(sent.keys() - files.keys())
+        parts = {field.name: getattr(task, field.name) for field in fields(task)}
+        question = _encoded({"files": changed, "seconds": seconds}) + _encoded(parts)
+        stdin, stdout = self._process.stdin, self._process.stdout
+        assert stdin is not None and stdout is not None  # noqa: S101 - both are pipes
+        unsent = memoryview(question)
+        with suppress(BrokenPipeError):  # the child ended, as reading will show
+            while unsent:
+                self._wait(stdin.fileno(), select.POLLOUT, seconds)
+                unsent = unsent[os.write(stdin.fileno(), unsent) :]
+        pieces, length = list[bytes](), 0
+        while not pieces or not pieces[-1].endswith(b"\n"):
+            self._wait(stdout.fileno(), select.POLLIN, seconds)
+            piece = os.read(stdout.fileno(), 1_000_000)
+            length += len(piece)
+            if length > _LONGEST_ANSWER:
+                self.kill()
+                raise _Died(f"gives more than {_LONGEST_ANSWER} characters")
+            if not piece:
+                status = self._process.wait()
+                self._close()
+                if status == -signal.SIGPROF:  # the timer that the child sets
+                    reason = f"takes more than {seconds:.3g} s of processor time"
+                    raise _Died(reason, is_late=True)
+                raise _Died(f"takes more than {MEMORY_MIB} MiB of memory, or is nested too deeply")
+            pieces.append(piece)
+        answer: dict[str, Any] = json.loads(b"".join(pieces))
+        return answer
+
+    def _wait(self, descriptor: int, event: int, seconds: float) -> None:
+        waiting = select.poll()
+        waiting.register(descriptor, event)
+        if not waiting.poll((_LONGEST_WAIT_S + 20 * seconds) * 1000):
+            self.kill()
+            raise _Died("gave no answer for a long time", is_late=True)
+
+    def kill(self) -> None:
+        self._process.kill()
+        self._process.wait()
+        self._close()
+
+    def _close(self) -> None:
+        for pipe in (self._process.stdin, self._process.stdout):
+            with suppress(OSError):  # what was not sent yet
+                if pipe:
+                    pipe.close()
+
+
+def _encoded(message: object) -> bytes:
+    def plain(value: object) -> object:
+        if isinstance(value, Mapping):
+            return dict(value)
+        raise TypeError(f"a {type(value).__name__} cannot be sent to a child")
+
+    # ASCII has an escape for what UTF-8 cannot encode; there are no line breaks within JSON
+    return json.dumps(message, default=plain).encode("ascii") + b"\n"
+
+
+EVALUATE = Evaluator()
+os.register_at_fork(after_in_child=EVALUATE.forget)

@@ -1,0 +1,306 @@
+"""Bookkeeping: who requests each service, connection and topic, and what each demand holds.
+
+The paper shows the bookkeeping in Table III, column 4. The bookkeeping is derived from the claims
+whenever it is shown, and is stored nowhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, TypeAlias
+
+from demandops.base.naming import Subject, SubjectKind
+from demandops.decide.placement.capacity import whole_usage
+from demandops.decide.planning.overrides import suspended_claims, without_suspended
+from demandops.decide.planning.planner import connection_topics, demanded_inputs
+from demandops.model.config.inventory import amount_text
+from demandops.model.demand.claim import Claim, requesters_of
+from demandops.model.ledger.ledger import World
+from demandops.model.ledger.records import in_turn
+from demandops.model.release import ServiceRelease, claims_of
+from demandops.views import release_causes
+
+_LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
+# Topic → the requesters of the topic, sorted.
+_Requesters: TypeAlias = dict[str, list[str]]
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceEntry:
+    """One running service and its requesters.
+
+    ``inputs`` maps each input role to its topics, and each topic to its requesters. ``version`` is
+    the version of the service's chart. ``application_version`` is the version of the application in
+    ``registry/versions.yaml``, or ``None``. ``versions_asked`` maps each version that a demand
+    names to the requesters of such demands.
+    """
+
+    applications: list[str]
+    service: str
+    node: str
+    source: str | None
+    source_topic: str | None
+    version: str
+    application_version: str | None
+    versions_asked: dict[str, list[str]]
+    parameters: dict[str, object]
+    inputs: dict[str, _Requesters]
+    requesters: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectionEntry:
+    """One connection and its requesters, also those of each source topic."""
+
+    type: str
+    source: str
+    target: str
+    topics: _Requesters
+    requesters: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class SuspendedEntry:
+    kind: str
+    id: str
+    demand: str
+    requesters: list[str]
+    override: str
+    reason: str
+
+
+@dataclass(frozen=True, slots=True)
+class WaitingEntry:
+    demand: str
+    requesters: list[str]
+    since: str
+    priority: int
+
+
+@dataclass(frozen=True, slots=True)
+class ResourceEntry:
+    """What services request of a node's resource, and the capacity, as Kubernetes quantities."""
+
+    requested: str
+    capacity: str
+
+
+@dataclass(frozen=True, slots=True)
+class DemandEntry:
+    """One demand that holds claims. ``action`` is the ROS action that takes such a demand."""
+
+    action: Literal["Demand", "DeploymentRequest"]
+    request: str
+    requesters: list[str]
+
+
+@dataclass(frozen=True, slots=True)
+class Bookkeeping:
+    """The whole view: services by release name, connections and demands by id, all sorted.
+
+    ``demands`` includes demands whose claims are suspended. No service or connection counts the
+    claims in ``suspended``. ``nodes`` are the nodes that declare a capacity. ``waiting`` is in the
+    order in which the generator tries to book.
+    """
+
+    services: dict[str, ServiceEntry]
+    connections: dict[str, ConnectionEntry]
+    demands: dict[str, DemandEntry]
+    suspended: list[SuspendedEntry]
+    nodes: dict[str, dict[str, ResourceEntry]]
+    waiting: list[WaitingEntry]
+
+
+def bookkeeping(world: World) -> Bookkeeping:
+    active = without_suspended(world)
+    services = {}
+    for release in release_causes.releases(world):
+        if not isinstance(release, ServiceRelease):
+            continue
+        inputs = {
+            role: {topic.topic: set[str]() for topic in topics}
+            for role, topics in release.inputs.items()
+        }
+        for claim in claims_of(release, active.ledger):
+            for role, topic, key in demanded_inputs(active, release, claim.application):
+                if topic in inputs[role]:  # a claim that a person wrote may name another topic
+                    inputs[role][topic].update(claim.holders(key))
+        services[release.name] = ServiceEntry(
+            applications=list(release.applications),
+            service=release.key.service,
+            node=release.node.id,
+            source=release.key.source,
+            source_topic=release.key.topic,
+            version=release.chart.version,
+            application_version=release.version.name or None,
+            versions_asked=release_causes.versions_asked(release, active.ledger),
+            parameters=dict(release.parameters),
+            inputs={role: _sorted(topics) for role, topics in inputs.items()},
+            requesters=list(release.requesters),
+        )
+    connections = {}
+    for id in world.ledger.subjects(SubjectKind.CONNECTION):
+        first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
+        if first is None or not claims:
+            continue
+        holders = {route.source: set[str]() for route in connection_topics(claims)}
+        for claim in claims:
+            for key in claim.held.topic_keys():
+                holders[key[0]].update(claim.holders(key))
+        connections[id] = ConnectionEntry(
+            type=first.type.word if first.type else "",
+            source=first.source,
+            target=first.target,
+            topics=_sorted(holders),
+            requesters=list(requesters_of(claims)),
+        )
+    suspended = [
+        SuspendedEntry(
+            claim.subject.kind.value[:-1],
+            claim.subject.id,
+            claim.demand,
+            list(claim.requesters),
+            override.path,
+            override.reason,
+        )
+        for claim, override in suspended_claims(world)
+    ]
+    waiting = [
+        WaitingEntry(
+            demand.demand,
+            list(demand.requesters),
+            demand.since.strftime("%Y-%m-%dT%H:%M:%SZ"),
+            demand.priority,
+        )
+        for demand in in_turn(world.ledger.waiting)
+    ]
+    return Bookkeeping(
+        dict(sorted(services.items())),
+        connections,
+        _demands(world),
+        suspended,
+        _nodes(world),
+        waiting,
+    )
+
+
+def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
+    usage, config = whole_usage(world), world.config
+    nodes: dict[str, dict[str, ResourceEntry]] = {}
+    # A machine that is in several access domains is one entry, because it has one capacity.
+    machines = {id: node for id, node in config.nodes.items() if id not in config.hosts}
+    for id, node in sorted(machines.items()):
+        names = {*(node.capacity or ()), *(name for at, name in usage.amounts if at == id)}
+        limits = ((name, node.most(name)) for name in sorted(names))
+        resources = {
+            name: ResourceEntry(amount_text(usage.of(id, name), name), amount_text(most, name))
+            for name, most in limits
+            if most is not None
+        }
+        if resources:
+            nodes[id] = resources
+    return nodes
+
+
+def _demands(world: World) -> dict[str, DemandEntry]:
+    by_demand: dict[str, list[Claim]] = {}
+    for kind in SubjectKind:
+        for id in world.ledger.subjects(kind):
+            for claim in world.ledger.claims_on(Subject(kind, id)):
+                if claim.keeping_override is None:  # a claim that an override keeps is of no demand
+                    by_demand.setdefault(claim.demand, []).append(claim)
+    return {
+        demand: DemandEntry(
+            "DeploymentRequest" if claims[0].joined else "Demand",
+            claims[0].request,
+            list(requesters_of(claims)),
+        )
+        for demand, claims in sorted(by_demand.items())
+    }
+
+
+def _sorted(topics: dict[str, set[str]]) -> _Requesters:
+    return {topic: sorted(who) for topic, who in topics.items()}
+
+
+def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
+    """Return the bookkeeping as plain data, as ``bookkeeping --output json`` prints it.
+
+    ``demands``, ``suspended``, ``nodes`` and ``waiting`` are left out if they are empty.
+    """
+    data = asdict(view) | {"commit": commit}
+    return {name: part for name, part in data.items() if part or name not in _LEFT_OUT}
+
+
+@dataclass(frozen=True, slots=True)
+class EntryChange:
+    """One service or connection that was added, changed or removed.
+
+    ``requesters`` are the requesters after the change. If the entry was removed, they are those
+    before the change. If the entry was changed, ``lost`` has the facts that no longer hold, and
+    ``gained`` has the new facts.
+    """
+
+    kind: Literal["service", "connection"]
+    name: str
+    change: Literal["added", "changed", "removed"]
+    requesters: list[str]
+    lost: tuple[str, ...] = ()
+    gained: tuple[str, ...] = ()
+
+
+def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
+    return (
+        *_changes("service", old.services, new.services),
+        *_changes("connection", old.connections, new.connections),
+    )
+
+
+_Entry = ServiceEntry | ConnectionEntry
+
+
+def _changes(
+    kind: Literal["service", "connection"], old: Mapping[str, _Entry], new: Mapping[str, _Entry]
+) -> Iterator[EntryChange]:
+    for name in sorted({*old, *new}):
+        if name not in new:
+            yield EntryChange(kind, name, "removed", old[name].requesters)
+        elif name not in old:
+            yield EntryChange(kind, name, "added", new[name].requesters)
+        elif old[name] != new[name]:
+            had, has = list(_facts(old[name], new[name])), list(_facts(new[name], old[name]))
+            lost = tuple(fact for fact in had if fact not in has)
+            gained = tuple(fact for fact in has if fact not in had)
+            yield EntryChange(kind, name, "changed", new[name].requesters, lost, gained)
+
+
+def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:
+    yield from (f"requester {requester}" for requester in entry.requesters)
+    if isinstance(entry, ConnectionEntry):
+        yield f"from {entry.source} to {entry.target}"
+        yield f"by {entry.type}"
+    else:
+        yield f"on {entry.node}"
+        yield from (f"for {application}" for application in entry.applications)
+        yield f"version {entry.version}"
+        if entry.application_version:
+            yield f"application version {entry.application_version}"
+        for version, requesters in entry.versions_asked.items():
+            yield f"version {version} for {', '.join(requesters)}"
+        yield from (f"{name} = {value}" for name, value in sorted(entry.parameters.items()))
+    others = _topics(other)
+    for topic, requesters in sorted(_topics(entry).items()):
+        yield topic
+        # a requester that ``other`` lacks is not repeated here, because it is a fact above
+        lasting = (who for who in requesters if topic in others and who in other.requesters)
+        yield from (f"{topic} for {who}" for who in lasting)
+
+
+def _topics(entry: _Entry) -> _Requesters:
+    inputs = {"topic": entry.topics} if isinstance(entry, ConnectionEntry) else entry.inputs
+    return {
+        f"{role} {topic}": requesters
+        for role, topics in inputs.items()
+        for topic, requesters in topics.items()
+    }

@@ -1,0 +1,171 @@
+"""The demands that hold something or wait for room, as a list for people.
+
+An override that keeps claims is listed like a demand.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal
+
+from demandops.base.naming import SubjectKind
+from demandops.decide.planning.overrides import suspended_by
+from demandops.model.config.config import Config
+from demandops.model.config.inventory import Position, PropertyValue
+from demandops.model.demand.claim import Claim, Lease, requesters_of
+from demandops.model.ledger.ledger import World
+from demandops.model.ledger.records import WaitingDemand
+from demandops.model.release import Release
+
+# The state of a claim or of a demand. A claim is held by its demand, kept by an override, or
+# suspended by an override. A demand has the state of its claims. If the states of its claims
+# differ, the demand is partly suspended. If it waits for room, it has no claims.
+State = Literal["held", "kept", "suspended", "partly suspended", "waiting"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldDemand:
+    """A demand and what it holds. Of the demand's leases, ``lease`` is the first that ends."""
+
+    name: str
+    state: State
+    requests: tuple[str, ...]
+    requesters: tuple[str, ...]
+    applications: tuple[str, ...] = ()
+    connections: tuple[str, ...] = ()
+    nodes: tuple[str, ...] = ()
+    domains: tuple[str, ...] = ()
+    since: datetime
+    lease: Lease | None = None
+    suspended_by: tuple[str, ...] = ()
+
+
+def state_of(claim: Claim, world: World) -> State:
+    if suspended_by(claim, world) is not None:
+        return "suspended"
+    return "kept" if claim.keeping_override else "held"
+
+
+def domains_of(nodes: Iterable[str], config: Config) -> tuple[str, ...]:
+    """Return the access domains of nodes, sorted; a node without a domain is skipped."""
+    return tuple(sorted({config.domain_of[id].name for id in nodes if id in config.domain_of}))
+
+
+def nodes_of(claim: Claim) -> tuple[str, ...]:
+    """Return the nodes that a claim needs, sorted.
+
+    These include the sources of its inputs, the nodes to which it delivers, and its broker's node.
+    """
+    held = claim.held
+    if claim.is_on_application:
+        sources = (topic.source for _, topic in claim.application.all_inputs())
+        delivered = (delivery.node for delivery in claim.application.deliver)
+        return tuple(sorted({*held.nodes, *sources, *delivered}))
+    return tuple(sorted({*held.nodes, *filter(None, (claim.connection.broker,))}))
+
+
+def demands(world: World) -> list[HeldDemand]:
+    """Return every demand, and each override that keeps claims, the oldest first."""
+    by_demand: defaultdict[str, list[Claim]] = defaultdict(list)
+    for claim in world.ledger:
+        by_demand[claim.demand].append(claim)
+    entries = [held_demand(claims, world) for claims in by_demand.values()]
+    entries += [waiting_demand(demand) for demand in world.ledger.waiting.values()]
+    return sorted(entries, key=lambda entry: (entry.since, entry.name))
+
+
+def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
+    """Return the entry for a demand; ``claims`` are all claims that it holds."""
+    states = {state_of(claim, world) for claim in claims}
+    (state,) = states if len(states) == 1 else ("partly suspended",)
+    suspending = filter(None, (suspended_by(claim, world) for claim in claims))
+    nodes = {node for claim in claims for node in nodes_of(claim)}
+    leases = [claim.lease for claim in claims if claim.lease]
+    return HeldDemand(
+        name=claims[0].demand,
+        state=state,  # type: ignore[arg-type]  # one of the words
+        requests=tuple(sorted({claim.request for claim in claims})),
+        requesters=requesters_of(claims),
+        applications=tuple(ids_of(claims, SubjectKind.APPLICATION)),
+        connections=tuple(ids_of(claims, SubjectKind.CONNECTION)),
+        nodes=tuple(sorted(nodes)),
+        domains=domains_of(nodes, world.config),
+        since=min(claim.booked for claim in claims),
+        lease=min(leases, key=lambda lease: lease.until) if leases else None,
+        suspended_by=tuple(sorted({override.path for override in suspending})),
+    )
+
+
+def waiting_demand(demand: WaitingDemand) -> HeldDemand:
+    return HeldDemand(
+        name=demand.demand,
+        state="waiting",
+        requests=(demand.request,),
+        requesters=tuple(sorted(demand.requesters)),
+        since=demand.since,
+    )
+
+
+def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> Iterator[str]:
+    yield from sorted(claim.subject.id for claim in claims if claim.subject.kind is kind)
+
+
+# ---- the nodes, and what uses each of them, as a list for people ----
+
+
+@dataclass(frozen=True, slots=True)
+class UsedNode:
+    """A node of the inventory or of a claim, and what uses the node.
+
+    ``applications``, ``connections`` and ``requesters`` come from the claims that need the node.
+    These include claims on applications that only read an input from the node.
+    """
+
+    name: str
+    type: str | None
+    cluster: str | None
+    domain: str | None
+    drained: bool
+    capabilities: tuple[str, ...]
+    properties: Mapping[str, PropertyValue]
+    position: Position | None
+    releases: tuple[str, ...]
+    applications: tuple[str, ...]
+    connections: tuple[str, ...]
+    requesters: tuple[str, ...]
+
+
+def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
+    """Return every node, sorted by id; ``releases`` are all releases that run."""
+    running: defaultdict[str, list[str]] = defaultdict(list)
+    for release in releases:
+        running[release.node.id].append(release.name)
+    needing: defaultdict[str, list[Claim]] = defaultdict(list)
+    for claim in world.ledger:
+        for id in nodes_of(claim):
+            needing[id].append(claim)
+    inventory = world.config.nodes
+    used = []
+    # A claim may need a node that a person removed from the inventory.
+    for id in sorted({*inventory, *needing}):
+        node, domain, claims = inventory.get(id), world.config.domain_of.get(id), needing[id]
+        used.append(
+            UsedNode(
+                name=id,
+                type=node.type if node else None,
+                cluster=node.cluster if node else None,
+                domain=domain.name if domain else None,
+                drained=bool(node and node.drained),
+                capabilities=node.capabilities if node else (),
+                properties=node.properties if node else {},
+                position=node.position if node else None,
+                releases=tuple(sorted(running[id])),
+                applications=tuple(sorted({*ids_of(claims, SubjectKind.APPLICATION)})),
+                connections=tuple(sorted({*ids_of(claims, SubjectKind.CONNECTION)})),
+                requesters=requesters_of(claims),
+            )
+        )
+    return used

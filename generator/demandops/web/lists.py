@@ -1,0 +1,267 @@
+"""The lists: demands, services, connections and leases."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from demandops.base.naming import SubjectKind
+from demandops.decide.planning.planner import connection_topics
+from demandops.model.config.base_model import duration_text
+from demandops.model.demand.claim import Claim, requesters_of
+from demandops.model.ledger.ledger import World
+from demandops.model.ledger.records import WaitingDemand
+from demandops.model.release import ServiceRelease
+from demandops.views import demand_lists
+from demandops.web.filtered_table import Cell, Column, Link, Part, Row, cell, exactly
+from demandops.web.situation import RANKS, WORDS, ReusableRows, Situation, word_of, worst_word
+
+Values: TypeAlias = "tuple[Any, ...]"
+
+
+@dataclass(frozen=True, slots=True)
+class ListKind:
+    """One of the lists: its name in addresses, its title, its columns and its entries.
+
+    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the world and
+    the values. For an entry whose values have not changed, ``row`` is called again only if the
+    configuration or the overrides have changed.
+    """
+
+    name: str
+    title: str
+    about: str
+    columns: tuple[Column, ...]
+    entries: Callable[[Situation], Iterator[tuple[str, Values]]]
+    row: Callable[..., Row]
+
+
+def _release_part(name: str) -> Part:
+    return Part(name, Link("release", {"name": name}))
+
+
+def _demand_part(id: str) -> Part:
+    return Part(id, Link("demand", {"id": id}))
+
+
+def _health_cell(word: str) -> Cell:
+    """Return the cell for a health word; its sort key puts the worst health first."""
+    return cell(word, tone=WORDS[word], order=RANKS[word])
+
+
+def _linked(view: str, key: str, values: Iterable[str]) -> Cell:
+    """Return a cell in which each value is linked to the rows that have it in field ``key``."""
+    return cell(*(Part(value, Link(view, {"q": exactly(key, value)})) for value in values))
+
+
+def _requesters(requesters: Iterable[str]) -> Cell:
+    return _linked("demands", "requester", requesters)
+
+
+def _services(now: Situation) -> Iterator[tuple[str, Values]]:
+    for release, _ in now.commit_state.targets:
+        if isinstance(release, ServiceRelease):
+            name = release.name
+            claims = now.commit_state.claims_of_releases[name]
+            yield name, (release, claims, word_of(now.status(name)))
+
+
+def _service(world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
+    return Row(
+        {
+            "release": cell(_release_part(release.name)),
+            "service": cell(release.key.service),
+            "node": _linked("services", "node", [release.node.id]),
+            "cluster": cell(release.node.cluster),
+            "application": _linked("services", "application", release.applications),
+            "version": cell(release.version.name or release.chart.version),
+            "requester": _requesters(release.requesters),
+            "health": _health_cell(word),
+        },
+        {"demand": [*dict.fromkeys(claim.demand for claim in claims)], "type": [release.node.type]},
+    )
+
+
+def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
+    ledger = now.commit_state.active.ledger
+    clients_of: dict[str, list[str]] = {}
+    for name, release in now.commit_state.releases.items():
+        if not isinstance(release, ServiceRelease):
+            for id in release.connections:
+                clients_of.setdefault(id, []).append(name)
+    for id in ledger.subjects(SubjectKind.CONNECTION):
+        claims, clients = ledger.connection_claims(id), clients_of.get(id, [])
+        if claims:  # at least one claim is not suspended
+            yield id, (claims, clients, worst_word(map(now.status, clients)))
+
+
+def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], word: str) -> Row:
+    held = claims[0].connection
+    return Row(
+        {
+            "connection": cell(held.id),
+            "by": cell(held.type.word if held.type else ""),
+            "from": _linked("connections", "from", [held.source]),
+            "to": _linked("connections", "to", [held.target]),
+            "topic": cell(*(route.source for route in connection_topics(claims))),
+            "requester": _requesters(requesters_of(claims)),
+            "release": cell(*map(_release_part, clients)),
+            "health": _health_cell(word),
+        },
+        {"demand": [claim.demand for claim in claims], "node": [held.source, held.target]},
+    )
+
+
+def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
+    commit_state = now.commit_state
+    for id, claims in commit_state.claims_of_demands.items():
+        releases = commit_state.releases_of_demands.get(id, [])
+        yield id, (claims, releases, worst_word(map(now.status, releases)))
+    for demand in commit_state.state.ledger.waiting.values():
+        yield f"waiting {demand.demand}", (demand, [], "waiting")
+
+
+def _demand(
+    world: World, holds: list[Claim] | WaitingDemand, releases: list[str], word: str
+) -> Row:
+    if isinstance(holds, WaitingDemand):
+        held = demand_lists.waiting_demand(holds)
+    else:
+        held = demand_lists.held_demand(holds, world)
+    health = _health_cell(word)
+    if held.state == "suspended":
+        health = cell("suspended", tone="bad", order=0.0)
+    elif held.state == "waiting":
+        health = cell("waits for room", tone="busy", order=RANKS["waiting"])
+    return Row(
+        {
+            "demand": cell(_demand_part(held.name)),
+            "request": cell(*held.requests),
+            "requester": _requesters(held.requesters),
+            "application": _linked("services", "application", held.applications),
+            "connection": _linked("connections", "connection", held.connections),
+            "since": Cell(time=held.since),
+            "lease": Cell(time=held.lease.until if held.lease else None),
+            "health": health,
+        },
+        {"release": releases, "node": held.nodes},
+    )
+
+
+def _leases(now: Situation) -> Iterator[tuple[str, Values]]:
+    for claim in now.commit_state.state.ledger:
+        if claim.lease is not None:
+            yield f"{claim.subject} {claim.demand}", (claim,)
+
+
+def _lease(world: World, claim: Claim) -> Row:
+    lease = claim.lease
+    assert lease is not None  # noqa: S101 - only claims with a lease are listed
+    return Row(
+        {
+            "ends": Cell(time=lease.until),
+            "subject": cell(claim.subject.id),
+            "kind": cell(claim.subject.kind.value[:-1]),
+            "demand": cell(_demand_part(claim.demand)),
+            "requester": _requesters(claim.requesters),
+            "term": cell(duration_text(lease.seconds), order=float(lease.seconds)),
+            "slack": cell(duration_text(lease.slack), order=float(lease.slack)),
+        },
+        {"node": demand_lists.nodes_of(claim)},
+    )
+
+
+def _columns(*named: str) -> tuple[Column, ...]:
+    return tuple(Column(*each.split("|")) for each in named)
+
+
+def rows_of(now: Situation, name: str) -> list[Row]:
+    """Return the rows of a list; reuse the rows of entries that have not changed."""
+    commit_state, kind = now.commit_state, LISTS[name]
+    reusable = commit_state.rows.get(name, ReusableRows(None, {}))
+    # the follower makes a new mapping of statuses whenever it looks, so the same mapping means that
+    # nothing has changed
+    if reusable.statuses is not now.statuses:
+        rows: dict[str, tuple[Values, Row]] = {}
+        for id, values in kind.entries(now):
+            before = reusable.rows.get(id)
+            if before is None or before[0] != values:
+                before = values, kind.row(commit_state.state, *values)
+            rows[id] = before
+        reusable = commit_state.rows[name] = ReusableRows(now.statuses, rows)
+    return [row for _, row in reusable.rows.values()]
+
+
+LISTS = {
+    kind.name: kind
+    for kind in (
+        ListKind(
+            "demands",
+            "Demands",
+            "What requesters hold, until they release it or its lease ends.",
+            _columns(
+                "demand|Demand",
+                "health|Health",
+                "requester|Requesters",
+                "application|Applications",
+                "connection|Connections",
+                "since|Since",
+                "lease|Lease until",
+                "request|Request",
+            ),
+            _demands,
+            _demand,
+        ),
+        ListKind(
+            "services",
+            "Services",
+            "One row for each Helm release: a service on a node, shared by all who need it.",
+            _columns(
+                "release|Release",
+                "health|Health",
+                "service|Service",
+                "node|Node",
+                "cluster|Cluster",
+                "application|For",
+                "version|Version",
+                "requester|Requesters",
+            ),
+            _services,
+            _service,
+        ),
+        ListKind(
+            "connections",
+            "Connections",
+            "Topics that are carried from one node to another.",
+            _columns(
+                "connection|Connection",
+                "health|Health",
+                "by|By",
+                "from|From",
+                "to|To",
+                "topic|Topics",
+                "requester|Requesters",
+                "release|Releases",
+            ),
+            _connections,
+            _connection,
+        ),
+        ListKind(
+            "leases",
+            "Leases",
+            "Claims that end unless their requester renews them. The first to end comes first.",
+            _columns(
+                "ends|Ends",
+                "subject|Holds",
+                "kind|Kind",
+                "demand|Demand",
+                "requester|Requesters",
+                "term|Term",
+                "slack|Slack",
+            ),
+            _leases,
+            _lease,
+        ),
+    )
+}

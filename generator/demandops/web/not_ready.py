@@ -1,0 +1,424 @@
+"""Who can probably fix a release that is not ready, judged by the files and the cluster."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Literal
+
+from demandops.cluster.release_status import ReleaseStatus
+from demandops.decide.planning.overrides import suspended_claims
+from demandops.model.config.config import IMAGES_FILE, Config
+from demandops.model.config.override import Override
+from demandops.model.demand.claim import Claim, requesters_of
+from demandops.model.ledger.records import in_turn
+from demandops.model.release import Release, ServiceRelease
+from demandops.repo.history.commit_log import GENERATOR_NAME, LogEntry
+from demandops.repo.load.last_valid_config import Problem
+from demandops.views import release_causes
+from demandops.web.filtered_table import Cell, Filter, Link, Part, Row, cell, exactly
+from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of, worst_word
+
+Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
+
+# The color of each kind of cause, in the order in which the view lists the kinds.
+KINDS: dict[str, str] = {
+    "unread": "bad",
+    "failing": "bad",
+    "invalid": "bad",
+    "suspended": "bad",
+    "decision": "busy",
+    "waiting": "busy",
+    "starting": "busy",
+}
+
+# A function that returns the newest commit that changed a file or folder, or None.
+LastChange = Callable[[str], "LogEntry | None"]
+
+
+@dataclass(frozen=True, slots=True)
+class Remedy:
+    """Who can fix a cause, how, and by which command; all but ``who`` may be empty."""
+
+    who: str
+    how: str = ""
+    command: str = ""
+
+
+# What kubelet and the scheduler write into a pod's status, which the reason of a release quotes.
+_IMAGE = re.compile(r"ImagePull|ErrImage|InvalidImage|manifest unknown|pull access denied", re.I)
+_ROOM = re.compile(r"not scheduled|Insufficient|didn't match|untolerated taint|unschedulable", re.I)
+_CRASH = re.compile(r"CrashLoop|exit code|OOMKilled|RunContainerError", re.I)
+
+
+def remedy_of(
+    kind: Kind, release: Release, config: Config, object: str, reason: str, last_change: LastChange
+) -> Remedy:
+    """Return who can probably fix a release, and how.
+
+    ``object`` names what is not ready: an object, such as ``Deployment perception/od-edge``, or a
+    cluster that cannot be read. ``reason`` says why.
+    """
+    cluster, (word, _, name) = release.node.cluster, object.partition(" ")
+    namespace, _, short = name.partition("/")
+    describe = ["kubectl", "-n", namespace, "describe", word.lower(), short]
+    command = shlex.join(describe) if short else ""
+    if word == "cluster":
+        how = "make its API reachable from here, and let this page read it (docs/status.md)"
+        return Remedy(f"the operator of cluster {cluster}", how)
+    if kind == "waiting" or word in ("Kustomization", "GitRepository", "Application"):
+        who = f"the operator of the GitOps controller of cluster {cluster}"
+        if kind != "failing":
+            who = (
+                f"the GitOps controller of cluster {cluster}; if the controller fails, its operator"
+            )
+        return Remedy(who, "", command)
+    if kind == "starting":
+        who = f"nobody yet; if this lasts, the operator of cluster {cluster}"
+        return Remedy(who, "", command)
+    if release.shaping.by:
+        override = release.shaping.by[-1][0]
+        return Remedy(
+            f"{override.owner}, who owns {override.path}, which changes this release",
+            f"correct or remove {override.path} by pull request",
+            command,
+        )
+    if _ROOM.search(reason):
+        return Remedy(
+            f"the operator of node {release.node.id} in cluster {cluster}",
+            "make room on the node, or name another node in the demand",
+            command,
+        )
+    names = [name for name in release.images if name in config.images]
+    if names and _IMAGE.search(reason):
+        images = [
+            release.image(name, config)
+            if isinstance(release, ServiceRelease)
+            else release.shaping.image(name, config.images[name])
+            for name in names
+        ]
+        files = dict.fromkeys(config.file_of(IMAGES_FILE, name) for name in names)
+        by = _changed_by(files, last_change)
+        return Remedy(
+            f"the publisher of image {', '.join(image.reference() for image in images)}",
+            f"push the image, or correct its entry in {' or '.join(files)} by pull request{by}",
+            command,
+        )
+    how = "look at the log of the container" if _CRASH.search(reason) else ""
+    if not isinstance(release, ServiceRelease):
+        return Remedy(f"the maintainer of the {release.type.word} client", how, command)
+    where = f"appdefs/{release.service.folder}"
+    by = _changed_by([where], last_change)
+    return Remedy(f"the maintainer of {where}{by}", how, command)
+
+
+def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
+    """Return a text that names the people who last changed each path; empty if no person did."""
+    changes = filter(None, map(last_change, paths))
+    people = dict.fromkeys(change.author for change in changes if change.author != GENERATOR_NAME)
+    return f" (last changed by {', '.join(people)})" if people else ""
+
+
+# ---- which applications are not ready, why and since when, and who can fix the causes ----
+
+_MOST_LISTED = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Cause:
+    """Something that keeps applications from being ready, or that needs attention.
+
+    ``told`` has details, such as a cluster's message, a fault in a file, or a person's reason.
+    ``releases`` names the releases that an override denies, or that are not healthy. It is empty
+    for a cause that is not found by release, such as a claim that an override suspends.
+    """
+
+    kind: Kind
+    what: Part
+    why: str
+    remedy: Remedy
+    since: datetime | None = None
+    told: str = ""
+    releases: tuple[str, ...] = ()
+    applications: tuple[str, ...] = ()
+    requesters: tuple[str, ...] = ()
+    demands: tuple[str, ...] = ()
+
+    @property
+    def tone(self) -> str:
+        return KINDS[self.kind]
+
+    def row(self) -> Row:
+        texts = {
+            "release": self.releases,
+            "application": self.applications,
+            "requester": self.requesters,
+            "demand": self.demands,
+        }
+        return Row({"what": Cell((self.what,)), "why": cell(self.why, self.told)}, texts)
+
+
+@dataclass(frozen=True, slots=True)
+class Ready:
+    """Whether an application is ready: one word for its state, and the causes if it is not.
+
+    ``word`` is a word for a health, or the kind of the first cause.
+    """
+
+    application: str
+    word: str
+    causes: tuple[Cause, ...]
+
+    @property
+    def tone(self) -> str:
+        return {**WORDS, **KINDS}[self.word]
+
+
+def causes(
+    now: Situation, wanted: Filter, last_change: LastChange, pending: Collection[str] = ()
+) -> list[Cause]:
+    """Return every cause that matches the filter, the worst kind first, then the oldest.
+
+    ``last_change`` returns the newest commit that changed a file or folder. ``pending`` are the
+    generated files that a generator must still write or remove.
+    """
+    all_causes = [
+        *_unread_or_invalid(now, last_change),
+        *_overridden(now.commit_state, last_change),
+        *_of_releases(now, last_change),
+        *_awaited(now, sorted(pending)),
+    ]
+    places = {kind: place for place, kind in enumerate(KINDS)}
+    latest = now.now.timestamp()
+    all_causes.sort(
+        key=lambda cause: (places[cause.kind], cause.since.timestamp() if cause.since else latest)
+    )
+    return [cause for cause in all_causes if wanted.matches(cause.row())]
+
+
+def applications(now: Situation, causes: Iterable[Cause], wanted: Filter) -> list[Ready]:
+    """Return the applications that match the filter, those with a cause in ``causes`` first."""
+    by_application: dict[str, list[Cause]] = {}
+    for cause in causes:
+        for application in cause.applications:
+            by_application.setdefault(application, []).append(cause)
+    statuses: dict[str, list[ReleaseStatus]] = {}
+    rows: dict[str, Row] = {}
+    for name, release in now.commit_state.releases.items():
+        for application in release.applications if isinstance(release, ServiceRelease) else ():
+            statuses.setdefault(application, []).append(now.status(name))
+    for claim in now.commit_state.state.ledger:
+        if claim.is_on_application:
+            row_before = rows.get(claim.subject.id)
+            who = {*claim.requesters, *(row_before.hidden["requester"] if row_before else ())}
+            demands = {claim.demand, *(row_before.hidden["demand"] if row_before else ())}
+            rows[claim.subject.id] = Row(
+                {"application": cell(claim.subject.id)},
+                {"requester": sorted(who), "demand": sorted(demands)},
+            )
+    shown = []
+    for application, row in sorted(rows.items()):
+        if wanted.matches(row):
+            its_causes = tuple(by_application.get(application, ()))
+            word = worst_word(statuses.get(application, ()))
+            # what runs well may still be denied or invalid; then the cause says more
+            if its_causes and word in ("healthy", "unknown"):
+                word = its_causes[0].kind
+            shown.append(Ready(application, word, its_causes))
+    return sorted(shown, key=lambda ready: (not ready.causes, ready.application))
+
+
+def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Cause]:
+    if now.unread:
+        yield Cause(
+            "unread",
+            Part("The state repo"),
+            "cannot be read, so this page may be out of date",
+            Remedy(
+                "the operator of the Git server or of this page",
+                "mend what the text above names; the page tries again",
+            ),
+            told=now.unread,
+        )
+    for problem in now.commit_state.problems:
+        change = last_change(problem.file)
+        who = (
+            f"{change.author}, who last changed it" if change else "the person who last changed it"
+        )
+        if isinstance(problem, Problem) and problem.author:
+            who = f"{problem.author}, whose commit made it invalid"
+        field = f", {problem.field}" if problem.field else ""
+        since = problem.since if isinstance(problem, Problem) else ""
+        yield Cause(
+            "invalid",
+            Part(f"{problem.file or 'The configuration'}{field}"),
+            "is not valid, so its last valid version stays in effect",
+            Remedy(
+                who,
+                "correct the file by pull request",
+                shlex.join(["git", "show", since[:10]]) if since else "demandops check .",
+            ),
+            told=problem.message,
+            since=change.time if change else None,
+        )
+
+
+def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
+    """Yield a cause for each override that suspends claims, and for each release that one denies.
+
+    The claims that need a denied release are not suspended as a whole.
+    """
+    by_override: dict[str, tuple[Override, list[Claim]]] = {}
+    for claim, override in suspended_claims(commit_state.state):
+        by_override.setdefault(override.name, (override, []))[1].append(claim)
+    denials: list[tuple[Override, Part, str, Sequence[Claim], Iterable[str], tuple[str, ...]]] = []
+    claims: Sequence[Claim]
+    applications: Iterable[str]
+    for override, claims in by_override.values():
+        names = dict.fromkeys(claim.subject.id for claim in claims)
+        what = Part(" and ".join(names), Link("overrides"))
+        applications = _applications_with(commit_state, claims)
+        denials.append((override, what, "is booked", claims, applications, ()))
+    for release, override in commit_state.denied:
+        claims = release_causes.claims_behind(commit_state.active.ledger, release)
+        what = Part(release.description, Link("release", {"name": release.name}))
+        applications = release.applications if isinstance(release, ServiceRelease) else ()
+        denials.append((override, what, "is needed", claims, applications, (release.name,)))
+    for override, what, state, claims, applications, releases in denials:
+        ends = f", or wait until the override ends at {override.expires}"
+        change = last_change(override.path)
+        yield Cause(
+            "suspended",
+            what,
+            f"{state}, but {override.path} denies it",
+            Remedy(
+                f"{override.owner}, who owns the override",
+                f"remove the file by pull request{ends if override.expires else ''}",
+                shlex.join(["git", "rm", override.path]),
+            ),
+            told=override.reason,
+            releases=releases,
+            applications=tuple(dict.fromkeys(applications)),
+            requesters=requesters_of(claims),
+            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
+            since=change.time if change else None,
+        )
+
+
+def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
+    """Yield what waits for room on a node, for a person's decision, or for a generator."""
+    for waiting in in_turn(now.commit_state.state.ledger.waiting):
+        yield Cause(
+            "waiting",
+            Part(waiting.demand, Link("demands", {"q": exactly("demand", waiting.demand)})),
+            "waits for room on a node",
+            Remedy(
+                "the generator, as soon as a node has room; the nodes' operator can add room, or a "
+                "requester can release something"
+            ),
+            since=waiting.since,
+            requesters=waiting.requesters,
+            demands=(waiting.demand,),
+        )
+    for proposal in now.proposals:
+        yield Cause(
+            "decision",
+            Part(proposal.summary, Link("overrides")),
+            "awaits a person's approval",
+            Remedy(
+                "a person who may merge to main",
+                "merge the branch to approve the demand, or delete the branch to refuse it",
+                shlex.join(["demandops", "approve", proposal.branch, "--commit", proposal.commit]),
+            ),
+            since=proposal.since,
+            requesters=proposal.requesters,
+            demands=proposal.demands,
+        )
+    for old in now.old_bootstraps:
+        yield Cause(
+            "decision",
+            Part(old.file),
+            f"is not applied to cluster '{old.cluster}' in the current version",
+            Remedy(f"an administrator of cluster {old.cluster}", "apply it", old.command),
+            told=f"access domains: {', '.join(old.domains)}",
+        )
+    for orphan in now.orphans:
+        yield Cause(
+            "decision",
+            Part(orphan.object),
+            f"runs on cluster '{orphan.cluster}', but belongs to no release",
+            Remedy(f"an administrator of cluster {orphan.cluster}", "delete it", orphan.command),
+            told="the GitOps controller no longer knows that it created this object",
+        )
+    if not_rendered:
+        count = len(not_rendered)
+        more = f" and {count - _MOST_LISTED} more" if count > _MOST_LISTED else ""
+        yield Cause(
+            "waiting",
+            Part("1 generated file" if count == 1 else f"{count} generated files"),
+            f"{'waits' if count == 1 else 'wait'} for a generator to carry out a person's commit",
+            Remedy(
+                "the operator of the generator",
+                "start a generator; a running generator carries out the commit at its next fetch",
+            ),
+            told=", ".join(not_rendered[:_MOST_LISTED]) + more,
+            since=now.commit_state.entry.time,
+        )
+
+
+def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
+    """Yield a cause for each reason why releases on a cluster are not healthy."""
+    together: dict[tuple[str, str, str, str], list[str]] = {}
+    for name, release in now.commit_state.releases.items():
+        status = now.status(name)
+        word = word_of(status)
+        if word not in ("healthy", "unknown"):
+            health = status.health
+            key = (word, health.object, health.reason, release.node.cluster)
+            together.setdefault(key, []).append(name)
+    for (word, object, reason, cluster), names in together.items():
+        releases = [now.commit_state.releases[name] for name in names]
+        first, several = releases[0], len(names) > 1
+        what = Part(first.description, Link("release", {"name": names[0]}))
+        if several:
+            link = Link("services", {"q": f"cluster={cluster}"})
+            what = Part(f"{len(names)} releases in {cluster}", link)
+        kind: Kind = "failing" if word == "failing" else "starting"
+        fail, have, are = ("fail", "have", "are") if several else ("fails", "has", "is")
+        why = fail if kind == "failing" else f"{are} starting and not ready yet"
+        if word == "waiting":
+            kind, why = "waiting", f"{have} not been applied by the cluster yet"
+        if object.startswith("cluster "):
+            why = f"cannot be seen, because {object} cannot be read"
+        claims = [claim for name in names for claim in now.commit_state.claims_of_releases[name]]
+        applications: dict[str, None] = {}
+        for name, release in zip(names, releases, strict=True):
+            # a connection is needed by the applications of the demands that hold it
+            applications |= dict.fromkeys(
+                release.applications
+                if isinstance(release, ServiceRelease)
+                else _applications_with(now.commit_state, now.commit_state.claims_of_releases[name])
+            )
+        times = filter(None, (since_of(now.status(name)) for name in names))
+        yield Cause(
+            kind,
+            what,
+            why,
+            remedy_of(kind, first, now.commit_state.config, object, reason, last_change),
+            since=min(times, default=None),
+            told=f"{object}: {reason}" if object else reason,
+            releases=tuple(names),
+            applications=tuple(applications),
+            requesters=requesters_of(claims),
+            demands=tuple(dict.fromkeys(claim.demand for claim in claims)),
+        )
+
+
+def _applications_with(commit_state: CommitState, claims: Iterable[Claim]) -> Iterator[str]:
+    """Yield the ids of all applications of the demands to which these claims belong."""
+    for demand in dict.fromkeys(claim.demand for claim in claims):
+        held = commit_state.claims_of_demands.get(demand, ())
+        yield from (claim.subject.id for claim in held if claim.is_on_application)

@@ -1,0 +1,327 @@
+"""The time line, with the events of demands, overrides, people's commits and health."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timedelta, timezone
+from statistics import median
+
+from demandops.model.config.base_model import span
+from demandops.model.config.override import OVERRIDES_ROOT
+from demandops.repo.history.commit_log import PROPOSAL
+from demandops.web.filtered_table import Filter, Row, cell
+from demandops.web.situation import WORDS, Commit, HealthChange
+
+# The title of each lane of the time line, from top to bottom, by the lane's name.
+LANES = {
+    "demands": "Demands",
+    "overrides": "Overrides",
+    "people": "People and generator",
+    "health": "Health",
+}
+
+# The spans of time that a person can choose, in seconds; 0 means all known events.
+SPANS = {
+    "15min": 900,
+    "1h": 3600,
+    "6h": 6 * 3600,
+    "1d": 86400,
+    "7d": 7 * 86400,
+    "30d": 30 * 86400,
+    "all": 0,
+}
+
+WIDTH = 1000
+_BINS = 60
+_FEW = 20
+# The distances between ticks that people can read off easily, from a second to 30 days.
+_STEPS_S = (1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 86400, 7 * 86400, 30 * 86400)
+_TICKS = 8
+
+_BY_DEMANDS = {"join", "shutdown", "put", "release", "renew", "expire", "decommission", "rollback"}
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    lane: str
+    time: datetime
+    word: str
+    summary: str
+    who: str
+    commit: str = ""
+    release: str = ""
+    tone: str = ""
+
+    def row(self) -> Row:
+        return Row(
+            {"lane": cell(self.lane), "word": cell(self.word), "summary": cell(self.summary)},
+            {"who": [self.who], "commit": [self.commit], "release": [self.release]},
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Dot:
+    """Events of one lane that are close together.
+
+    ``commit`` is the commit of the newest event; empty for a change of health.
+    """
+
+    lane: str
+    x: float
+    radius: float
+    count: int
+    label: str
+    commit: str
+    tone: str
+    is_chosen: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    x: float
+    label: str
+
+
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """The picture of the time line.
+
+    ``chosen`` is the x coordinate of the chosen commit; None if the picture does not show it.
+    """
+
+    span: str
+    dots: tuple[Dot, ...]
+    ticks: tuple[Tick, ...]
+    chosen: float | None
+
+
+def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
+    all_events = [of_commit(commit) for commit in commits]
+    for change in health:
+        reason = f": {change.reason}" if change.reason else ""
+        summary = f"was {change.before}, is {change.after}{reason}"
+        tone = WORDS[change.after]
+        all_events.append(
+            Event("health", change.time, change.after, summary, "", "", change.release, tone)
+        )
+    return sorted(all_events, key=lambda event: event.time, reverse=True)
+
+
+def of_commit(commit: Commit) -> Event:
+    entry = commit.entry
+    word = entry.first("Operation") or "by hand"  # only generators write this trailer
+    lane = "people"
+    if word in _BY_DEMANDS or PROPOSAL in entry.trailers:
+        lane = "demands"
+    elif word == "expire-override" or (word == "by hand" and OVERRIDES_ROOT in commit.roots):
+        lane = "overrides"
+    who = ", ".join(entry.trailers.get("Requester", ())) or entry.author
+    return Event(lane, entry.time, word, entry.summary, who, entry.commit)
+
+
+def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
+    """Return the events of ``lane`` (if empty, of all lanes) that match the filter."""
+    return [
+        event
+        for event in events
+        if lane in ("", event.lane) and (not wanted or wanted.matches(event.row()))
+    ]
+
+
+def strip(
+    events: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
+) -> Strip:
+    """Return the picture of the time line that ends at ``now``, for events that are newest first.
+
+    If ``span`` is no key of ``SPANS``, it is the shortest that has enough events. ``chosen`` is the
+    time and the id of the chosen commit; None if no earlier commit is chosen.
+    """
+    if span not in SPANS:
+        # enough events are 20, or three quarters of all events, whichever is less
+        last = min(_FEW, 3 * len(events) // 4) - 1
+        oldest_shown = events[last].time if len(events) > 1 else now
+        spans = (name for name, seconds in SPANS.items() if seconds)
+        span = next(
+            (name for name in spans if oldest_shown >= now - timedelta(seconds=SPANS[name])), "all"
+        )
+    oldest = events[-1].time if events else now - timedelta(hours=1)
+    start = now - timedelta(seconds=SPANS[span]) if SPANS[span] else oldest
+    length = max((now - start).total_seconds(), 1.0)
+
+    def x_of(at: datetime) -> float:
+        return WIDTH * (at - start).total_seconds() / length
+
+    bins: dict[tuple[str, int], list[Event]] = {}
+    for event in events:
+        if event.time >= start:
+            x = min(x_of(event.time), WIDTH - 1e-6)  # an event of this moment is in the last bin
+            bins.setdefault((event.lane, int(x * _BINS / WIDTH)), []).append(event)
+    dots = []
+    for (lane, place), group in sorted(bins.items()):
+        newest, count = group[0], len(group)
+        more = f", and {count - 1} more" if count > 1 else ""
+        what = " ".join(filter(None, (newest.release, newest.summary)))
+        label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
+        tone = "bad" if any(event.tone == "bad" for event in group) else newest.tone
+        is_chosen = chosen is not None and any(event.commit == chosen[1] for event in group)
+        x, radius = (place + 0.5) * WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
+        dots.append(Dot(lane, x, radius, count, label, newest.commit, tone, is_chosen))
+    step = next((each for each in _STEPS_S if length / each <= _TICKS), length / _TICKS)
+    form = "%H:%M:%S" if step < 60 else "%H:%M" if step < 86400 else "%m-%d"
+    ticks, at = list[Tick](), math.ceil(start.timestamp() / step) * step
+    while at <= now.timestamp():
+        moment = datetime.fromtimestamp(at, tz=timezone.utc)
+        ticks.append(Tick(x_of(moment), moment.strftime(form)))
+        at += step
+    mark = x_of(chosen[0]) if chosen else None
+    shown = mark if mark is not None and 0 <= mark <= WIDTH else None
+    return Strip(span, tuple(dots), tuple(ticks), shown)
+
+
+# ---- plots of rates and latencies ----
+#
+# The rates are those of demands that are booked or released, and of people's commits. The latencies
+# are the time from the receipt of a demand to its commit, and the time until a release is healthy
+# again.
+
+WIDTH, HEIGHT = 560, 150
+_RATE_BINS = 48
+
+
+@dataclass(frozen=True, slots=True)
+class Bar:
+    x: float
+    y: float
+    width: float
+    height: float
+    label: str  # when its bin of time begins, and its value
+
+
+@dataclass(frozen=True, slots=True)
+class Plot:
+    """A plot: its bars, the highest value of the axis as text, and the values as a table.
+
+    Bins of time whose value is 0 have neither a bar nor a line in the table.
+    """
+
+    title: str
+    unit: str
+    about: str
+    bars: tuple[Bar, ...]
+    top: str
+    first: datetime
+    last: datetime
+    summary: str
+    table: tuple[tuple[datetime, str], ...]
+
+
+# When a value was measured, and the value.
+Sample = tuple[datetime, float]
+
+_BOOKED = {"join", "put"}
+_RELEASED = {"shutdown", "release", "expire", "decommission"}
+
+
+def plots(
+    commits: Sequence[Commit], health: Sequence[HealthChange], now: datetime, span: str
+) -> list[Plot]:
+    """Return the plots of a span of time that ends at ``now``.
+
+    ``span`` is a key of ``SPANS``. ``all``, and any text that is no key, means the time since the
+    oldest of ``commits``; without commits, the last hour.
+    """
+    seconds = SPANS.get(span, 0)
+    oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
+    start = now - timedelta(seconds=seconds) if seconds else oldest
+    span_s = max((now - start).total_seconds(), 1.0)
+    demands = [commit.entry for commit in commits if commit.entry.first("Operation-Id")]
+    # The author's time of a demand's commit is when the generator received the demand.
+    waits = [
+        (entry.time, (entry.time - entry.authored).total_seconds())
+        for entry in demands
+        if entry.authored and entry.first("Operation") in _BOOKED | _RELEASED
+    ]
+    ready = [(change.time, change.lasted_s) for change in health if change.lasted_s is not None]
+    make = _PlotMaker(start, span_s)
+    return [
+        make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
+        make.counts(
+            "Demands released",
+            _times(commits, _RELEASED),
+            "commits that release demands, or end demands whose lease expired",
+        ),
+        make.counts(
+            "People's commits",
+            [commit.entry.time for commit in commits if not commit.entry.by_generator],
+            "commits that no generator made",
+        ),
+        make.medians("From received to committed", waits, "median (Git records whole seconds)"),
+        make.medians(
+            "Until healthy again",
+            ready,
+            "median time that releases were not healthy, since this page was started",
+        ),
+    ]
+
+
+def _times(commits: Iterable[Commit], operations: set[str]) -> list[datetime]:
+    entries = (commit.entry for commit in commits)
+    return [entry.time for entry in entries if entry.first("Operation") in operations]
+
+
+class _PlotMaker:
+    def __init__(self, start: datetime, span_s: float) -> None:
+        self._start, self._bin_s = start, span_s / _RATE_BINS
+        self._span = span_s
+
+    def counts(self, title: str, times: Iterable[datetime], about: str) -> Plot:
+        bins = self._bins((at, 1.0) for at in times)
+        total = sum(map(len, bins))
+        per_hour = total * 3600 / self._span
+        summary = f"{total} in all, {per_hour:.3g} an hour"
+        values = [float(len(each)) for each in bins]
+        return self._plot(title, f"per {span(self._bin_s)}", about, values, summary, "")
+
+    def medians(self, title: str, samples: Iterable[Sample], about: str) -> Plot:
+        bins = self._bins(samples)
+        every = sorted(value for each in bins for value in each)
+        summary = "no values in this span of time"
+        if every:
+            late = every[math.ceil(0.95 * len(every)) - 1]
+            summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, {len(every)} values"
+        values = [median(each) if each else 0.0 for each in bins]
+        return self._plot(title, "in seconds", about, values, summary, " s")
+
+    def _bins(self, samples: Iterable[Sample]) -> list[list[float]]:
+        bins: list[list[float]] = [[] for _ in range(_RATE_BINS)]
+        for time, value in samples:
+            place = int((time - self._start).total_seconds() / self._bin_s)
+            if time >= self._start:
+                bins[min(place, _RATE_BINS - 1)].append(value)
+        return bins
+
+    def _plot(
+        self, title: str, unit: str, about: str, values: list[float], summary: str, suffix: str
+    ) -> Plot:
+        top = max(*values, 1.0)  # at least 1, so that bins without a value divide by no zero
+        width = WIDTH / _RATE_BINS
+        starts = [self._start + timedelta(seconds=self._bin_s * n) for n in range(_RATE_BINS)]
+        texts = [f"{value:.3g}{suffix}" for value in values]
+        bars = tuple(
+            Bar(
+                round(n * width + 1, 2),
+                round(HEIGHT * (1 - value / top), 2),
+                round(width - 2, 2),
+                round(HEIGHT * value / top, 2),
+                f"{starts[n]:%Y-%m-%d %H:%M:%S} UTC: {texts[n]}",
+            )
+            for n, value in enumerate(values)
+            if value
+        )
+        table = tuple((starts[n], texts[n]) for n, value in enumerate(values) if value)
+        end = self._start + timedelta(seconds=self._span)
+        return Plot(
+            title, unit, about, bars, f"{top:.3g}{suffix}", self._start, end, summary, table
+        )

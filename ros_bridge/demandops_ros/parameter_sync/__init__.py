@@ -1,1 +1,0 @@
-"""Parameter sync: keeps the parameters of a running ROS node equal to those in a ConfigMap."""
