@@ -57,7 +57,7 @@ def modeline(path: str, schema: str) -> str:
 # The top-level folder with the generator's reports to people. No decision depends on the reports.
 NOTES_ROOT = ".demandops"
 
-_PACKAGE = Path(__file__).parent
+_PACKAGE = Path(__file__).parents[1]
 _CHECKOUT = _PACKAGE.parents[1]
 
 

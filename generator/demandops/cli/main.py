@@ -22,39 +22,45 @@ from demandops.repo.git import slow_git
 # The package of each command's module, and the short help, which `--help` shows without importing
 # the module. A package without a dot is below `demandops.cli`, except `demandops_ros`.
 COMMANDS = {
-    "approve": ("actions", "Approve a proposed demand: merge its branch in your own name."),
-    "bookkeeping": ("views", "Show who requests which service and connection."),
-    "check": ("repo", "Check edits of a state repo and show their consequences."),
-    "completion": ("repo", "Print the completion script for a shell."),
-    "config": ("repo", "List, set and choose contexts: the fleets that you work with."),
-    "decommission": ("actions", "Release all claims of a node or a requester."),
-    "demand": ("demandops_ros", "Send a demand to a running node."),
-    "detect": ("demandops_ros.detector", "Watch topics, and send the demands that rules ask for."),
-    "diff": ("views", "Show the differences between two commits."),
-    "get": ("views", "List demands, nodes, services, overrides and so on."),
-    "init": ("repo", "Create a state repo."),
-    "journal": ("repo", "List the accepted demands that are not published."),
-    "log": ("views", "List the commits of the state repo, newest first."),
-    "new": ("repo", "Write a new application, override or image."),
-    "override": ("actions", "Create and end overrides: deviations that people declare."),
+    "approve": ("actions.approve", "Approve a proposed demand: merge its branch in your own name."),
+    "bookkeeping": ("views.bookkeeping", "Show who requests which service and connection."),
+    "check": ("repo.check", "Check edits of a state repo and show their consequences."),
+    "completion": ("repo.program", "Print the completion script for a shell."),
+    "config": ("repo.program", "List, set and choose contexts: the fleets that you work with."),
+    "decommission": ("actions.ledger_change", "Release all claims of a node or a requester."),
+    "demand": ("demandops_ros.demand_command", "Send a demand to a running node."),
+    "detect": (
+        "demandops_ros.detector.detect_command",
+        "Watch topics, and send the demands that rules ask for.",
+    ),
+    "diff": ("views.diff", "Show the differences between two commits."),
+    "get": ("views.get", "List demands, nodes, services, overrides and so on."),
+    "init": ("repo.init", "Create a state repo."),
+    "journal": ("repo.journal", "List the accepted demands that are not published."),
+    "log": ("views.log", "List the commits of the state repo, newest first."),
+    "new": ("repo.new", "Write a new application, override or image."),
+    "override": ("actions.override", "Create and end overrides: deviations that people declare."),
     "parameter-sync": (
         "demandops_ros.parameter_sync",
         "Keep a ROS node's parameters equal to those in a ConfigMap.",
     ),
-    "reject": ("actions", "Turn a proposed demand down: delete its branch."),
-    "request": ("actions", "Book demand requests from files."),
-    "resume": ("actions", "Run suspended applications and connections again."),
-    "rollback": ("actions", "Restore the claims of an earlier commit, by a new commit."),
-    "schema": ("repo", "Print the JSON Schema of a kind of file."),
-    "serve": ("demandops_ros", "Run the ROS 2 node that accepts demands."),
-    "status": ("views", "Show the state of each release on its cluster."),
-    "suspend": ("actions", "Stop applications and connections; their claims stay booked."),
-    "upgrade": ("repo", "Render everything again, in one commit."),
-    "verify": ("repo", "Render commits again from their ledger and compare the bytes."),
-    "version": ("repo", "Print the versions of the program and of its formats."),
-    "watch": ("views", "Show releases, demands and the latest commits live."),
-    "web": ("views", "Show the state repo on a web page."),
-    "why": ("views", "Explain why something runs or ran."),
+    "reject": ("actions.approve", "Turn a proposed demand down: delete its branch."),
+    "request": ("actions.request", "Book demand requests from files."),
+    "resume": ("actions.override", "Run suspended applications and connections again."),
+    "rollback": (
+        "actions.ledger_change",
+        "Restore the claims of an earlier commit, by a new commit.",
+    ),
+    "schema": ("repo.schema", "Print the JSON Schema of a kind of file."),
+    "serve": ("demandops_ros.serve_command", "Run the ROS 2 node that accepts demands."),
+    "status": ("views.status", "Show the state of each release on its cluster."),
+    "suspend": ("actions.override", "Stop applications and connections; their claims stay booked."),
+    "upgrade": ("repo.upgrade", "Render everything again, in one commit."),
+    "verify": ("repo.upgrade", "Render commits again from their ledger and compare the bytes."),
+    "version": ("repo.program", "Print the versions of the program and of its formats."),
+    "watch": ("views.watch", "Show releases, demands and the latest commits live."),
+    "web": ("views.web", "Show the state repo on a web page."),
+    "why": ("views.why", "Explain why something runs or ran."),
 }
 
 
@@ -77,12 +83,11 @@ class ExitCode(IntEnum):
 
 def load(name: str) -> click.Command:
     """Import and return a command; a ClickException says if git or a Python package is missing."""
-    room = COMMANDS[name][0]
-    ros = room.split(".")[0] == "demandops_ros"
-    word = name.replace("-", "_")
-    module = f"{room}.{word}_command" if ros else f"demandops.cli.{room}.{word}"
+    module = COMMANDS[name][0]
+    ros = module.split(".")[0] == "demandops_ros"
     try:
-        command: click.Command = getattr(import_module(module), word)
+        found = import_module(module if ros else f"demandops.cli.{module}")
+        command: click.Command = getattr(found, name.replace("-", "_"))
     except ModuleNotFoundError as error:
         missing = str(error.name).split(".")[0]
         if missing in ("demandops", "demandops_ros"):

@@ -43,7 +43,7 @@ _LONGEST_ANSWER = 64_000_000
 _LONGEST_WAIT_S = 60
 _START = (
     "import sys, json; sys.path[:] = json.loads(sys.argv[1]); "
-    f"from demandops.evaluator import child; child.serve({MEMORY_MIB})"
+    f"from demandops.templating import child; child.serve({MEMORY_MIB})"
 )
 
 

@@ -125,7 +125,7 @@ def test_a_demand_that_comes_meanwhile_is_next(bare: Path, monkeypatch: pytest.M
 DIES = f"""
 import json, os, signal, sys
 from demandops.base.runtime import Runtime
-from demandops.service import Generator
+from demandops.serve.generator import Generator
 
 class Dying(Runtime):
     looks = 0

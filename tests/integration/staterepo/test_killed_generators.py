@@ -23,7 +23,7 @@ from tests.kit.rig import goal, wait_until
 GENERATOR = """
 import json, sys, threading
 from pathlib import Path
-from demandops.service import Generator
+from demandops.serve.generator import Generator
 address, key = sys.argv[1:]
 generator = Generator(address, signing_key=Path(key) if key else None)
 print("ready", flush=True)

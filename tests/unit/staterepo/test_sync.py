@@ -26,8 +26,8 @@ def recorded(owner, name):
     setattr(owner, name, call)
 
 recorded(pygit2, "option")
-from demandops.service import Generator
-from demandops.staterepo import new_repo
+from demandops.serve.generator import Generator
+from demandops.repo import new_repo
 
 bare = Path(sys.argv[1])
 new_repo.init(bare, datetime.now(timezone.utc), bare=True, gitops="flux")
