@@ -33,7 +33,7 @@ from tests.mutants.mutation import Mutant, mutants
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = ROOT / "generator" / "demandops"
-ROOMS = ("config", "demand", "ledger", "plan", "decision", "render")
+ROOMS = ("model", "connections", "decide", "render")
 TESTS = ("tests/unit", "tests/golden", "tests/appdefs")
 READ = ("generator", "templates", "appdefs", "state-repo-skeleton", "tests")
 MOST_TESTS = 30

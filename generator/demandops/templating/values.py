@@ -35,12 +35,12 @@ def with_template_lines(faults: Iterable[Fault], template: str, rendered: str) -
     """Yield faults of a rendered text, each with the template's line if this line is known."""
     template_lines, rendered_lines = template.splitlines(), rendered.splitlines()
     fields: Mapping[str, int] | None = None
-    for fault in faults:
-        if place := _PLACE.match(fault.field):
+    for problem in faults:
+        if place := _PLACE.match(problem.field):
             number: int | None = int(place[1])
         else:
             fields = strict_yaml.lines(rendered) if fields is None else fields
-            number = strict_yaml.nearest(fault.field.removeprefix("values."), fields)
+            number = strict_yaml.nearest(problem.field.removeprefix("values."), fields)
         candidates: list[int] = []
         if number and number <= len(rendered_lines):
             written = rendered_lines[number - 1]
@@ -49,7 +49,7 @@ def with_template_lines(faults: Iterable[Fault], template: str, rendered: str) -
             candidates = candidates or [at for at, line in lines if _may_write(line, written)]
         # a wrong line would mislead, so of several none is named
         line = candidates[0] if len(candidates) == 1 else None
-        yield replace(fault, line=fault.line or line)
+        yield replace(problem, line=problem.line or line)
 
 
 def _may_write(line: str, rendered: str) -> bool:

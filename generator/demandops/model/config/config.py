@@ -355,8 +355,8 @@ class ConfigReader:
             )
             return
         # both files, so that the changed one is quarantined, whichever of them a person changed
-        for (file, field), (other, _) in ((first, second), (second, first)):
-            self.add_fault(file, f"{field}{dot_key}", f"'{name}' is in {other} too; remove one")
+        for (file, place), (other, _) in ((first, second), (second, first)):
+            self.add_fault(file, f"{place}{dot_key}", f"'{name}' is in {other} too; remove one")
 
     def entry_files(self) -> dict[str, dict[str, str]]:
         return {
