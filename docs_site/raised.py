@@ -9,9 +9,9 @@ from pathlib import Path
 
 PROGRAM = Path(__file__).parents[1] / "generator" / "demandops"
 SECTIONS = {
-    "staterepo": "The state repo and Git",
+    "repo": "The state repo and Git",
     "cluster": "Clusters",
-    "service": "The generator",
+    "serve": "The generator",
     "cli": "The command line",
 }
 """The folders whose messages are in no list of mistakes, each with the title of its section."""
