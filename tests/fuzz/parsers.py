@@ -20,7 +20,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.cli import target
 from demandops.cli.actions.override import ends_at
-from demandops.cluster.health import health_reader
+from demandops.cluster.health.health_reader import health_reader
 from demandops.cluster.health.release_health import Target as ReleaseTarget
 from demandops.decide.state import try_configuration
 from demandops.detect import rule_file

@@ -9,7 +9,7 @@ from typing import Any
 
 from demandops.base.runtime import REAL, Runtime
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health import health_reader
+from demandops.cluster.health.health_reader import health_reader
 from demandops.cluster.health.release_health import ClusterDomain, Health, Key, ObjectSelector
 
 log = logging.getLogger("demandops")

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
-from demandops.cluster.health import health_reader
+from demandops.cluster.health.health_reader import health_reader
 from demandops.cluster.health.release_health import (
     ClusterDomain,
     Health,

@@ -13,7 +13,7 @@ from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL, Runtime
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health import health_reader
+from demandops.cluster.health.health_reader import health_reader
 from demandops.cluster.health.release_health import ClusterDomain, Target
 from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.release_status import (

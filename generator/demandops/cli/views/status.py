@@ -23,7 +23,7 @@ from demandops.cli.output import (
 from demandops.cli.table import Column, Table
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
-from demandops.cluster.health import health_reader
+from demandops.cluster.health.health_reader import health_reader
 from demandops.cluster.health.release_health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.release_status import OldBootstrap, Orphan, old_bootstraps, orphans, statuses
