@@ -24,7 +24,7 @@ from demandops.base.errors import (
 )
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
-from demandops.cluster.health.release_health import Level
+from demandops.cluster.health import Level
 from demandops.serve.queue import Receipt
 from demandops_interfaces.action import Demand
 from rclpy.action import ActionClient, ActionServer

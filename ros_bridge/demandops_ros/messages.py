@@ -10,7 +10,7 @@ from typing import Any
 from builtin_interfaces.msg import Duration
 from demandops.base.errors import suggestion
 from demandops.base.settings import API_VERSION
-from demandops.cluster.health.release_health import Level
+from demandops.cluster.health import Level
 from demandops.connections.connection import RouteOptions
 from demandops.model.config.base_model import seconds_of
 from demandops_interfaces import msg as messages

@@ -18,7 +18,7 @@ from demandops.cli.output import errors, progress
 from demandops.cli.target import signing_option
 from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.leadership import Leadership
-from demandops.cluster.rollout_watcher import RolloutWatcher
+from demandops.cluster.rollouts import RolloutWatcher
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.serve.http_server import PushWebhook

@@ -8,13 +8,13 @@ from typing import Any, Literal
 
 import pytest
 from demandops.base.errors import InvalidInput
-from demandops.decide.changes.trial_render import render_trial_demands
+from demandops.decide.changeset import render_trial_demands
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import rendered_files
 from demandops.model.config.appdef import Scaling
-from demandops.model.demand.application import InputTopic
+from demandops.model.demand.claim import InputTopic
 from demandops.model.release import ServiceKey, replicas_of
-from demandops.views.override_report import override_report, warnings
+from demandops.views.explanations import override_report, warnings
 from hypothesis import given
 from hypothesis import strategies as st
 

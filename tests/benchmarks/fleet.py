@@ -16,7 +16,7 @@ from typing import Any
 import pygit2
 from demandops.base import strict_yaml
 from demandops.decide.admission.admitted_request import admit
-from demandops.decide.booking.apply import apply
+from demandops.decide.booking import apply
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.load import load
 from demandops.model.ledger import claim_file

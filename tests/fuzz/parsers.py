@@ -20,19 +20,18 @@ from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.cli import target
 from demandops.cli.actions.override import ends_at
-from demandops.cluster.health.health_reader import health_reader
-from demandops.cluster.health.release_health import Target as ReleaseTarget
+from demandops.cluster.health import Target as ReleaseTarget
+from demandops.cluster.health import health_reader
 from demandops.decide.state import try_configuration
 from demandops.detect import rule_file
-from demandops.detect.detection_state import Observation
 from demandops.detect.detector import Detector, Want
-from demandops.detect.message_reader import MessageReader, Unreadable
+from demandops.detect.observations import MessageReader, Observation, Unreadable
 from demandops.detect.rule_file import RuleFile
 from demandops.model.config import override, policy
 from demandops.model.config.load import load
 from demandops.model.ledger import claim_file, records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
-from demandops.repo.git import open_repository as addresses
+from demandops.repo.git import local_repository as addresses
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.write import journal
 from demandops.serve.http_server import PushWebhook

@@ -18,8 +18,8 @@ from demandops.cli.main import cli
 from demandops.decide.decision import decide
 from demandops.decide.state import State, rendered_files
 from demandops.detect import rule_file
-from demandops.detect.detection_state import Observation
 from demandops.detect.detector import Detector
+from demandops.detect.observations import Observation
 from demandops.model.config.load import load
 from demandops.model.demand.demand_request import Expire
 from demandops.render.release_file import check_files

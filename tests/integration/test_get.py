@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.runtime import REAL
-from demandops.cli.views.kinds import KINDS
+from demandops.cli.views.get import KINDS
 from demandops.model.config.override import parse_time
 from demandops.repo.git.repository import RemoteAway
 from demandops.repo.reader import Reader

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from demandops.repo.git import signing
 from demandops.repo.git.signing import Signer, SigningFailed
-from demandops.repo.history import allowed_signers
 
 from tests.kit import rig
 from tests.kit.goals import connection, goal
@@ -360,7 +360,7 @@ class TestVerify:
     ) -> None:
         state.commit({SIGNERS: listed(key)})
         book("a", "--signing-key", key)
-        monkeypatch.setattr(allowed_signers, "_good", {})
+        monkeypatch.setattr(signing, "_good", {})
         found = shutil.which("git")
         assert found
         (tmp_path / "bin").mkdir()

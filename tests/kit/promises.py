@@ -7,8 +7,7 @@ from itertools import combinations
 from random import Random
 from typing import Any
 
-from demandops.model.demand.application import Application
-from demandops.model.demand.claim import Claim, demand_id
+from demandops.model.demand.claim import Application, Claim, demand_id
 
 from tests.model.leases import Goal, Subject, name_by_message
 

@@ -22,7 +22,7 @@ from action_msgs.msg import GoalStatusArray
 from builtin_interfaces.msg import Time
 from demandops.base.quoting import is_visible
 from demandops.base.settings import DEFAULT_ACTION_NAME
-from demandops.cluster.health.release_health import Health
+from demandops.cluster.health import Health
 from demandops.serve.queue import Receipt
 from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.actions import DemandAdapter

@@ -14,18 +14,17 @@ from typing import Any, Literal
 
 import yaml
 from demandops.base.errors import Fault, Refused
-from demandops.decide.booking.leaving import Drain
+from demandops.decide.booking import Drain
 from demandops.decide.decision import Decision, decide
-from demandops.decide.override_lifecycle import changed_claim_files
-from demandops.decide.placement.relocation import following_overrides
+from demandops.decide.placement.relocation import changed_claim_files, following_overrides
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.base_model import FrozenModel, parse_file, seconds_of
 from demandops.model.config.load import load
 from demandops.model.demand.demand_request import Expire
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import in_turn
-from demandops.serve.timing.limits import RateLimit
 from demandops.serve.timing.own_work import LeaseExpiry
+from demandops.serve.timing.timers import RateLimit
 from pydantic import Field, model_validator
 
 from tests.kit import plain_yaml

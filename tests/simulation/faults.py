@@ -14,13 +14,11 @@ from typing import Any
 from demandops.base.errors import InvalidInput
 from demandops.connections import connection
 from demandops.connections.connection import Route
-from demandops.decide import decision, override_lifecycle
+from demandops.decide import booking, changeset, decision
 from demandops.decide.admission import admitted_request, permission
-from demandops.decide.booking import joining, leaving
-from demandops.decide.changes import changeset
 from demandops.decide.checks import quotas
 from demandops.decide.decision import Decision
-from demandops.decide.placement import placement
+from demandops.decide.placement import placement, relocation
 from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.placement.choice import Choice
 from demandops.decide.planning import overrides, planner, release_keys
@@ -50,24 +48,24 @@ Patch = Callable[[Any, str, Any], None]
 
 
 def keep_former_requesters(patch: Patch) -> None:
-    book = joining.book
+    book = booking.book
 
     def kept(ledger: Any, one: Any, request: str, key: Any, current: Any, now: Any) -> Any:
         former = current.requesters if current else ()
         one = replace(one, requesters=(*one.requesters, *former))
         return book(ledger, one, request, key, current, now)
 
-    patch(joining, "book", kept)
+    patch(booking, "book", kept)
 
 
 def let_strangers_change_a_demand(patch: Patch) -> None:
-    patch(joining, "refuse_other_owners", lambda *_: None)
-    patch(joining, "refuse_other_owners", lambda *_: None)
+    patch(booking, "refuse_other_owners", lambda *_: None)
+    patch(booking, "refuse_other_owners", lambda *_: None)
 
 
 def release_only_the_first_claim(patch: Patch) -> None:
-    owned = leaving.owned_claims
-    patch(leaving, "owned_claims", lambda *given: owned(*given)[:1])
+    owned = booking.owned_claims
+    patch(booking, "owned_claims", lambda *given: owned(*given)[:1])
 
 
 def replace_what_was_joined(patch: Patch) -> None:
@@ -168,7 +166,7 @@ def deliver_under_the_source_topic(patch: Patch) -> None:
 
 
 def send_a_source_topic_to_two_targets(patch: Patch) -> None:
-    patch(joining, "_route_conflicts", lambda *_: ())
+    patch(booking, "_route_conflicts", lambda *_: ())
 
 
 def leave_the_clients_of_a_released_connection(patch: Patch) -> None:
@@ -290,7 +288,7 @@ def book_what_is_denied(patch: Patch) -> None:
 
 
 def end_overrides_early(patch: Patch) -> None:
-    for module in (own_work, override_lifecycle):
+    for module in (own_work, relocation):
         expired = module.expired_overrides
         patch(
             module,

@@ -22,9 +22,9 @@ from demandops.model.demand.claim import Claim, Lease
 from demandops.model.ledger import claim_file
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.release import Release, ServiceRelease
-from demandops.render.paths import path_of
+from demandops.render.gitops import path_of
 from demandops.repo.history.commit_log import LogEntry
-from demandops.views.release_causes import versions_asked
+from demandops.views.explanations import versions_asked
 
 Json = dict[str, Any]
 Command = Callable[..., Any]

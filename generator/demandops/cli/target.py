@@ -7,7 +7,7 @@ the signing key. docs/commands.md describes the file.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -17,12 +17,16 @@ from pydantic import Field, StringConstraints, model_validator
 
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput, suggestion
+from demandops.base.naming import SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.base.strict_yaml import located_in
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, parse_file
-from demandops.repo.git.local_repository import checkout_around, origin_of
-from demandops.repo.git.open_repository import is_url
+from demandops.repo import reader
+from demandops.repo.git.local_repository import checkout_around, is_url, origin_of
+from demandops.repo.reader import Reader
+from demandops.repo.write.proposal_branch import pending_proposals
+from demandops.views import explanations
 
 if TYPE_CHECKING:
     pass  # DROPPED
@@ -280,3 +284,50 @@ clusters_option = click.option(
     help="A file that says how to reach the clusters; see docs/status.md [env: "
     "DEMANDOPS_CLUSTERS].",
 )
+
+
+# ---- name completion ----
+#
+# Completers for names from the state repo, by which a shell completes a command's arguments.
+
+Complete = Callable[[click.Context, click.Parameter, str], list[str]]
+
+
+def names_of(*kinds: str) -> Complete:
+    """Return a completer for names of these kinds; it offers no names if an error occurs."""
+
+    def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
+        try:
+            with ctx.scope(cleanup=False):
+                address = ctx.params.get("state_repo") or readable_repo()
+            if not address:
+                return []
+            # offline, because a shell waits for the names while a person types
+            with reader.opened_offline(address) as repo:
+                names = {name for kind in kinds for name in _names(repo, kind)} if repo else set()
+            return sorted(name for name in names if name.startswith(incomplete))
+        except Exception:  # an error must not disturb a person who is typing
+            return []
+
+    return complete
+
+
+def _names(repo: Reader, kind: str) -> Iterator[str]:
+    if kind == "proposals":
+        yield from (proposal.branch for proposal in pending_proposals(repo.repository))
+        return
+    world = repo.last_valid_snapshot(repo.commit()).state
+    if kind == "releases":
+        yield from (release.name for release in explanations.releases(world))
+    elif kind in ("requesters", "demands"):
+        yield from world.ledger.indexed_names(kind[:-1])
+    elif kind in ("applications", "connections"):
+        yield from world.ledger.subjects(SubjectKind(kind))
+    else:
+        yield from {
+            "nodes": world.config.nodes,
+            "domains": world.config.domains,
+            "overrides": world.config.overrides,
+            "appdefs": world.config.appdefs,
+            "services": {name: 0 for each in world.config.services.values() for name in each},
+        }[kind]

@@ -9,8 +9,7 @@ from typing import Any
 
 from demandops.base.runtime import REAL, Runtime
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health.health_reader import health_reader
-from demandops.cluster.health.release_health import ClusterDomain, Health, Key, ObjectSelector
+from demandops.cluster.health import ClusterDomain, Health, Key, ObjectSelector, health_reader
 
 log = logging.getLogger("demandops")
 

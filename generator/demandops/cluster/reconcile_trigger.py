@@ -25,13 +25,11 @@ from demandops.base.http_call import NoAnswer
 from demandops.base.runtime import REAL, Runtime
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cluster.clusters_file import ClusterAccess, NoAccess
-from demandops.cluster.health.flux import REQUESTED_AT, Flux
-from demandops.cluster.health.release_health import ClusterDomain, ObjectSelector
+from demandops.cluster.health import REQUESTED_AT, ClusterDomain, Flux, ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain
-from demandops.render.argocd import project_of
-from demandops.render.paths import domain_folder, domains_in_use
+from demandops.render.gitops import domain_folder, domains_in_use, project_of
 
 _TIMEOUT_S = 5.0
 _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")

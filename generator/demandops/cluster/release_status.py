@@ -7,18 +7,17 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Literal
 
-from demandops.cluster.health.health_reader import health_reader
-from demandops.cluster.health.release_health import (
+from demandops.cluster.health import (
     ClusterDomain,
     Health,
     History,
     State,
     Target,
+    health_reader,
     name_of,
 )
 from demandops.cluster.object_cache import ObjectCache
-from demandops.render.bootstrap import digest_in, digest_of
-from demandops.render.paths import bootstrap_path
+from demandops.render.gitops import bootstrap_path, digest_in, digest_of
 
 
 @dataclass(frozen=True, slots=True)

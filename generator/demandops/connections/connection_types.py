@@ -10,8 +10,7 @@ from pydantic_core import PydanticKnownError
 
 from demandops.base.errors import Fault, fault, sentences
 from demandops.base.naming import topic_problem
-from demandops.connections.connection import Connection, Route
-from demandops.connections.connection_type import UNSUPPORTED, ConnectionType
+from demandops.connections.connection import UNSUPPORTED, Connection, ConnectionType, Route
 from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH

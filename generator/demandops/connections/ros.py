@@ -14,13 +14,14 @@ from typing import Any
 
 from demandops.base import naming
 from demandops.base.errors import Fault, Refused, fault
-from demandops.connections.connection import Connection, Route
-from demandops.connections.connection_type import (
+from demandops.connections.connection import (
     UNSUPPORTED,
     ClientKey,
+    Connection,
     Connections,
     ConnectionType,
     End,
+    Route,
     make_end,
     message_type,
 )

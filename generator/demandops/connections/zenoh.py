@@ -15,11 +15,11 @@ from typing import Any
 
 from demandops.base import naming
 from demandops.base.errors import Fault, Refused, fault
-from demandops.connections.connection import Connection
-from demandops.connections.connection_type import (
+from demandops.connections.connection import (
     UNSUPPORTED,
     Client,
     ClientKey,
+    Connection,
     Connections,
     ConnectionType,
 )

@@ -7,14 +7,17 @@ after the remote got newer commits all call the same function.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import chain
 from typing import Literal
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
-from demandops.decide.admission import admission, permission
+from demandops.base.naming import Subject
+from demandops.decide import changeset, restoration, warnings
+from demandops.decide.admission import admission, admitted_request, permission
 from demandops.decide.admission.admitted_request import (
     Checkpoint,
     Throttle,
@@ -25,26 +28,31 @@ from demandops.decide.admission.admitted_request import (
     paced,
     permission_faults,
 )
-from demandops.decide.booking import restoration
-from demandops.decide.booking.apply import apply
-from demandops.decide.booking.leaving import Drain
-from demandops.decide.booking.restoration import Restoration
-from demandops.decide.changes import changeset
-from demandops.decide.changes.changeset import FileReader, ReleaseChange
+from demandops.decide.booking import Drain, apply
+from demandops.decide.changeset import Changeset, FileReader, ReleaseChange
 from demandops.decide.checks import collisions, quotas, version_difference
-from demandops.decide.decision_notes import notes_on
 from demandops.decide.placement import capacity, relocation
-from demandops.decide.planning import implied_connections
+from demandops.decide.planning import flows
 from demandops.decide.planning import planner as scale_downs
-from demandops.decide.planning.overrides import with_kept_claims, without_kept_claims
-from demandops.decide.planning.release_keys import ReleaseKey, affected_keys
+from demandops.decide.planning.flows import flows
+from demandops.decide.planning.overrides import (
+    with_kept_claims,
+    without_kept_claims,
+    without_suspended,
+)
+from demandops.decide.planning.planner import is_bridged
+from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, keys_of_claims
+from demandops.decide.restoration import Restoration
 from demandops.decide.state import State
 from demandops.model.config.config import Config
+from demandops.model.config.override import format_time
 from demandops.model.demand import demand_goal
+from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Decommission, DemandRequest
-from demandops.model.ledger.ledger import Changes
+from demandops.model.ledger import claim_file
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, changes_on
 from demandops.model.ledger.records import Instance, Wait
-from demandops.model.release import ServiceKey
+from demandops.model.release import ServiceKey, ServiceRelease
 
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "restored", "unchanged", "waiting"]
@@ -316,7 +324,7 @@ def _booked(
     # demands any longer, would contradict the request.
     ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
     if isinstance(request, Decommission):
-        ledger, changes = implied_connections.without_idle_deliveries(
+        ledger, changes = flows.without_idle_deliveries(
             state.ledger, replace(state, ledger=ledger), changes
         )
     after = replace(state, ledger=ledger)
@@ -361,3 +369,106 @@ def scale_down(
     )
     usage = state.usage().plus(_growth(state.config, change))
     return state.followed_by(after.ledger, change, usage), change
+
+
+# ---- notes that the requester gets about a decision, in addition to the outcome ----
+
+
+def notes_on(
+    request: DemandRequest, after: World, changes: Changes, rendered: Changeset
+) -> Iterator[str]:
+    """Yield notes for the requester of a demand that is booked and rendered, or that waits."""
+    yield from admitted_request.notes(request)
+    yield from _connection_warnings(request, after)
+    yield from warnings.notes(request, after)
+    yield from rendered.blocked
+    if changes.repeats is not None:
+        at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
+        yield f"the same shutdown was carried out at {at}, so this one releases nothing more"
+    if isinstance(request, Drain):
+        yield from request.stays
+    if isinstance(request, Wait):
+        yield from request.reasons
+    yield from quotas.warnings(request, after)
+    for release in (rendered.plans.get(ServiceKey.of(instance)) for instance in changes.kept):
+        if isinstance(release, ServiceRelease) and release.keeps:
+            until = format_time(release.keeps.until)
+            yield (
+                f"{release.name} keeps {release.replicas} replicas until {until} (downAfter in its "
+                "definition), although its demands need fewer"
+            )
+
+
+def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
+    # a connection that an override denies carries nothing
+    ledger = without_suspended(world).ledger
+    for item in request.demanded if request.adds_claims else ():
+        held = item.held
+        if isinstance(held, Application):
+            for flow in flows(world.config, held):
+                if not ledger.is_carried_to(flow.receiver, flow.target):
+                    yield (
+                        f"application '{held.id}': no connection carries {flow.topic} "
+                        f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
+                    )
+            continue
+        if item.note:
+            yield f"connection '{held.id}' {item.note}"
+        for route in held.topics:
+            if is_bridged(route, *held.nodes, world.config):
+                yield (
+                    f"connection '{held.id}': the initial deployment already carries "
+                    f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
+                    "the inventory), so no client of this connection carries it"
+                )
+
+
+# ---- claims that a person edits in the ledger: the effect of the edit, and the faults in it ----
+
+
+def changeset_of_edit(
+    state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
+) -> changeset.Changeset:
+    """Return the changes to rendered files after a person edited claims on ``subjects``."""
+    old = replace(state, ledger=before)
+    keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
+    # a template that takes too long is no fault of the claim, so its release keeps its file
+    return changeset.build_changeset(
+        old, state, Changes(), keys, state.evaluate, read, keeps_late=True
+    )
+
+
+def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) -> Iterator[Fault]:
+    """Yield the faults of claims that a person wrote, each located in the claim's file."""
+    for change in changes:
+        claim = change.after
+        # an edit that only takes requesters away has the effect of a release, which is allowed
+        if claim is None or _only_reduces(change):
+            continue
+        wanted, config = restoration.request_for(claim), after.config
+        malformed = list(admission.faults(wanted, config))
+        allowed = chain(
+            permission.faults(wanted, config),
+            quotas.quota_faults(before, after, Changes((change,))),
+        )
+        for each in malformed or allowed:
+            yield each.within(claim_file.path_of(claim.key))
+        yield from collisions.faults_of_claim(claim, before, after)
+        keys, changed = keys_of_claims(after, [claim]), Changes((change,))
+        faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names()))
+        without = replace(after, ledger=after.ledger.replace(change.key, change.before))
+        with suppress(Refused):  # other checks report a claim that cannot be planned
+            grown = capacity.growth_by(without, after, [change])
+            # only growth is a fault: the nodes may be full because of other claims
+            usage = after.usage().plus({need: -amount for need, amount in grown.items()})
+            faults += capacity.faults(usage, grown, config)
+        for each in faults:
+            yield each.within(claim_file.path_of(claim.key))
+
+
+def _only_reduces(change: ClaimChange) -> bool:
+    before, after = change.before, change.after
+    if before is None or after is None:
+        return False
+    as_before = replace(after, requesters=before.requesters, partial=before.partial)
+    return as_before == before and {*after.requesters} <= {*before.requesters}

@@ -10,7 +10,7 @@ from types import MappingProxyType
 from rpds import HashTrieMap
 
 from demandops.base.errors import Refused
-from demandops.decide.changes import changeset, trial_render
+from demandops.decide import changeset
 from demandops.decide.checks import collisions
 from demandops.decide.checks.collisions import Names
 from demandops.decide.placement import capacity
@@ -94,4 +94,4 @@ def rendered_files(
 
 def try_configuration(state: State) -> None:
     """Raise Refused or InvalidInput if an appdef or an override in effect does not work."""
-    trial_render.render_trial_demands(state, state.evaluate)
+    changeset.render_trial_demands(state, state.evaluate)

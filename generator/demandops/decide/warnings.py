@@ -17,7 +17,7 @@ from demandops.base.errors import MOST_FAULTS, Fault, fault, suggestion
 from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
-from demandops.decide.booking.leaving import Drain
+from demandops.decide.booking import Drain
 from demandops.decide.checks.collisions import all_names
 from demandops.decide.placement.capacity import overcommitted, whole_usage
 from demandops.decide.placement.choice import lacks, requirement_of, unmet
@@ -26,11 +26,11 @@ from demandops.decide.planning.flows import flows
 from demandops.decide.planning.overrides import without_suspended
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
-from demandops.model.demand.application import Application
+from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import DemandRequest
 from demandops.model.ledger import claim_file
 from demandops.model.ledger.ledger import World
-from demandops.templating import chart_files
+from demandops.templating import charts
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,12 +343,12 @@ def _kinds_of_charts(config: Config) -> Iterator[Fault]:
         for service in services.values():
             for source in config.charts[service.chart].sources():
                 top = source.folder
-                for folder in chart_files.folders(top, config.files) if top else ():
+                for folder in charts.folders(top, config.files) if top else ():
                     domains = domains_of.setdefault(folder, [])
                     domains += [domain for domain in allowing if domain not in domains]
     paths = sorted(config.files)
     for folder, domains in sorted(domains_of.items()):
-        for chart in chart_files.dependencies(folder, config.files):
+        for chart in charts.dependencies(folder, config.files):
             if (
                 chart.folder is None
                 and f"{folder}/charts/{chart.name}/Chart.yaml" not in config.files
@@ -359,7 +359,7 @@ def _kinds_of_charts(config: Config) -> Iterator[Fault]:
                     "kinds"
                 )
                 yield fault(f"dependencies[{chart.index}]", message).within(f"{folder}/Chart.yaml")
-        for path in chart_files.below(folder, paths):
+        for path in charts.below(folder, paths):
             name = path.removeprefix(f"{folder}/")
             if _CRDS.fullmatch(name):
                 yield from _refused(path, None, "CustomResourceDefinition", domains, config)

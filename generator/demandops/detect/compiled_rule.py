@@ -9,9 +9,8 @@ from math import floor, hypot
 from typing import NamedTuple
 
 from demandops.detect.condition import Count, Hours, Near, Threshold, Together
-from demandops.detect.detection_state import Cell, Key, Observation, Who
-from demandops.detect.rule_demand import Values
-from demandops.detect.rule_file import Rule
+from demandops.detect.observations import Cell, Key, Observation, Who
+from demandops.detect.rule_file import Rule, Values
 from demandops.model.config.base_model import seconds_of
 
 Seen = Mapping[Who, Observation]

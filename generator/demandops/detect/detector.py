@@ -8,10 +8,9 @@ from heapq import heappop, heappush
 from math import inf
 from typing import Any, Literal
 
-from demandops.detect.detection_state import Event, Key, Observation
 from demandops.detect.event_engine import EventEngine
-from demandops.detect.rule_demand import BookedDemand, Goal, Values
-from demandops.detect.rule_file import RuleFile
+from demandops.detect.observations import Event, Key, Observation
+from demandops.detect.rule_file import BookedDemand, Goal, RuleFile, Values
 from demandops.model.config.base_model import seconds_of
 
 

@@ -20,7 +20,7 @@ from demandops.detect.compiled_rule import (
     distance,
 )
 from demandops.detect.condition import Area
-from demandops.detect.detection_state import Event, Key, Observation, Phase, State, Who
+from demandops.detect.observations import Event, Key, Observation, Phase, State, Who
 from demandops.detect.rule_file import RuleFile
 from demandops.model.config.base_model import seconds_of
 

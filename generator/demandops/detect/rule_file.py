@@ -1,18 +1,23 @@
-"""The file of rules for the event detector, and the checks across its parts.
+"""The template of a rule's demand: plain data in whose texts ``{entity}`` stands for a value.
 
-:func:`read` reports many faults of a file together, each with its line and field. But the parts are
-compared only if the fields are valid, and a demand's form is checked only if its names are known.
+A text that is only a name in braces becomes the value itself, for example a number for ``{x}``.
+``{{`` and ``}}`` stand for single braces. A template has no expressions, attributes or formats.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from itertools import product
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
 from demandops.base.errors import Fault, InvalidInput, fault, suggestion
 from demandops.base.naming import message_type_problem
+from demandops.base.quoting import quoted
+from demandops.base.settings import API_VERSION
 from demandops.base.strict_yaml import located_in
 from demandops.detect.condition import (
     Count,
@@ -23,7 +28,6 @@ from demandops.detect.condition import (
     Together,
     topic_pattern_problem,
 )
-from demandops.detect.rule_demand import RuleDemand, faults_of_demand
 from demandops.model.config.base_model import (
     CamelModel,
     DnsLabel,
@@ -35,6 +39,316 @@ from demandops.model.config.base_model import (
     without,
 )
 from demandops.model.config.policy import Duration, Patterns, matches
+from demandops.model.demand import demand_goal, deployment_request_goal
+
+# The values of the names in a template.
+Values = Mapping[str, str | float]
+
+_TOKEN = re.compile(r"\{\{|\}\}|\{([^{}]*)\}|[{}]")
+# The pattern of an entity's name.
+_ENTITY = r"[A-Za-z0-9_.-]+"
+
+
+def is_entity(name: str) -> bool:
+    return bool(re.fullmatch(_ENTITY, name))
+
+
+def filled(template: Any, values: Values) -> Any:  # noqa: ANN401 - plain data
+    """Return a copy of a template in which values replace the names in braces.
+
+    Raises:
+        KeyError: if a name has no value; :func:`faults` reports such names.
+    """
+    # The template is parsed already, so a value cannot change the structure of the demand.
+    if isinstance(template, str):
+        alone = _TOKEN.fullmatch(template)
+        if alone and alone[1] is not None:
+            return values[alone[1]]
+        return _TOKEN.sub(
+            lambda token: token[0][0] if token[1] is None else str(values[token[1]]), template
+        )
+    if isinstance(template, Mapping):
+        return {str(filled(key, values)): filled(value, values) for key, value in template.items()}
+    if isinstance(template, list | tuple):
+        return [filled(item, values) for item in template]
+    return template
+
+
+def texts(template: Any, field: str) -> Iterator[tuple[str, str]]:  # noqa: ANN401
+    """Yield (path, text) for each text and each key in a template at the path ``field``."""
+    if isinstance(template, str):
+        yield field, template
+    elif isinstance(template, Mapping):
+        for key, value in template.items():
+            yield f"{field}.{key}", key
+            yield from texts(value, f"{field}.{key}")
+    elif isinstance(template, list | tuple):
+        for index, item in enumerate(template):
+            yield from texts(item, f"{field}[{index}]")
+
+
+def names(text: str) -> set[str]:
+    return {token[1] for token in _TOKEN.finditer(text) if token[1] is not None}
+
+
+def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
+    """Return a fault for each name in braces that ``known`` lacks, and for each stray brace.
+
+    A brace is stray if it is neither doubled nor part of a pair around a name.
+    """
+    problems = []
+    for path, text in texts(template, field):
+        for token in _TOKEN.finditer(text):
+            if token[0] in ("{", "}"):
+                message = f"has a single '{token[0]}'; write '{token[0] * 2}' for one brace"
+                problems.append(fault(path, message))
+            elif token[1] is not None and token[1] not in known:
+                message = f"'{{{token[1]}}}' has no value here"
+                problems.append(fault(path, message + suggestion(token[1], known)))
+    return problems
+
+
+def candidates(template: str, text: str) -> Mapping[str, str]:
+    """Return entities whose names turn the template into ``text``, by the names in braces.
+
+    If several combinations of entities give this text, the result is one of them. The result is
+    empty if none does, or if the template has no names in braces.
+    """
+    seen: set[str] = set()
+    pattern, end = "", 0
+    for token in _TOKEN.finditer(template):
+        pattern += re.escape(template[end : token.start()])
+        end = token.end()
+        if token[1] is None:
+            pattern += re.escape(token[0][0])
+        else:
+            pattern += f"(?P={token[1]})" if token[1] in seen else f"(?P<{token[1]}>{_ENTITY})"
+            seen.add(token[1])
+    matched = re.fullmatch(pattern + re.escape(template[end:]), text)
+    return matched.groupdict() if matched else {}
+
+
+# ---- what a rule demands: a template for goals of one of the two actions ----
+#
+# The template makes the goals that start, renew and end a demand. It also recognizes which demands
+# in the bookkeeping the rule has made, so that a restart of the detector changes nothing.
+
+Action = Literal["demand", "deployment_request"]
+
+
+@dataclass(frozen=True, slots=True)
+class Goal:
+    action: Action
+    data: Mapping[str, Any]
+
+    @property
+    def id(self) -> str:
+        """The id by which people know the goal: the demand's, or the request's."""
+        return str(self.data["demand" if self.action == "demand" else "id"])
+
+    @property
+    def requesters(self) -> tuple[str, ...]:
+        return tuple(sorted({*requesters_in(self.action, self.data)}))
+
+    @property
+    def action_name(self) -> str:
+        """The action's type in ROS: ``Demand`` or ``DeploymentRequest``."""
+        return "Demand" if self.action == "demand" else "DeploymentRequest"
+
+    @property
+    def document(self) -> Mapping[str, Any]:
+        """The goal in the form that a file for ``demandops request`` has."""
+        head = {"apiVersion": API_VERSION, "kind": "Demand"} if self.action == "demand" else {}
+        return {**head, **self.data}
+
+    def ended(self) -> Goal:
+        if self.action == "deployment_request":
+            return Goal(self.action, {**self.data, "shutdown": True})
+        kept = {name: self.data[name] for name in ("demand", "requesters")}
+        return Goal(self.action, {**kept, "operation": "release"})
+
+    def renewed(self) -> Goal:
+        if self.action == "deployment_request":
+            return self  # the same request again renews the leases of its claims
+        kept = {name: self.data[name] for name in ("demand", "requesters")}
+        return Goal(self.action, {**kept, "operation": "renew"})
+
+
+@dataclass(frozen=True, slots=True)
+class BookedDemand:
+    """A demand that the bookkeeping lists.
+
+    ``demand`` is the demand's id. It is empty for a demand by ``DeploymentRequest``, of which
+    ``request`` is the id.
+    """
+
+    demand: str
+    request: str
+    requesters: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class RuleDemand:
+    action: Action
+    data: Mapping[str, Any]
+
+    def goal(self, values: Values) -> Goal:
+        return Goal(self.action, filled(self.data, values))
+
+    def names(self) -> set[str]:
+        return {name for _, text in texts(self.data, "") for name in names(text)}
+
+    def outline(self, values: Values) -> Goal:
+        """Return the goal that starts the demand, if ``values`` has all names of the template.
+
+        If ``values`` lacks a name, the template must be that of a ``Demand``. The goal then has
+        only the demand's id and its requesters, which suffice to end the demand.
+        """
+        if self.names() <= set(values):
+            return self.goal(values)
+        kept = {name: self.data[name] for name in ("demand", "requesters")}
+        return Goal(self.action, filled(kept, values))
+
+    def subjects_of(
+        self, held: BookedDemand, subjects: tuple[str, ...], rule: str
+    ) -> Values | None:
+        """Return the entities of the event for which the rule made a booked demand.
+
+        ``subjects`` are the names by which the template refers to the event's entities. ``rule`` is
+        the name of the rule. Return ``None`` if the rule makes no demand with this id and these
+        requesters.
+        """
+        named = {*requesters_in(self.action, self.data)}
+        is_own, held_id = self.action == "demand", held.demand or held.request
+        if len(held.requesters) > len(named) or is_own != bool(held.demand):
+            return None
+        # The id alone may not tell the entities: ``{entity}-{other}`` can give ``a-b-c`` in two
+        # ways. So the requesters are read as well, and each combination is tried.
+        pairs = [(str(self.data["demand"] if is_own else self.data.get("id", "")), held_id)]
+        pairs += product(sorted(named), held.requesters)
+        entities: dict[str, set[str]] = {name: set() for name in subjects}
+        for template, text in pairs:
+            for name, entity in candidates(template, text).items():
+                entities.get(name, set()).add(entity)
+        for combination in product(*(sorted(entities[name]) for name in subjects)):
+            values = dict(zip(subjects, combination, strict=True))
+            goal = self.outline({"rule": rule, **values})
+            if (goal.id, goal.requesters) == (held_id, tuple(sorted(held.requesters))):
+                return values
+        return None
+
+
+def requesters_in(action: Action, data: Mapping[str, Any]) -> Iterator[str]:
+    if action == "demand":
+        yield from data.get("requesters", ())
+        return
+    for app in data.get("apps", ()):
+        yield from app.get("object_detection_fusion_app", {}).get("requester_ids", ())
+    for connection in data.get("connections", ()):
+        yield from connection.get("requester_ids", ())
+
+
+# ---- checks what a rule demands: the names in the template, the demand's form and its ids ----
+
+_HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
+# Values of the right types, with which the form of a demand is checked before any event.
+_SAMPLE: Values = {
+    "rule": "rule",
+    "entity": "entity",
+    "other": "other",
+    "x": 0.0,
+    "y": 0.0,
+    "distance": 0.0,
+    "value": 0.0,
+    "count": 1,
+}
+
+
+def faults_of_demand(
+    template: RuleDemand, field: str, subjects: tuple[str, ...], momentary: frozenset[str]
+) -> list[Fault]:
+    """Return the faults of a rule's demand: of its names, else of its form, else of its ids.
+
+    ``field`` is the path of the demand in the file. ``subjects`` are the names by which the
+    template refers to an event's entities, ``momentary`` those of values that are known only when
+    an event starts.
+    """
+    # A ``DeploymentRequest`` is sent again to renew it and with ``shutdown`` to end it. It must be
+    # the same then, also after a restart, when momentary values are not known.
+    known = {"rule", *subjects, *(momentary if template.action == "demand" else ())}
+    if problems := faults(template.data, field, known):
+        return problems
+    data = filled(template.data, _SAMPLE)
+    if template.action == "demand":
+        fixed = [name for name in ("apiVersion", "kind", "operation") if name in data]
+        malformed = demand_goal.parse({**_HEAD, **data})[1]
+    else:
+        fixed = ["shutdown"] if "shutdown" in data else []
+        malformed = deployment_request_goal.form_faults(data)
+    problems = [fault(f"{field}.{name}", "is set by the detector; remove it") for name in fixed]
+    written = dict(texts(template.data, field))
+    for problem in malformed:
+        path = f"{field}.{problem.field}" if problem.field else field
+        text, message = written.get(path, ""), problem.message
+        # The writer wrote a text such as ``{x}``, which becomes a number.
+        is_number = text.startswith("{") and isinstance(_SAMPLE.get(text[1:-1]), float | int)
+        if is_number and message.startswith("must be text"):
+            message = (
+                f"{quoted(text)} becomes a number, but this field needs text; write a word before "
+                f"{text}, such as 'near-{text}'"
+            )
+        problems.append(fault(path, message))
+    return problems or list(_faults_of_ids(template, field, {f"{{{name}}}" for name in subjects}))
+
+
+def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
+    """Yield a fault for each id that is missing, that may change, or that two entities would share.
+
+    ``needed`` are names in braces, such as ``{entity}``. They must be in the id of a ``Demand``, or
+    in the requesters of each application and connection of a ``DeploymentRequest``.
+    """
+    data: Any = template.data
+    if template.action == "demand":
+        yield from _missing(data, field, "demand", "requesters")
+        why = "otherwise two events would share one demand"
+        listed = [("demand", [data.get("demand", "")])]
+        for name, what in (("demand", "id"), ("requesters", "requesters")):
+            for path, text in texts(data.get(name, ()), f"{field}.{name}"):
+                if changing := sorted(names(text) - {"rule", "entity", "other"}):
+                    message = (
+                        f"'{{{changing[0]}}}' changes, but the demand's {what} must stay the same; "
+                    )
+                    yield fault(path, f"{message}leave that name out")
+    else:
+        yield from _missing(data, field, "id")
+        why = "a shutdown ends what its requesters hold, so each event needs its own requesters"
+        kind = "object_detection_fusion_app"
+        listed = [
+            (f"apps[{index}].{kind}.requester_ids", app.get(kind, {}).get("requester_ids", []))
+            for index, app in enumerate(data.get("apps", ()))
+        ]
+        listed += [
+            (f"connections[{index}].requester_ids", connection.get("requester_ids", []))
+            for index, connection in enumerate(data.get("connections", ()))
+        ]
+    for path, values in listed:
+        missing = needed - {f"{{{name}}}" for value in values for name in names(value)}
+        if missing and any(values):
+            named = " and ".join(sorted(missing))
+            yield fault(f"{field}.{path}", f"must name {named}, because {why}")
+
+
+def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: ANN401 - plain data
+    for name in needed:
+        if not data.get(name):
+            yield fault(f"{field}.{name}", "is missing; add it")
+
+
+# ---- the file of rules for the event detector, and the checks across its parts ----
+#
+# :func:`read` reports many faults of a file together, each with its line and field. But the parts
+# are compared only if the fields are valid, and a demand's form is checked only if its names are
+# known.
 
 # For some message types, the fields that have x and y; a source can name other fields instead.
 POSITIONS: Mapping[str, tuple[str, str]] = {

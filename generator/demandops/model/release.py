@@ -7,15 +7,14 @@ from dataclasses import dataclass
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Refused, suggestion
-from demandops.connections.connection_type import Client
+from demandops.connections.connection import Client
 from demandops.model.config.appdef import Resource, Scaling, Scope, Service
 from demandops.model.config.config import CHARTS_FILE, VERSIONS_FILE, Config
 from demandops.model.config.inventory import Node
 from demandops.model.config.override import UNSHAPED, Shaping, format_time
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ApplicationVersion, ChartSource, Image
-from demandops.model.demand.application import InputTopic
-from demandops.model.demand.claim import Claim
+from demandops.model.demand.claim import Claim, InputTopic
 from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import Instance, Kept, Steps

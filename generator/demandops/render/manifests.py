@@ -17,10 +17,10 @@ import jsonschema_rs
 
 from demandops.base.errors import InvalidInput, Refused, fault, field_path
 from demandops.base.settings import data_folder
-from demandops.connections.connection_type import UNSUPPORTED, Client
+from demandops.connections.connection import UNSUPPORTED, Client
 from demandops.model.config.config import IMAGES_FILE, Config
 from demandops.model.release import Release, ServiceRelease
-from demandops.render import argocd, flux
+from demandops.render import gitops
 from demandops.templating import engine
 from demandops.templating.values import Evaluate, ValuesTask
 
@@ -184,8 +184,8 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
         return render_connection(release, config)
     values = values_of(release, config, evaluate)
     if config.repo_settings.gitops == "argocd":
-        return argocd.render(release, values, config.repo_settings)
-    return flux.render(release, values)
+        return gitops.argocd_manifests(release, values, config.repo_settings)
+    return gitops.flux_manifests(release, values)
 
 
 def base_files(config: Config) -> dict[str, str]:
@@ -193,5 +193,5 @@ def base_files(config: Config) -> dict[str, str]:
     # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
     # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
     if config.repo_settings.gitops == "argocd":
-        return argocd.base_files(config)
-    return flux.base_files(config)
+        return gitops.argocd_base_files(config)
+    return gitops.flux_base_files(config)

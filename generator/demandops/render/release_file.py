@@ -25,7 +25,7 @@ from demandops.model.config.override import Override, format_time
 from demandops.model.ledger.ledger import World
 from demandops.model.release import Release
 from demandops.render import manifests
-from demandops.render.paths import CLUSTERS_ROOT
+from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.templating.values import Evaluate
 
 # whose schemas check the objects of built-in kinds

@@ -15,14 +15,13 @@ from demandops.base import settings
 from demandops.base.errors import Fault, InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import FieldLines, with_lines
-from demandops.decide.booking.restoration import Restoration
-from demandops.decide.changes.changeset import FileReader
+from demandops.decide.changeset import FileReader
+from demandops.decide.restoration import Restoration
 from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
 from demandops.repo import verification
 from demandops.repo.git import tree as trees
-from demandops.repo.git.local_repository import LastFetch
-from demandops.repo.git.open_repository import connect, is_url
+from demandops.repo.git.local_repository import LastFetch, connect, is_url
 from demandops.repo.git.repository import StateRepository, access_error, reading
 from demandops.repo.history import commit_log, commit_message, revisions
 from demandops.repo.history.commit_log import LogEntry, PathHistory

@@ -14,8 +14,8 @@ from pygit2 import Commit, Oid, Repository, Tree
 
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
+from demandops.decide.planning.planner import TracedPlan
 from demandops.decide.planning.release_keys import ReleaseKey
-from demandops.decide.planning.traced_plan import TracedPlan
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.config.repo_settings import ROOT_FILE
@@ -25,9 +25,9 @@ from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.ledger.records import Instance
 from demandops.model.release import Release
 from demandops.render import manifests, release_file
-from demandops.render.paths import path_of
+from demandops.render.gitops import path_of
+from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
-from demandops.repo.history import allowed_signers
 from demandops.repo.history.commit_log import PROPOSAL, LogEntry, entry_of
 from demandops.repo.load import ledger_files, state_in_effect
 from demandops.repo.load.snapshot import changed_kept_replicas
@@ -314,17 +314,15 @@ def _blob(text: str) -> Oid:
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
     """Return the verdicts; one of a generator's commit fails if it lacks a required signature."""
     pairs = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
-    checks = allowed_signers.checks(
-        repo, [commit for _, commit in pairs if entry_of(commit).by_generator]
-    )
+    checks = signing.checks(repo, [commit for _, commit in pairs if entry_of(commit).by_generator])
     signed = []
     for verdict, commit in pairs:
-        check = checks.get(verdict.commit, allowed_signers.Check())
+        check = checks.get(verdict.commit, signing.Check())
         signed.append(
             replace(
                 verdict,
                 holds=verdict.holds and not check.fault,
-                signed=bool(allowed_signers.signature_of(commit)),
+                signed=bool(signing.signature_of(commit)),
                 signer=check.signer,
                 signature=check.fault,
             )

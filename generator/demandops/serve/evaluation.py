@@ -1,28 +1,70 @@
-"""Evaluates one demand on top of the commits of its batch.
+"""A rollback as a goal: plain data that passes through queue and journal like a demand.
 
-A demand that fails gets the error as its answer. The other demands of the batch continue.
+Only the command line makes this goal; actions and request files cannot contain it. The goal is
+evaluated on the newest tip, so a rollback works while others write. What others book until then
+counts as newer than the commit to roll back to.
 """
 
 from __future__ import annotations
 
 import logging
 from math import inf
+from typing import Any
 
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, Withdrawn, fault, internal
+from demandops.base.settings import API_VERSION
+from demandops.cluster.rollouts import targets_of_decision
 from demandops.decide.decision import Decision, Outcome, decide
+from demandops.decide.restoration import Restoration
 from demandops.model.demand.demand_request import Decommission
 from demandops.repo.git.repository import StateRepository, disk_error
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history.commit_log import operations_since
+from demandops.repo.load.ledger_files import restoration
+from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.serve import rollback_goal
 from demandops.serve.approvals.approvals import Approvals, Result
 from demandops.serve.approvals.proposal import is_release
 from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.serve.queue import Receipt, Ticket, receipt_of
-from demandops.serve.rollout_targets import targets_of_decision
-from demandops.serve.timing.limits import RateLimit, within
+from demandops.serve.timing.timers import RateLimit, within
 from demandops.templating.evaluator import DEMAND_S, processor_time
+
+_KIND = "Rollback"
+
+
+def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
+    """Return the goal to book the claims of the commit ``to`` again."""
+    return {
+        "apiVersion": API_VERSION,
+        "kind": _KIND,
+        "to": to,
+        "dropNewer": drop_newer,  # without it, newer claims make the rollback fail
+        "reason": " ".join(reason.split()),
+        "by": list(who),
+    }
+
+
+def is_rollback(goal: object) -> bool:
+    return isinstance(goal, dict) and goal.get("kind") == _KIND
+
+
+def to_restoration(
+    goal: dict[str, Any], repository: StateRepository, head: Snapshot
+) -> Restoration:
+    """Return the restoration that a goal requests; Refused if ``head`` lacks its commit."""
+    to = str(goal["to"])
+    if not repository.includes(str(head.commit), to):
+        message = f"commit {to} is not in the history of the state repo; roll back to one that is"
+        raise Refused([fault("", message)])
+    by, email = goal["by"]
+    more = {"drop_newer": bool(goal["dropNewer"]), "reason": goal["reason"]}
+    return restoration(repository.objects, to, **more, by=by, email=email)
+
+
+# ---- evaluates one demand on top of the commits of its batch ----
+#
+# A demand that fails gets the error as its answer. The other demands of the batch continue.
 
 log = logging.getLogger("demandops")
 
@@ -50,8 +92,8 @@ class Evaluator:
             return Withdrawn(TAKEN_BACK)
         try:
             goal = ticket.goal
-            if rollback_goal.is_rollback(goal):
-                goal = rollback_goal.to_restoration(goal, self._repository, commits.start)
+            if is_rollback(goal):
+                goal = to_restoration(goal, self._repository, commits.start)
             state = commits.head.state
             # of all services, once for each configuration; that is not this demand's work
             state.usage()
@@ -136,7 +178,7 @@ class Evaluator:
             outcome: Outcome = "booked"
             if record.outcome != "changed":
                 outcome = record.outcome
-            elif rollback_goal.is_rollback(ticket.goal):
+            elif is_rollback(ticket.goal):
                 outcome = "restored"
             elif is_release(ticket.goal) or Decommission.is_goal(ticket.goal):
                 outcome = "released"

@@ -14,7 +14,7 @@ from demandops.base.errors import Refused, fault
 from demandops.base.runtime import REAL, Runtime
 from demandops.decide.admission import admission
 from demandops.model.config.config import Config
-from demandops.repo.git.open_repository import connect
+from demandops.repo.git.local_repository import connect
 from demandops.repo.git.repository import access_error, reading
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import revisions
@@ -24,9 +24,8 @@ from demandops.repo.write.journal import Slot
 from demandops.serve.approvals.approvals import Approvals
 from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.queue import Listener, Ticket
-from demandops.serve.status import RemoteStatus
 from demandops.serve.timing.timers import Heartbeat
-from demandops.serve.worker import Worker
+from demandops.serve.worker import RemoteStatus, Worker
 
 log = logging.getLogger("demandops")
 

@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import quoted
-from demandops.cluster.health.release_health import Target
+from demandops.cluster.health import Target
 from demandops.decide.decision import Decision, Outcome
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo.write.journal import JournalEntry, ProposalRecord

@@ -21,7 +21,7 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path
 from demandops.base.quoting import quoted
 from demandops.base.strict_yaml import not_writable
-from demandops.templating import chart_files
+from demandops.templating import charts
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
 
 _EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
@@ -245,7 +245,7 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
         template = files[task.template]
         raise InvalidInput(with_template_lines(error.faults, template, text)) from None
     for override, patch in task.patches:
-        values = chart_files.merge_patch(values, patch)
+        values = charts.merge_patch(values, patch)
         if task.chart:
             _check(values, task.chart, files, override, "the override")
     return values
@@ -323,7 +323,7 @@ def _check(
         return
     schema = validator(files[path], path)
     # as Helm does, because a schema may require a value that has a default
-    merged = chart_files.merged(chart_files.defaults(chart, files), values)
+    merged = charts.merged(charts.defaults(chart, files), values)
     faults = [
         fault(
             f"values.{place}" if place else "values", f"{error.message}; fix {author} or {chart}"

@@ -19,7 +19,7 @@ from demandops.model.demand.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import ServiceRelease, claims_of
-from demandops.views import release_causes
+from demandops.views import explanations
 
 _LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
 # Topic → the requesters of the topic, sorted.
@@ -115,7 +115,7 @@ class Bookkeeping:
 def bookkeeping(world: World) -> Bookkeeping:
     active = without_suspended(world)
     services = {}
-    for release in release_causes.releases(world):
+    for release in explanations.releases(world):
         if not isinstance(release, ServiceRelease):
             continue
         inputs = {
@@ -134,7 +134,7 @@ def bookkeeping(world: World) -> Bookkeeping:
             source_topic=release.key.topic,
             version=release.chart.version,
             application_version=release.version.name or None,
-            versions_asked=release_causes.versions_asked(release, active.ledger),
+            versions_asked=explanations.versions_asked(release, active.ledger),
             parameters=dict(release.parameters),
             inputs={role: _sorted(topics) for role, topics in inputs.items()},
             requesters=list(release.requesters),

@@ -9,8 +9,7 @@ from typing import TypeVar
 
 from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
-from demandops.web.filtered_table import Filter, Row
-from demandops.web.lists import rows_of
+from demandops.web.lists import Filter, Row, rows_of
 from demandops.web.situation import RANKS, WORDS, Situation, word_of
 
 WIDTH = 1200.0

@@ -12,9 +12,9 @@ from itertools import islice
 from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL, Runtime
+from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health.health_reader import health_reader
-from demandops.cluster.health.release_health import ClusterDomain, Target
+from demandops.cluster.health import ClusterDomain, Target, health_reader
 from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.release_status import (
     OldBootstrap,
@@ -29,7 +29,6 @@ from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
-from demandops.serve import rollout_targets
 from demandops.web.situation import Commit, CommitState, HealthChange, Situation, word_of
 
 # How many changes of health are kept. They are in memory only, because the page writes nothing.
@@ -299,7 +298,7 @@ class Follower:
         if not watch.clusters:
             return situation
         targets = [target for _, target in commit_state.targets]
-        domains = rollout_targets.domains_of_state(commit_state.state)
+        domains = rollouts.domains_of_state(commit_state.state)
         return replace(
             situation,
             statuses=watch.statuses(targets, commit, repository),

@@ -18,8 +18,8 @@ from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import GENERATOR_NAME, LogEntry
 from demandops.repo.load.last_valid_config import Problem
-from demandops.views import release_causes
-from demandops.web.filtered_table import Cell, Filter, Link, Part, Row, cell, exactly
+from demandops.views import explanations
+from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of, worst_word
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
@@ -283,7 +283,7 @@ def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[
         applications = _applications_with(commit_state, claims)
         denials.append((override, what, "is booked", claims, applications, ()))
     for release, override in commit_state.denied:
-        claims = release_causes.claims_behind(commit_state.active.ledger, release)
+        claims = explanations.claims_behind(commit_state.active.ledger, release)
         what = Part(release.description, Link("release", {"name": release.name}))
         applications = release.applications if isinstance(release, ServiceRelease) else ()
         denials.append((override, what, "is needed", claims, applications, (release.name,)))

@@ -10,7 +10,8 @@ from typing import Any
 
 from demandops.base.errors import Fault
 from demandops.base.naming import Subject, SubjectKind
-from demandops.cluster.health.release_health import Health, Target
+from demandops.cluster import rollouts
+from demandops.cluster.health import Health, Target
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import denied_release, plan
@@ -30,9 +31,8 @@ from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.last_valid_config import Problem
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.proposal_branch import PendingProposal
-from demandops.serve import rollout_targets
-from demandops.views import release_causes
-from demandops.views.override_report import Entry, override_report
+from demandops.views import explanations
+from demandops.views.explanations import Entry, override_report
 
 # The words for a health, each with its color on the page, from the worst to the best health.
 WORDS = {
@@ -203,16 +203,16 @@ class CommitState:
                 continue
             kept = [claim for claim in planned.claims if id(claim) not in gone]
             added = [claim for id in ids for claim in fresh[kind].get(id, ())]
-            needing = [claim for claim in added if release_causes.needs(claim, release)]
+            needing = [claim for claim in added if explanations.needs(claim, release)]
             if needing or len(kept) < len(planned.claims):
-                yield key, replace(planned, claims=release_causes.by_booking([*kept, *needing]))
+                yield key, replace(planned, claims=explanations.by_booking([*kept, *needing]))
 
     def _plan(self, key: ReleaseKey) -> Planned | None:
         release = plan(self.state, key)
         if release is None:
             return None
-        target = rollout_targets.target_of(release, self.config.repo_settings)
-        return Planned(release, target, release_causes.claims_behind(self.active.ledger, release))
+        target = rollouts.target_of(release, self.config.repo_settings)
+        return Planned(release, target, explanations.claims_behind(self.active.ledger, release))
 
     @property
     def planned(self) -> dict[ReleaseKey, Planned | None]:

@@ -1,31 +1,233 @@
-"""The detector's status on ``/diagnostics``: its rules, its data and its demands."""
+"""Subscriptions to the topics that match the sources of rules.
+
+Topics may appear and vanish at any time.
+"""
 
 from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from importlib import import_module
+from math import inf
 from pathlib import Path
 from typing import Any
 
-from demandops.base.errors import InvalidInput
-from demandops.base.quoting import one_line
+from application_manager_interfaces.action import DeploymentRequest
+from demandops.base.errors import Fault, InvalidInput, fault
+from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
-from demandops.detect.detection_state import Observation
-from demandops.detect.detector import Detector, booked_events
-from demandops.detect.rule_file import RuleFile, read
+from demandops.detect.condition import entity_in
+from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDemands, booked_events
+from demandops.detect.observations import Key, MessageReader, Observation, Unreadable
+from demandops.detect.rule_file import Goal, RuleFile, read
 from demandops_interfaces.msg import Bookkeeping
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 
 from demandops_ros import ros_process
+from demandops_ros.actions import DemandError, GoalSender
+from demandops_ros.client import DemandClient
 from demandops_ros.detector import detect_command
-from demandops_ros.detector.demand_sender import DemandSender
-from demandops_ros.detector.source_subscriptions import SourceSubscriptions, faults_of_types
-from demandops_ros.publications import status
+from demandops_ros.messages import fill_message
+from demandops_ros.node import status
+
+# A subscription is reliable if all publishers that it finds are. The queue is deep, because many
+# entities may share a topic.
+_QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
+
+
+def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class
+    package, _, name = type_name.split("/")
+    try:
+        return getattr(import_module(f"{package}.msg"), name, None)
+    except ModuleNotFoundError:
+        return None
+
+
+def faults_of_types(file: RuleFile) -> list[Fault]:
+    """Return a fault for each source whose message type is not installed."""
+    return [
+        fault(
+            f"sources.{name}.type",
+            f"{source.type} is not installed; install its package, or start the detector in a "
+            "workspace that has it",
+        )
+        for name, source in file.sources.items()
+        if message_class(source.type) is None
+    ]
+
+
+class SourceSubscriptions:
+    def __init__(
+        self,
+        node: Node,
+        file: RuleFile,
+        now: Callable[[], float],
+        observe: Callable[[Observation], None],
+    ) -> None:
+        self._node, self._file, self._now, self._observe = node, file, now, observe
+        self._readers = {name: MessageReader(file, name) for name in file.sources}
+        self._subscriptions: dict[tuple[str, str], Any] = {}
+        self._told: set[str] = set()
+        self.messages = self.unreadable = 0
+
+    @property
+    def topics(self) -> int:
+        return len(self._subscriptions)  # a topic counts once for each source that reads it
+
+    def refresh(self) -> None:
+        """Subscribe to new topics, and leave those that nobody publishes any longer."""
+        published: Mapping[str, list[str]] = dict(self._node.get_topic_names_and_types())
+        for name, source in self._file.sources.items():
+            for topic, types in published.items():
+                entity = entity_in(source.topic, topic)
+                if entity is None or (name, topic) in self._subscriptions:
+                    continue
+                if source.type not in types:
+                    self._tell_once(
+                        f"{topic} is not read, because its type is {', '.join(types)}, and source "
+                        f"{name} reads {source.type}"
+                    )
+                elif self._node.count_publishers(topic):
+                    self._subscriptions[name, topic] = self._node.create_subscription(
+                        message_class(source.type),
+                        topic,
+                        partial(self._read, name, topic, entity),
+                        _QOS,
+                    )
+        for key in [*self._subscriptions]:
+            if not self._node.count_publishers(key[1]):
+                self._node.destroy_subscription(self._subscriptions.pop(key))
+
+    def close(self) -> None:
+        while self._subscriptions:
+            self._node.destroy_subscription(self._subscriptions.popitem()[1])
+
+    def _read(self, source: str, topic: str, entity: str, message: Any) -> None:  # noqa: ANN401
+        self.messages += 1
+        try:
+            self._observe(self._readers[source].observation(message, entity, self._now()))
+        except Unreadable as error:
+            self.unreadable += 1
+            self._tell_once(f"a message on {topic} is left out: {error}")
+
+    def _tell_once(self, text: str) -> None:
+        if text not in self._told and len(self._told) < 1000:  # what is told is kept in memory
+            self._told.add(text)
+            self._node.get_logger().warning(one_line(text))
+
+
+# ---- sends the demands of events in separate threads, and sends a failed demand again ----
+
+# How many goals are sent at the same time; the node publishes such goals together.
+_THREADS = 8
+_LONGEST_WAIT_S = 60.0
+
+Log = Callable[[str, str], None]  # of a level, `info` or `warning`, and a text
+
+
+class DemandSender:
+    """Keeps the demands of the current events booked: sends, retries and renews them."""
+
+    def __init__(
+        self, action_name: str, demand_action_name: str, timeout_s: float, log: Log
+    ) -> None:
+        self._log = log
+        self._wanted = WantedDemands()
+        self._changed = REAL.condition()
+        self._is_closed = False
+        self._demands = DemandClient(
+            action_name=demand_action_name,
+            node_name="demandops_detector_client",
+            timeout_s=timeout_s,
+        )
+        self._requests = GoalSender(
+            DeploymentRequest, action_name, "demandops_detector_requests", timeout_s
+        )
+        self._threads = [
+            REAL.keep_running(f"sender-{number}", self._run) for number in range(_THREADS)
+        ]
+
+    def close(self) -> None:
+        """Stop sending; demands that are booked stay booked."""
+        with self._changed:
+            self._is_closed = True
+            self._changed.notify_all()
+        self._demands.close()
+        self._requests.close()
+
+    def want(self, wants: Iterable[Want], booked: Mapping[Key, Goal] | None = None) -> None:
+        """Record the demands that events need from now on, and send the goals for them.
+
+        ``booked`` has the events whose demands were booked before the detector started, each with a
+        goal that can end the demand.
+        """
+        with self._changed:
+            for key, goal in (booked or {}).items():
+                self._wanted.hold(key, goal)
+            for want in wants:
+                self._wanted.want(want)
+            self._changed.notify_all()
+
+    def summary(self) -> tuple[int, int, list[tuple[Key, str]]]:
+        """Return how many events want or hold a demand, and how many of these have no answer yet.
+
+        The third value has the events whose last goal failed, each with the reason.
+        """
+        with self._changed:
+            return len(self._wanted), self._wanted.unanswered(), list(self._wanted.refusals())
+
+    def _run(self) -> None:
+        while (sending := self._take()) is not None:
+            outcome = self._send(sending.goal)
+            with self._changed:
+                told = self._wanted.answered(sending, outcome, REAL.monotonic())
+                self._changed.notify_all()
+            rule, subjects = sending.key
+            what = f"{sending.purpose} of {quoted(sending.goal.id)}"
+            if subjects:
+                what += f" for {', '.join(subjects)}"
+            if told:
+                self._log("warning", f"rule {rule}: {what} failed and will be tried again: {told}")
+            elif not outcome.code and sending.purpose != "renew":
+                self._log("info", f"rule {rule}: {what}: {outcome.message}")
+
+    def _take(self) -> Sending | None:
+        """Wait for a goal to send; return None once the sender is closed."""
+        with self._changed:
+            while not self._is_closed:
+                now = REAL.monotonic()
+                if sending := self._wanted.next(now):
+                    return sending
+                pause = self._wanted.next_at() - now
+                self._changed.wait(None if pause == inf else max(0.0, min(pause, _LONGEST_WAIT_S)))
+        return None
+
+    def _send(self, goal: Goal) -> Outcome:
+        try:
+            if goal.action == "demand":
+                answer = self._demands.send(goal.data)
+                texts = (f"{answer.outcome} in {answer.commit}", *answer.warnings)
+                return Outcome("", one_line("; warning: ".join(texts)), answer.lease_s)
+            succeeded, result, _ = self._requests.send(
+                fill_message(DeploymentRequest.Goal(), dict(goal.data))
+            )
+            lines = result.message.split("\n")
+            text = one_line("; ".join(lines if succeeded else lines[:1]))
+            # a failed request begins with the code, as this action has no field for it
+            return Outcome("" if succeeded else text.partition(":")[0] or "aborted", text)
+        except DemandError as error:
+            return Outcome(error.code, one_line(str(error)))
+        except Exception as error:  # a value that the message cannot carry, or a closed client
+            return Outcome("fault", one_line(repr(error)))
+
+
+# ---- the detector's status on ``/diagnostics``: its rules, its data and its demands ----
 
 _MOST_REFUSALS = 20
 

@@ -16,11 +16,9 @@ from demandops.cli import json_output
 from demandops.cli.output import errors
 from demandops.cli.table import Column, Table
 from demandops.detect.condition import Count, Near, entity_in
-from demandops.detect.detection_state import Event, Key, Observation
 from demandops.detect.detector import Detector
-from demandops.detect.message_reader import MessageReader, Unreadable
-from demandops.detect.rule_demand import Goal
-from demandops.detect.rule_file import RuleFile
+from demandops.detect.observations import Event, Key, MessageReader, Observation, Unreadable
+from demandops.detect.rule_file import Goal, RuleFile
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 

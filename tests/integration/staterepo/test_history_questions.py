@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from demandops.repo import reader
-from demandops.repo.git.open_repository import connect
+from demandops.repo.git.local_repository import connect
 
 from tests.kit import rig
 from tests.kit.rig import Person

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.errors import InvalidInput, Refused
-from demandops.serve import rollback_goal
+from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 from demandops.serve.queue import Receipt
 
@@ -144,7 +144,7 @@ def test_the_connections_of_a_demand_follow_a_moved_service_also_through_a_rollb
     assert {*moved} - {*plain} > {"derived/edge/cloud"}
     assert "perception" in follow_of(bare, cause).all("Demand-Id")
     who = ("A", "a@example.org")
-    rolled = rollback_goal.goal(before, drop_newer=True, reason="x", who=who)
+    rolled = evaluation.goal(before, drop_newer=True, reason="x", who=who)
     assert rig.receipt(generator.submit(rolled)).outcome == "restored"
     assert "derived/edge/cloud" in rig.books(bare)["connections"], (
         "the connection must last as long as the override"

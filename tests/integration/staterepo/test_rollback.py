@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 from demandops.base.errors import Refused
-from demandops.serve import rollback_goal
+from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -15,7 +15,7 @@ from tests.kit import rig
 
 def goal_of(to: str, *, drop_newer: bool) -> dict[str, object]:
     who = ("A person", "person@example.org")
-    return rollback_goal.goal(to, drop_newer=drop_newer, reason="a test", who=who)
+    return evaluation.goal(to, drop_newer=drop_newer, reason="a test", who=who)
 
 
 def test_it_is_judged_on_what_others_booked_meanwhile(url: str, bare: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from demandops.repo import reader
 from demandops.repo.verification import Verdict
-from demandops.serve import rollback_goal
+from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -125,7 +125,7 @@ def test_rolling_back_leaves_to_overrides_what_they_keep(
     assert len(rig.claims(bare, "override:lasting")) == 1
 
     def back(to: str) -> str:
-        goal = rollback_goal.goal(to, drop_newer=False, reason="x", who=("A", "a@example.org"))
+        goal = evaluation.goal(to, drop_newer=False, reason="x", who=("A", "a@example.org"))
         return rig.receipt(generator.submit(goal)).outcome
 
     assert back(asked) == "restored", "a claim that an override keeps must not count as newer"
@@ -138,7 +138,7 @@ def test_rolling_back_leaves_to_overrides_what_they_keep(
     assert back(kept) == "unchanged", "without the override, the rollback must change nothing"
     person.override(lasting=keep)
     rig.book(generator, rig.goal(2), rig.leave(2))
-    rolled = rollback_goal.goal(kept, drop_newer=True, reason="x", who=("A", "a@example.org"))
+    rolled = evaluation.goal(kept, drop_newer=True, reason="x", who=("A", "a@example.org"))
     assert rig.receipt(generator.submit(rolled)).outcome == "restored"
     assert len(rig.claims(bare, "override:lasting")) == 2
     assert all(verdict.holds for verdict in verdicts(bare).values())
@@ -154,7 +154,7 @@ def test_rolling_back_leaves_the_markers_alone(
     person.override(brief=expired)
     rig.book(generator, rig.leave(1))
     marker = file(bare, "ledger/overrides/brief.yaml")
-    goal = rollback_goal.goal(before, drop_newer=False, reason="x", who=("A", "a@example.org"))
+    goal = evaluation.goal(before, drop_newer=False, reason="x", who=("A", "a@example.org"))
     assert rig.receipt(generator.submit(goal)).outcome == "restored"
     assert file(bare, "ledger/overrides/brief.yaml") == marker
     rig.assert_sound(bare)

@@ -14,8 +14,8 @@ import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.web import not_ready
-from demandops.web.filtered_table import Filter
 from demandops.web.follower import Follower
+from demandops.web.lists import Filter
 from demandops.web.server import Site
 from demandops.web.situation import Situation
 from starlette.testclient import TestClient

@@ -16,10 +16,9 @@ import pytest
 import yaml
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
-from demandops.web import fleet_map, view_pages
-from demandops.web.filtered_table import Filter
+from demandops.web import fleet_map, server
 from demandops.web.follower import Follower
-from demandops.web.lists import LISTS, rows_of
+from demandops.web.lists import LISTS, Filter, rows_of
 from demandops.web.server import Site
 from demandops.web.situation import CommitState
 from starlette.testclient import TestClient
@@ -97,7 +96,7 @@ def test_too_many_causes_are_counted(
     booked.fetch_now()
     wait_until(lambda: booked.snapshot.problems, "the generator reports them")
     assert "more causes" not in look("/").text
-    monkeypatch.setattr(view_pages, "_MOST_CAUSES", 1)
+    monkeypatch.setattr(server, "_MOST_CAUSES", 1)
     page = look("/")
     assert len(page.texts("h3")) == 1 and "and 1 more causes; filter to see them" in page.text
     assert page.texts("h1") == ["2 things need attention"]

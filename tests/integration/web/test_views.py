@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 from demandops.base.errors import StateRepoError
-from demandops.cluster.health.release_health import Health
+from demandops.cluster.health import Health
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
 from demandops.web import fleet_map
-from demandops.web.filtered_table import Filter
 from demandops.web.follower import Follower
-from demandops.web.lists import rows_of
+from demandops.web.lists import Filter, rows_of
 from demandops.web.not_ready import remedy_of
 from demandops.web.release_view import explained_demand
 from demandops.web.situation import CommitState, Situation

@@ -17,8 +17,8 @@ import pytest
 import yaml
 from demandops.base.errors import InvalidInput
 from demandops.model.config.load import load
-from demandops.templating import chart_files
-from demandops.templating.chart_files import merged
+from demandops.templating import charts
+from demandops.templating.charts import merged
 
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.goals import application, goal
@@ -30,7 +30,7 @@ CHARTS = ("object-detection", "object-fusion")
 
 
 def chart_values(chart: str) -> dict[str, Any]:
-    return chart_files.defaults(f"appdefs/{APPDEF.name}/charts/{chart}", skeleton())
+    return charts.defaults(f"appdefs/{APPDEF.name}/charts/{chart}", skeleton())
 
 
 def chart_schema(chart: str) -> dict[str, Any]:
@@ -261,7 +261,7 @@ def test_the_first_of_two_imports_of_a_value_counts() -> None:
         "appdefs/a/values.yaml": "own: 1\n",
         "appdefs/lib/values.yaml": "exports:\n  first: {x: 1}\n  second: {x: 2, y: 2, own: 2}\n",
     }
-    assert chart_files.defaults("appdefs/a", files) == {"x": 1, "y": 2, "own": 1}
+    assert charts.defaults("appdefs/a", files) == {"x": 1, "y": 2, "own": 1}
 
 
 def test_a_topic_of_two_sources_is_read_once() -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from demandops.templating import chart_schema
+from demandops.templating import charts
 
 ROOT = Path(__file__).parents[3]
 LIBRARY = ROOT / "appdefs" / "charts" / "ros-service"
@@ -27,7 +27,7 @@ def schema(chart: Path) -> str:
     """Return the schema that a chart must have: its own properties and those of the library."""
     known = json.loads((chart / "values.schema.json").read_text())
     library = json.loads((LIBRARY / "values.schema.json").read_text())
-    library_properties = library["definitions"][chart_schema.EXPORT]["properties"]
+    library_properties = library["definitions"][charts.EXPORT]["properties"]
     of_library, of_chart = (
         {name: without_descriptions(inner) for name, inner in properties.items()}
         for properties in (library_properties, known["properties"])
@@ -35,10 +35,10 @@ def schema(chart: Path) -> str:
     own = {
         name: inner
         for name, inner in of_chart.items()
-        if name not in (chart_schema.LIBRARY, "global") and inner != of_library.get(name)
+        if name not in (charts.LIBRARY, "global") and inner != of_library.get(name)
     }
     values, shared = ((each / "values.yaml").read_text() for each in (chart, LIBRARY))
-    data = chart_schema.composed(known["title"], own, values, library, shared)
+    data = charts.composed(known["title"], own, values, library, shared)
     return json.dumps(data, indent=2, ensure_ascii=False) + "\n"
 
 
@@ -54,12 +54,10 @@ def readme(chart: Path) -> str:
     """Return the text of a chart's README, with its table made anew from ``values.yaml``."""
     text = (chart / "README.md").read_text()
     values = (chart / "values.yaml").read_text()
-    root = f"exports.{chart_schema.EXPORT}" if chart == LIBRARY else ""
+    root = f"exports.{charts.EXPORT}" if chart == LIBRARY else ""
     metadata = yaml.safe_load((chart / "Chart.yaml").read_text())
     assert text.startswith(f"# {metadata['name']}\n\n{metadata['description']}\n")
-    return re.sub(
-        r"(?s)\| Key \| Type.*?\n(?=\n|\Z)", lambda _: chart_schema.table(values, root), text
-    )
+    return re.sub(r"(?s)\| Key \| Type.*?\n(?=\n|\Z)", lambda _: charts.table(values, root), text)
 
 
 def main() -> None:

@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from demandops.cluster.health.health_reader import health_reader
-from demandops.cluster.health.release_health import (
+from demandops.cluster.health import (
     ClusterDomain,
     Health,
     ObjectName,
     ObjectSelector,
     Target,
+    health_reader,
 )
 
 from tests.kit.cluster import Letters, condition, deployment

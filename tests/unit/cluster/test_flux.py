@@ -5,13 +5,14 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from demandops.cluster.health.health_reader import health_reader
-from demandops.cluster.health.flux import REQUESTED_AT, Flux
-from demandops.cluster.health.release_health import (
+from demandops.cluster.health import (
+    REQUESTED_AT,
     ClusterDomain,
+    Flux,
     Health,
     Target,
     deployment_health,
+    health_reader,
     worst,
 )
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health.release_health import ObjectSelector
+from demandops.cluster.health import ObjectSelector
 from demandops.cluster.object_cache import ObjectCache
 
 from tests.kit.http import Answer, Call, kubeconfig, serving

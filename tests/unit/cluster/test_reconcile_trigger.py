@@ -10,7 +10,7 @@ from threading import Event, Timer
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.cluster import clusters_file, reconcile_trigger
-from demandops.cluster.health.flux import REQUESTED_AT
+from demandops.cluster.health import REQUESTED_AT
 from demandops.cluster.reconcile_trigger import ReconcileTrigger
 
 from tests.kit.clock import Clock

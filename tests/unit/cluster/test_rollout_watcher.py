@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health.release_health import ClusterDomain, Target
-from demandops.cluster.rollout_watcher import RolloutWatcher
+from demandops.cluster.health import ClusterDomain, Target
+from demandops.cluster.rollouts import RolloutWatcher
 
 from tests.kit.clock import Clock
 from tests.kit.cluster import Letters

@@ -20,12 +20,17 @@ from demandops.base import naming, settings
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection_types
-from demandops.connections.connection import Connection
-from demandops.connections.connection_type import Client, ClientKey, Connections, ConnectionType
+from demandops.connections.connection import (
+    Client,
+    ClientKey,
+    Connection,
+    Connections,
+    ConnectionType,
+)
 from demandops.decide.decision import Decision
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.ledger import claim_file
-from demandops.views import release_causes
+from demandops.views import explanations
 
 from tests.kit.connections import ROS_IMAGE, demand, routes, state
 from tests.kit.goals import connection, goal
@@ -183,9 +188,9 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     world, _ = booked()
     ledger = world.state.ledger
     subject = Subject(SubjectKind.CONNECTION, "c")
-    (release,) = release_causes.releases(world.state, subject)
-    assert release_causes.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
-    files = [each[:2] for each in release_causes.shaping_files(release, world.config)]
+    (release,) = explanations.releases(world.state, subject)
+    assert explanations.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
+    files = [each[:2] for each in explanations.shaping_files(release, world.config)]
     assert ("inventory/nodes.yaml", "edge.wan") in files
     assert ("registry/images.yaml", "images.relay") in files
 

@@ -12,10 +12,9 @@ import pytest
 import yaml
 from demandops.base.errors import InvalidInput, Refused
 from demandops.base.naming import Subject, SubjectKind
-from demandops.connections.connection import Route
-from demandops.connections.connection_type import ClientKey
+from demandops.connections.connection import ClientKey, Route
 from demandops.connections.zenoh import ZENOH
-from demandops.decide.changes.changeset import ReleaseChange
+from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import State, rendered_files

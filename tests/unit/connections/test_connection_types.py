@@ -8,7 +8,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from demandops.connections.connection_type import ConnectionType
+from demandops.connections.connection import ConnectionType
 from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from demandops.detect.detection_state import Key
 from demandops.detect.detector import Detector, booked_events
+from demandops.detect.observations import Key
 
 from tests.kit.detection import at, demand, file_of, rule
 

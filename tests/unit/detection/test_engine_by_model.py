@@ -7,7 +7,7 @@ from itertools import combinations, product
 from math import hypot
 from typing import Any
 
-from demandops.detect.detection_state import Observation
+from demandops.detect.observations import Observation
 from hypothesis import given
 from hypothesis import strategies as st
 

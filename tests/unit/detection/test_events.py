@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from datetime import datetime, timezone
 
-from demandops.detect.detection_state import Observation
+from demandops.detect.observations import Observation
 
 from tests.kit.detection import POSE, SOURCES, Run, at, rule
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 from demandops.detect import rule_file
 from demandops.detect.condition import entity_in
-from demandops.detect.message_reader import MessageReader, Unreadable
+from demandops.detect.observations import MessageReader, Unreadable
 from demandops.detect.rule_file import POSITIONS
 
 from tests.kit.detection import rule, text_of

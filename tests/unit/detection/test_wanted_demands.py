@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from demandops.detect.detector import Outcome, Sending, Want, WantedDemands
-from demandops.detect.rule_demand import Goal
+from demandops.detect.rule_file import Goal
 
 KEY = ("rule", ("a",))
 PUT = Goal("demand", {"demand": "d", "requesters": ["a"], "applications": [1]})

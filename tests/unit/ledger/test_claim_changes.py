@@ -8,7 +8,7 @@ import pytest
 from demandops.base.errors import Refused
 from demandops.connections.connection import Connection, Route
 from demandops.connections.mqtt import MQTT
-from demandops.decide.booking.apply import apply
+from demandops.decide.booking import apply
 from demandops.model.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey, Term
 from demandops.model.demand.demand_request import Demanded, DemandRequest, Join, Release, Shutdown
 from demandops.model.ledger.ledger import Changes, Ledger

@@ -13,8 +13,16 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.connections.connection import Connection, Route, merged_routes
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.mqtt import MQTT
-from demandops.model.demand.application import Application, Delivery, InputTopic
-from demandops.model.demand.claim import LONGEST_S, Claim, ClaimKey, Lease, demand_id
+from demandops.model.demand.claim import (
+    LONGEST_S,
+    Application,
+    Claim,
+    ClaimKey,
+    Delivery,
+    InputTopic,
+    Lease,
+    demand_id,
+)
 from demandops.model.demand.demand_request import id_problem
 from demandops.model.ledger import claim_file
 from demandops.model.ledger.ledger import Ledger

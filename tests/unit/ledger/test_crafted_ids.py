@@ -17,7 +17,7 @@ from demandops.base import naming
 from demandops.base.errors import InvalidInput, Refused
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import ros
-from demandops.decide.booking.leaving import Drain
+from demandops.decide.booking import Drain
 from demandops.decide.checks import collisions
 from demandops.decide.decision import Decision, decide
 from demandops.decide.placement.relocation import following_overrides
@@ -25,8 +25,7 @@ from demandops.decide.planning import flows
 from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
 from demandops.model.config.registry import Chart
-from demandops.model.demand.application import Requirement
-from demandops.model.demand.claim import ClaimKey, demand_id
+from demandops.model.demand.claim import ClaimKey, Requirement, demand_id
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.ledger import Changes
 from demandops.model.ledger.records import RecentShutdown, RecentShutdowns, Wait, WaitingDemand

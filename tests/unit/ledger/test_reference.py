@@ -14,7 +14,7 @@ from pathlib import Path
 from random import Random
 from typing import Any
 
-from demandops.decide.booking.apply import apply
+from demandops.decide.booking import apply
 from demandops.model.demand import deployment_request_goal
 from demandops.model.demand.claim import ClaimKey, demand_id
 from demandops.model.demand.demand_request import DemandRequest, Join

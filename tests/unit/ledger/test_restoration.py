@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 from demandops.base.errors import Refused
-from demandops.decide.booking.restoration import Restoration
 from demandops.decide.decision import Decision, decide
+from demandops.decide.restoration import Restoration
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.demand.claim import Claim, Lease

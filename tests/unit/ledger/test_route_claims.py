@@ -9,12 +9,11 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.errors import InvalidInput, Refused
-from demandops.connections.connection import Connection, Route, merged_routes
-from demandops.connections.connection_type import ConnectionType
+from demandops.connections.connection import Connection, ConnectionType, Route, merged_routes
 from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH
-from demandops.decide.booking.apply import apply
+from demandops.decide.booking import apply
 from demandops.model.demand.claim import Claim, demand_id
 from demandops.model.demand.demand_request import Demanded, Join
 from demandops.model.ledger import claim_file

@@ -6,9 +6,8 @@ from dataclasses import replace
 from random import Random
 
 from demandops.decide.decision import Decision
-from demandops.decide.planning.planner import plan
+from demandops.decide.planning.planner import TracedPlan, plan
 from demandops.decide.planning.release_keys import ReleaseKey, all_keys
-from demandops.decide.planning.traced_plan import TracedPlan
 from demandops.model.config.config import Config
 from demandops.model.ledger.ledger import ClaimChange, Ledger, World
 from demandops.model.release import Release

@@ -9,7 +9,7 @@ from functools import lru_cache
 from itertools import product
 from typing import Any
 
-from demandops.decide.changes.trial_render import trial_releases
+from demandops.decide.changeset import trial_releases
 from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
 from demandops.model.config.config import Config
 from demandops.model.config.cross_check import contested_effects, patches_commute, patterns_overlap

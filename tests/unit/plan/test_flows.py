@@ -13,9 +13,8 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import yaml
-from demandops.decide.planning.planner import plan
+from demandops.decide.planning.planner import TracedPlan, plan
 from demandops.decide.planning.release_keys import ReleaseKey, all_keys
-from demandops.decide.planning.traced_plan import TracedPlan
 from demandops.decide.state import rendered_files
 from demandops.model.release import Release, ServiceKey, ServiceRelease
 from hypothesis import given

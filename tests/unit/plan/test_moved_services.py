@@ -13,8 +13,7 @@ from typing import Any
 
 import yaml
 from demandops.base.errors import Refused
-from demandops.decide.override_lifecycle import changed_claim_files
-from demandops.decide.placement.relocation import following_overrides
+from demandops.decide.placement.relocation import changed_claim_files, following_overrides
 from demandops.decide.planning.release_keys import all_keys
 from demandops.decide.state import rendered_files
 from demandops.decide.warnings import policy_warnings
@@ -22,7 +21,7 @@ from demandops.model.config.config import Config
 from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile, Selector
 from demandops.model.release import ServiceKey
-from demandops.views.release_causes import releases
+from demandops.views.explanations import releases
 from hypothesis import given
 from hypothesis import strategies as st
 

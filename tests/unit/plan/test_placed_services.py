@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.errors import Refused
-from demandops.decide.booking.leaving import Drain
+from demandops.decide.booking import Drain
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import all_keys
 from demandops.decide.state import rendered_files

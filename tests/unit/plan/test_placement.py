@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decide.booking.joining import put as book
+from demandops.decide.booking import put as book
 from demandops.decide.decision import Decision
 from demandops.decide.placement.capacity import Usage
 from demandops.decide.placement.placement import with_chosen_nodes
@@ -18,7 +18,7 @@ from demandops.model.config.config import Config
 from demandops.model.config.inventory import Node, Position
 from demandops.model.config.load import load
 from demandops.model.config.policy import AccessDomain, Rule
-from demandops.model.demand.application import Application, InputTopic, Requirement
+from demandops.model.demand.claim import Application, InputTopic, Requirement
 from demandops.model.demand.demand_request import Demanded, Put
 from demandops.model.ledger.ledger import Ledger, World
 from demandops.repo.history import commit_message

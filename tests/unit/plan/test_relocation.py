@@ -6,12 +6,12 @@ from dataclasses import replace
 from random import Random
 from typing import Any
 
-from demandops.decide.booking.leaving import Drain
+from demandops.decide.booking import Drain
 from demandops.decide.placement.relocation import with_moves
 from demandops.decide.planning.release_keys import all_keys
 from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
-from demandops.model.demand.application import Requirement
+from demandops.model.demand.claim import Requirement
 from demandops.model.release import ServiceKey
 from hypothesis import given
 from hypothesis import strategies as st

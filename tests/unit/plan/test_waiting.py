@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.errors import Refused
-from demandops.decide.booking.restoration import Restoration
 from demandops.decide.decision import Decision
+from demandops.decide.restoration import Restoration
 from demandops.model.demand.demand_request import Decommission
 from demandops.model.ledger import records
 from demandops.model.ledger.records import in_turn

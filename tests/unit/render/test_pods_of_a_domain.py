@@ -19,7 +19,7 @@ from demandops.base.errors import InvalidInput
 from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
 from demandops.model.config.policy import matches
-from demandops.render.bootstrap import expression_of, node_rule
+from demandops.render.gitops import expression_of, node_rule
 from demandops.render.release_file import check_files
 
 from tests.kit.config import configuration, edited, skeleton

@@ -6,8 +6,8 @@ import logging
 
 import pytest
 from demandops.base.runtime import REAL
-from demandops.serve.status import RemoteMonitor
 from demandops.serve.timing.timers import PollTimer, parse_interval
+from demandops.serve.worker import RemoteMonitor
 
 from tests.kit.clock import Clock
 from tests.kit.memory import NOW

@@ -6,9 +6,9 @@ from datetime import datetime, timedelta, timezone
 
 from demandops.model.config.config import Config
 from demandops.model.config.load import load
-from demandops.model.demand.application import Application
+from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Demanded, Join
-from demandops.serve.timing.limits import RateLimit
+from demandops.serve.timing.timers import RateLimit
 
 from tests.kit.config import configuration, edited
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 from demandops.base import strict_yaml
-from demandops.cluster.health.release_health import ObjectName
+from demandops.cluster import rollouts
+from demandops.cluster.health import ObjectName
 from demandops.decide.decision import decide
-from demandops.serve import rollout_targets
 
 from tests.kit import goals
 from tests.kit.golden import requests_of, start
@@ -22,7 +22,7 @@ def test_a_rollout_target_names_its_argo_cd_application_or_none_for_flux(
 ) -> None:
     state, files = start(case)
     goal = strict_yaml.load(requests_of(case)[0].read_text())
-    found = rollout_targets.targets_of_state(decide(state, goal, NOW, files.get).state)
+    found = rollouts.targets_of_state(decide(state, goal, NOW, files.get).state)
     assert {target.name for release, target in found} == {release.name for release, _ in found}
     assert {target.domain.application for _, target in found} == {application}
     assert {target.is_service for _, target in found} == {True, False}
@@ -34,7 +34,7 @@ def test_a_demand_waits_for_no_release_that_only_others_need() -> None:
 
     def followed(goal: goals.Goal) -> dict[str, bool]:
         before = repo.state
-        targets = rollout_targets.targets_of_decision(before, repo.send(goal))
+        targets = rollouts.targets_of_decision(before, repo.send(goal))
         return {target.name: target.wanted for target in targets}
 
     repo, fusion = MemoryRepo(), "of-edge-object-detection-fusion-cf7e0180a8bb"

@@ -9,7 +9,7 @@ import pygit2
 import pytest
 from demandops.base.errors import fault
 from demandops.base.naming import id_problem
-from demandops.decide.changes.changeset import ReleaseChange
+from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
 from demandops.model.demand.demand_request import Decommission
 from demandops.repo.history import commit_log, commit_message

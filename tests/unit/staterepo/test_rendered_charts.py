@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from demandops.decide.changes.trial_render import trial_releases
+from demandops.decide.changeset import trial_releases
 from demandops.repo.pull_request.helm import Report
 from demandops.repo.pull_request.rendered_charts import _Run
 

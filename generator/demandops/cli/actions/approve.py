@@ -18,9 +18,8 @@ from demandops.cli.actions.person_change import (
     yes_option,
 )
 from demandops.cli.json_output import output_option, show
-from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors
-from demandops.cli.target import signing_option, writable_repo_option
+from demandops.cli.target import names_of, signing_option, writable_repo_option
 from demandops.cli.views.diff import differences, entry_lines, release_lines
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit

@@ -22,11 +22,10 @@ from demandops.cli.actions.person_change import (
     yes_option,
 )
 from demandops.cli.json_output import Json, claim_data, faults_of, output_option, show
-from demandops.cli.name_completion import names_of
 from demandops.cli.output import busy, console, errors, progress
-from demandops.cli.target import dry_run_option, signing_option, writable_repo_option
+from demandops.cli.target import dry_run_option, names_of, signing_option, writable_repo_option
 from demandops.cli.views.diff import release_lines
-from demandops.decide.changes.changeset import ReleaseChange
+from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision, decide
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.demand.demand_request import Decommission
@@ -36,7 +35,7 @@ from demandops.repo.history import commit_message
 from demandops.repo.history.commit_message import Person
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
-from demandops.serve import rollback_goal
+from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 from demandops.serve.queue import Receipt
 
@@ -275,7 +274,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     with reader.opened(state_repo, only_read=dry_run) as repo:
         to, base = repo.commit(revision), repo.commit()
         who = repo.operator() if dry_run else warned_if_unnamed(repo.operator())
-        goal = rollback_goal.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)
+        goal = evaluation.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)
         result: Json = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
         result |= {**_consequences(None), "configuration_since": since, "faults": []}

@@ -27,14 +27,14 @@ from demandops.cli.actions.person_change import (
     warn_of_idle,
     writable,
 )
-from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors
 from demandops.cli.repo.scaffold import document
+from demandops.cli.target import names_of
 from demandops.model.config.base_model import seconds_of
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time, parse_time
 from demandops.repo.reader import Reader
-from demandops.views.override_report import Entry
+from demandops.views.explanations import Entry
 
 
 @click.group()

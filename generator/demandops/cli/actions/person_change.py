@@ -24,9 +24,14 @@ from demandops.cli.json_output import (
     release_data,
     show,
 )
-from demandops.cli.name_completion import names_of
 from demandops.cli.output import errors, progress
-from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
+from demandops.cli.target import (
+    dry_run_option,
+    hint_to_pull,
+    names_of,
+    signing_option,
+    writable_repo_option,
+)
 from demandops.model.config.base_model import parse_file
 from demandops.model.config.override import Override, OverrideFile
 from demandops.model.ledger.ledger import World
@@ -37,7 +42,7 @@ from demandops.repo.history.commit_message import Person
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published
-from demandops.views.override_report import Entry, override_report
+from demandops.views.explanations import Entry, override_report
 
 Command = Callable[..., Any]
 

@@ -18,7 +18,7 @@ from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain, Rule, matches
 from demandops.model.config.registry import Image
 from demandops.model.config.repo_settings import as_git_url
-from demandops.templating import chart_schema
+from demandops.templating import charts
 
 
 def document(path: str, schema: str, kind: str, fields: Mapping[str, Any], note: str = "") -> str:
@@ -89,7 +89,7 @@ def image_files(
 # each further service reads the outputs of the service before it. One image contains the launch
 # files of all services. Pure.
 
-LIBRARY_FOLDER = f"appdefs/charts/{chart_schema.LIBRARY}"
+LIBRARY_FOLDER = f"appdefs/charts/{charts.LIBRARY}"
 _NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 _RESULT = "result"
 _REQUESTER = "operator"
@@ -265,7 +265,7 @@ launch:
 commonLabels:
   app.kubernetes.io/part-of: {plan.name}
 """
-    composed = chart_schema.composed(title, {"launch": _LAUNCH}, values, schema, shared)
+    composed = charts.composed(title, {"launch": _LAUNCH}, values, schema, shared)
     version = re.search(r"(?m)^version: (\S+)$", library[f"{LIBRARY_FOLDER}/Chart.yaml"])
     return {
         f"{folder}/Chart.yaml": f"""\
@@ -275,17 +275,17 @@ description: Runs the launch files of {plan.name}.
 type: application
 version: {_VERSION}
 dependencies:
-  - name: {chart_schema.LIBRARY}
+  - name: {charts.LIBRARY}
     version: {version[1] if version else _VERSION}
-    repository: file://../../../charts/{chart_schema.LIBRARY}
-    import-values: [{chart_schema.EXPORT}]
+    repository: file://../../../charts/{charts.LIBRARY}
+    import-values: [{charts.EXPORT}]
 """,
         f"{folder}/values.yaml": values,
         f"{folder}/values.schema.json": json.dumps(composed, indent=2, ensure_ascii=False) + "\n",
         f"{folder}/README.md": f"# {plan.name}\n\nRuns the launch files of {plan.name}.\n\n"
         f"## Values\n\nBesides those of the library "
-        f"[{chart_schema.LIBRARY}](../../../charts/{chart_schema.LIBRARY}/README.md#values):\n\n"
-        + chart_schema.table(values),
+        f"[{charts.LIBRARY}](../../../charts/{charts.LIBRARY}/README.md#values):\n\n"
+        + charts.table(values),
         f"{folder}/templates/service.yaml": f"""\
 {{{{- $run := list "ros2" "launch" .Values.launch.package .Values.launch.file }}}}
 {{{{- range $name, $value := .Values.launch.arguments }}}}

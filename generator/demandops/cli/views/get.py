@@ -1,29 +1,443 @@
-"""``demandops get``: lists of demands, of running services and of people's configuration."""
+"""The proposals that await a person's approval, with links to their pull requests."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from datetime import datetime, timedelta
 from typing import Any
 
 import click
 
-from demandops.base import strict_yaml
+from demandops.base import settings, strict_yaml
 from demandops.base.errors import InvalidInput, fault, suggestion
 from demandops.base.naming import SubjectKind
 from demandops.base.quoting import json_escaped, quoted
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import Json, output_formats, print_json, show
-from demandops.cli.name_completion import names_of
-from demandops.cli.output import at_option, errors, painted, progress, warn_of, warn_of_not_rendered
-from demandops.cli.target import state_repo_option
-from demandops.cli.views.kinds import KINDS, Kind, Source
+from demandops.base.settings import MAIN_BRANCH
+from demandops.cli.json_output import (
+    Json,
+    claim_data,
+    lease_data,
+    output_formats,
+    override_data,
+    print_json,
+    release_data,
+    show,
+    time_data,
+    time_text,
+)
+from demandops.cli.output import (
+    at_option,
+    errors,
+    painted,
+    progress,
+    version_lines,
+    warn_of,
+    warn_of_not_rendered,
+)
+from demandops.cli.table import Cell, Column, Table
+from demandops.cli.target import names_of, state_repo_option
+from demandops.model.config.base_model import duration_text, relative
+from demandops.model.config.override import parse_time
 from demandops.model.config.policy import matches
+from demandops.model.config.repo_settings import Proposals
+from demandops.model.demand.claim import Lease
 from demandops.model.ledger.ledger import World
 from demandops.repo import reader
+from demandops.repo.forge import ForgeError, forge_for
 from demandops.repo.git.repository import RemoteAway
+from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
+from demandops.repo.write.proposal_branch import pending_proposals
+from demandops.views import demand_lists, explanations
+from demandops.views.bookkeeping import bookkeeping
+from demandops.views.explanations import override_report, override_state
+
+
+def proposals(repo: Reader) -> list[Json]:
+    """Return the proposals as JSON data.
+
+    The links to the pull requests come from the GitHub or Gitea that demandops.yaml names, with the
+    token in the file that DEMANDOPS_FORGE_TOKEN_FILE names. If one of these is missing, or there is
+    no answer or no pull request, a link is None.
+    """
+    pending = list(pending_proposals(repo.repository))
+    token_file, forge = settings.forge_token_file(), None
+    if pending and token_file is not None:
+        try:
+            configured = repo.config().repo_settings.proposals
+        except InvalidInput:
+            configured = Proposals()  # if a file is invalid, list the proposals without links
+        try:
+            forge = forge_for(configured, token_file)
+        except ForgeError as error:
+            errors.print(f"warning: {error}")
+    rows = []
+    for proposal in pending:
+        link = None
+        try:
+            request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
+            link = request.link if request else None
+        except ForgeError as error:
+            errors.print(f"warning: {error}")
+        since = time_data(proposal.since)
+        rows.append({"name": proposal.branch, **asdict(proposal), "since": since, "link": link})
+    return rows
+
+
+# ---- the kinds of things that ``demandops get`` lists: their data, columns and filters ----
+
+Values = Callable[[Json], Iterable[str]]
+CellOf = Callable[[Json, datetime], Cell]
+
+
+@dataclass(frozen=True, slots=True)
+class Source:
+    repo: Reader
+    snapshot: Snapshot
+    now: datetime
+    not_rendered: Collection[str] = ()  # files that a generator has yet to write or remove
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """A kind of thing: its items, each with a ``name``, and how they are shown.
+
+    Only ``-o wide`` shows the columns in ``wide``. ``filters`` maps an option to a function from an
+    item to values. An item is listed if the option matches one of the values.
+    """
+
+    items: Callable[[Source], list[Json]]
+    columns: Sequence[tuple[Column, CellOf]]
+    wide: Sequence[tuple[Column, CellOf]]
+    filters: Mapping[str, Values] = field(default_factory=dict)
+
+    def table(self, items: Iterable[Json], now: datetime, *, wide: bool = False) -> Table:
+        shown = [*self.columns, *(self.wide if wide else ())]
+        rows = [[cell_of(item, now) for _, cell_of in shown] for item in items]
+        return Table([column for column, _ in shown], rows, whole=wide)
+
+
+def _column(
+    title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False
+) -> tuple[Column, CellOf]:
+    """Return a column whose cells are a field of the items, or what a function returns."""
+    cell_of = cell if callable(cell) else lambda item, now: item[cell] or ""
+    return Column(title, rank, wraps), cell_of
+
+
+def _demands(source: Source) -> list[Json]:
+    return [
+        {
+            **asdict(demand),
+            "state": _state_now(demand.state, demand.lease, source.now),
+            "since": time_data(demand.since),
+            "lease": lease_data(demand.lease),
+        }
+        for demand in demand_lists.demands(source.snapshot.state)
+    ]
+
+
+def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
+    return "overdue" if state == "held" and lease and lease.has_ended(now) else state
+
+
+def _leases(source: Source) -> list[Json]:
+    leased = [demand for demand in _demands(source) if demand["lease"]]
+    # "~" sorts a lease that has not started behind every time
+    return sorted(leased, key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]))
+
+
+def _nodes(source: Source) -> list[Json]:
+    world = source.snapshot.state
+    return [
+        {**asdict(node), "position": node.position.model_dump() if node.position else None}
+        for node in demand_lists.nodes(world, explanations.releases(world))
+    ]
+
+
+def _services(source: Source) -> list[Json]:
+    world = source.snapshot.state
+    return [
+        {
+            "name": name,
+            "domains": demand_lists.domains_of([service.node], world.config),
+            **asdict(service),
+        }
+        for name, service in bookkeeping(world).services.items()
+    ]
+
+
+def _connections(source: Source) -> list[Json]:
+    world = source.snapshot.state
+    return [
+        {
+            "name": name,
+            "domains": demand_lists.domains_of([each.source, each.target], world.config),
+            **asdict(each),
+        }
+        for name, each in bookkeeping(world).connections.items()
+    ]
+
+
+def _claims(source: Source) -> list[Json]:
+    world = source.snapshot.state
+    claims = sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand))
+    return [
+        {
+            "name": (data := claim_data(claim))["file"],
+            "state": _state_now(demand_lists.state_of(claim, world), claim.lease, source.now),
+            "nodes": (nodes := demand_lists.nodes_of(claim)),
+            "domains": demand_lists.domains_of(nodes, world.config),
+            **data,
+        }
+        for claim in claims
+    ]
+
+
+def _overrides(source: Source) -> list[Json]:
+    return [
+        {
+            **override_data(entry.override),
+            "state": override_state(entry, source.snapshot.state, source.not_rendered),
+            "releases": [release_data(release) for release in entry.releases],
+            "claims": [claim_data(claim) for claim in entry.claims],
+        }
+        for entry in override_report(source.snapshot.state, source.now)
+    ]
+
+
+def _lease_text(item: Json, now: datetime) -> str:
+    lease = item["lease"]
+    if lease is None:
+        return ""
+    if not lease["until"]:
+        return "not started"
+    end = parse_time(lease["until"])
+    released = end + timedelta(seconds=lease["slack"])
+    if end >= now:
+        return f"ends {relative(end, now)}"
+    then = "waits for a generator" if released < now else f"released {relative(released, now)}"
+    return f"ended {relative(end, now)}, {then}"
+
+
+def effect_words(override: Json) -> list[str]:
+    shown = ("version", "replicas", "node")
+    listed = ("images", "values")
+    return [
+        f"{name} {value}"
+        if name in shown
+        else f"{name} {', '.join(value)}"
+        if name in listed
+        else name
+        for name, value in override["effects"].items()
+    ]
+
+
+def _override_targets(item: Json, now: datetime) -> list[str]:
+    releases = (release["name"] for release in item["releases"])
+    subjects = ("{kind} {id}".format(**claim["subject"]) for claim in item["claims"])
+    return [*dict.fromkeys((*releases, *subjects))]
+
+
+def _node_state(item: Json, now: datetime) -> str:
+    if item["type"] is None:  # only claims name it
+        return "not in the inventory"
+    return "drained" if item["drained"] else "open"
+
+
+def _holds(item: Json, now: datetime) -> list[str]:
+    return [*item["applications"], *item["connections"]]
+
+
+def _joined(key: str) -> CellOf:
+    return lambda item, now: ", ".join(item[key])
+
+
+def _ago(key: str) -> CellOf:
+    return lambda item, now: relative(parse_time(item[key]), now) if item[key] else ""
+
+
+def _utc(key: str) -> CellOf:
+    return lambda item, now: time_text(item[key]).removesuffix(" UTC") if item[key] else ""
+
+
+def _key(name: str) -> Values:
+    def values(item: Json) -> Iterable[str]:
+        value = item[name]
+        return [value] if isinstance(value, str) else value or ()
+
+    return values
+
+
+_COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _key("domains")}
+
+KINDS: dict[str, Kind] = {
+    "claims": Kind(
+        _claims,
+        (
+            _column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
+            _column("Requesters", _joined("requesters"), 1, wraps=True),
+            _column("State", "state", 2),
+            _column("Since", _ago("since"), 3),
+            _column("Lease", _lease_text, 4, wraps=True),
+            _column("Demand", "demand", 5),
+        ),
+        (
+            _column("Request", "request"),
+            _column("Since (UTC)", _utc("since")),
+            _column("File", "file"),
+        ),
+        _COMMON
+        | {
+            "application": lambda item: (
+                [item["subject"]["id"]] if item["subject"]["kind"] == "application" else []
+            )
+        },
+    ),
+    "connections": Kind(
+        _connections,
+        (
+            _column("Connection", "name"),
+            _column("Type", "type", 2),
+            _column("From", "source", 1),
+            _column("To", "target", 1),
+            _column("Requesters", _joined("requesters"), 3, wraps=True),
+        ),
+        (_column("Topics", lambda item, now: list(item["topics"])),),
+        _COMMON | {"node": lambda item: [item["source"], item["target"]]},
+    ),
+    "demands": Kind(
+        _demands,
+        (
+            _column("Demand", "name"),
+            _column("State", "state", 3),
+            _column("Requesters", _joined("requesters"), 1, wraps=True),
+            _column("Holds", _holds, 2),
+            _column("Since", _ago("since"), 5),
+            _column("Lease", _lease_text, 4, wraps=True),
+        ),
+        (
+            _column("Requests", "requests"),
+            _column("Nodes", "nodes"),
+            _column("Since (UTC)", _utc("since")),
+            _column("Suspended by", "suspended_by"),
+        ),
+        _COMMON | {"application": _key("applications")},
+    ),
+    "leases": Kind(
+        _leases,
+        (
+            _column("Demand", "name"),
+            _column("Requesters", _joined("requesters"), 2, wraps=True),
+            _column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
+            _column(
+                "Ends",
+                lambda item, now: _lease_text(item, now).removeprefix("ends "),
+                1,
+                wraps=True,
+            ),
+        ),
+        (
+            _column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
+            _column("Holds", _holds),
+        ),
+        _COMMON | {"application": _key("applications")},
+    ),
+    "nodes": Kind(
+        _nodes,
+        (
+            _column("Node", "name"),
+            _column("Type", "type", 2),
+            _column("Domain", "domain", 3),
+            _column("Cluster", "cluster", 5),
+            _column("State", _node_state, 1),
+            _column("Releases", lambda item, now: str(len(item["releases"])), 4),
+            _column("Requesters", _joined("requesters"), 6, wraps=True),
+        ),
+        (
+            _column("Capabilities", "capabilities"),
+            _column(
+                "Properties",
+                lambda item, now: [
+                    f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
+                ],
+            ),
+            _column("Names of releases", "releases"),
+        ),
+        {
+            "node": _key("name"),
+            "requester": _key("requesters"),
+            "application": _key("applications"),
+            "domain": _key("domain"),
+        },
+    ),
+    "overrides": Kind(
+        _overrides,
+        (
+            _column("Override", "name"),
+            _column("State", "state", 1),
+            _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
+            _column("Until", _ago("until"), 3),
+            _column("Owner", "owner", 4),
+            _column("To", _override_targets, 5),
+            _column("Reason", "reason", 6, wraps=True),
+        ),
+        (
+            _column("Priority", lambda item, now: str(item["priority"])),
+            _column("Until (UTC)", _utc("until")),
+        ),
+        {
+            "node": lambda item: [release["node"] for release in item["releases"]],
+            "domain": lambda item: [release["domain"] for release in item["releases"]],
+            "requester": lambda item: [
+                who for claim in item["claims"] for who in claim["requesters"]
+            ],
+        },
+    ),
+    "proposals": Kind(
+        lambda source: proposals(source.repo),
+        (
+            _column("Branch", "branch"),
+            _column("Commit", lambda item, now: item["commit"][:10]),
+            _column("Requesters", _joined("requesters"), 1, wraps=True),
+            _column("Since", _ago("since"), 2),
+            _column("What", "summary", 3, wraps=True),
+            _column("Link", "link", 5),
+        ),
+        (_column("Demands", "demands"), _column("Since (UTC)", _utc("since"))),
+        {"requester": _key("requesters")},
+    ),
+    "services": Kind(
+        _services,
+        (
+            _column("Service", "name"),
+            _column("Kind", "service", 4),
+            _column("Version", lambda item, now: version_lines(item), 5),
+            _column("Node", "node", 1),
+            _column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
+            _column("Requesters", _joined("requesters"), 2, wraps=True),
+        ),
+        (
+            _column(
+                "Takes in",
+                lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
+            ),
+            _column(
+                "Parameters",
+                lambda item, now: [
+                    f"{name} = {value}" for name, value in item["parameters"].items()
+                ],
+            ),
+        ),
+        _COMMON | {"node": _key("node"), "application": _key("applications")},
+    ),
+}
+
+
+# ---- ``demandops get``: lists of demands, of running services and of people's configuration ----
 
 FILTERS = ("node", "requester", "application", "domain")
 _POLL_S = 1.0

@@ -13,10 +13,9 @@ from demandops.base.errors import InvalidInput, StateRepoError, fault, suggestio
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
-from demandops.cli.name_completion import names_of
 from demandops.cli.output import busy
 from demandops.cli.table import Column, Table
-from demandops.cli.target import state_repo_option
+from demandops.cli.target import names_of, state_repo_option
 from demandops.model.config.base_model import relative
 from demandops.model.config.override import parse_time
 from demandops.repo import reader

@@ -22,9 +22,8 @@ from demandops.cli.output import (
 )
 from demandops.cli.table import Column, Table
 from demandops.cli.target import clusters_option, state_repo_option
-from demandops.cluster import clusters_file
-from demandops.cluster.health.health_reader import health_reader
-from demandops.cluster.health.release_health import ObjectSelector
+from demandops.cluster import clusters_file, rollouts
+from demandops.cluster.health import ObjectSelector, health_reader
 from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.release_status import OldBootstrap, Orphan, old_bootstraps, orphans, statuses
 from demandops.decide.planning.overrides import without_suspended
@@ -34,7 +33,6 @@ from demandops.repo import reader
 from demandops.repo.git.repository import RemoteAway
 from demandops.repo.load.last_valid_config import Problem
 from demandops.repo.reader import Reader
-from demandops.serve import rollout_targets
 
 _SHORT = 10
 _POLL_S = 2.0
@@ -158,9 +156,9 @@ class Status:
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(progress=report)
         commit = str(snapshot.commit)
-        releases = rollout_targets.targets_of_state(snapshot.state)
+        releases = rollouts.targets_of_state(snapshot.state)
         targets = [target for _, target in releases]
-        domains = rollout_targets.domains_of_state(snapshot.state)
+        domains = rollouts.domains_of_state(snapshot.state)
         wanted: dict[str, dict[ObjectSelector, None]] = {}
         for domain in {*domains, *(target.domain for target in targets)}:
             watched = health_reader(domain).objects_to_watch(domain)

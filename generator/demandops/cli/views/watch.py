@@ -17,7 +17,7 @@ from demandops.cli.json_output import commit_data
 from demandops.cli.output import painted
 from demandops.cli.table import Table
 from demandops.cli.target import clusters_option, state_repo_option
-from demandops.cli.views.kinds import KINDS, Source
+from demandops.cli.views.get import KINDS, Source
 from demandops.cli.views.log import log_table
 from demandops.cli.views.status import Status, releases_table
 from demandops.cluster import clusters_file

@@ -20,8 +20,7 @@ from demandops.connections.connection import Connection
 from demandops.model.config.appdef import ApplicationDefinition, Services
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.repo_settings import ROOT_FILE, Limits
-from demandops.model.demand.application import Application, Delivery
-from demandops.model.demand.claim import LONGEST_S, OVERRIDE_PREFIX
+from demandops.model.demand.claim import LONGEST_S, OVERRIDE_PREFIX, Application, Delivery
 from demandops.model.demand.demand_request import (
     AnyRequest,
     Demanded,

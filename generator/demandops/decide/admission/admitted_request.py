@@ -26,12 +26,12 @@ from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
 from demandops.decide.placement import placement
 from demandops.decide.placement.choice import NO_ROOM
-from demandops.decide.planning import flows, implied_connections
+from demandops.decide.planning import flows
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import id_in_domain
 from demandops.model.demand import demand_goal, deployment_request_goal
-from demandops.model.demand.application import Application
+from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import (
     AnyRequest,
     Decommission,
@@ -315,7 +315,7 @@ def completed(request: DemandRequest, state: State) -> DemandRequest:
     if request.is_reference:  # its clients list their connections and shut down what they listed
         request = flows.with_further_topics(request, ledger, config)
     else:
-        request = implied_connections.with_implied_connections(request, ledger, config)
+        request = flows.with_implied_connections(request, ledger, config)
     return admission.with_chosen_types(request, config, ledger.connection)
 
 

@@ -16,8 +16,7 @@ from demandops.connections.connection import Connection
 from demandops.model.config.base_model import duration_text, seconds_of
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain, Rule, matches
-from demandops.model.demand.application import Application
-from demandops.model.demand.claim import Claim, Term
+from demandops.model.demand.claim import Application, Claim, Term
 from demandops.model.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put
 
 # pairs of a rule's field, such as ``nodes``, and a value that this field must allow

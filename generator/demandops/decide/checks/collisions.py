@@ -18,9 +18,7 @@ from rpds import HashTrieMap, HashTrieSet
 from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
-from demandops.connections.connection import Connection
-from demandops.connections.connection_type import ClientKey
-from demandops.decide.booking.restoration import request_for
+from demandops.connections.connection import ClientKey, Connection
 from demandops.decide.planning.flows import flows, outputs, usual_topic
 from demandops.decide.planning.planner import service_name
 from demandops.decide.planning.release_keys import (
@@ -30,10 +28,10 @@ from demandops.decide.planning.release_keys import (
     keys_of,
     keys_of_claims,
 )
+from demandops.decide.restoration import request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.demand.application import Application
-from demandops.model.demand.claim import Claim, ClaimKey
+from demandops.model.demand.claim import Application, Claim, ClaimKey
 from demandops.model.demand.demand_request import Demanded, DemandRequest
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.claim_file import path_of

@@ -24,7 +24,7 @@ from demandops.decide.planning.release_keys import is_needed, keys_of, keys_of_c
 from demandops.model.config.config import Config
 from demandops.model.config.override import Selector, format_time
 from demandops.model.config.policy import AccessDomain, matches
-from demandops.model.demand.application import Application
+from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Demanded, DemandRequest
 from demandops.model.ledger.ledger import Changes, World
 from demandops.model.release import ServiceKey

@@ -27,8 +27,7 @@ from demandops.model.config.inventory import (
     meets_condition,
     read_condition,
 )
-from demandops.model.demand.application import Application, Requirement
-from demandops.model.demand.claim import Claim
+from demandops.model.demand.claim import Application, Claim, Requirement
 from demandops.model.demand.demand_request import Demanded
 from demandops.model.ledger.ledger import World
 

@@ -27,8 +27,7 @@ from demandops.decide.placement.choice import (
 )
 from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.model.config.appdef import Service
-from demandops.model.demand.application import Application
-from demandops.model.demand.claim import Claim, demand_id
+from demandops.model.demand.claim import Application, Claim, demand_id
 from demandops.model.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put
 from demandops.model.ledger.ledger import World
 

@@ -19,8 +19,13 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, Selector, Shaping
 from demandops.model.config.policy import matches
-from demandops.model.demand.application import Application
-from demandops.model.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey, requesters_of
+from demandops.model.demand.claim import (
+    OVERRIDE_PREFIX,
+    Application,
+    Claim,
+    ClaimKey,
+    requesters_of,
+)
 from demandops.model.demand.demand_request import Demanded
 from demandops.model.ledger.ledger import Changes, Ledger, World, claim_changes
 from demandops.model.release import Release, ServiceRelease, claims_of, overridden

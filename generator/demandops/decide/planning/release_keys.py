@@ -14,14 +14,13 @@ from dataclasses import replace
 
 from demandops.base.errors import Refused
 from demandops.base.naming import Subject, SubjectKind
-from demandops.connections.connection_type import ClientKey
+from demandops.connections.connection import ClientKey
 from demandops.decide.planning.flows import instances, node_of, roots_of, version_of_instance
 from demandops.decide.planning.overrides import without_suspended
 from demandops.model.config.appdef import Service, Services
 from demandops.model.config.config import VERSIONS_FILE, Config
 from demandops.model.config.registry import ApplicationVersion, precedence
-from demandops.model.demand.application import Application
-from demandops.model.demand.claim import Claim
+from demandops.model.demand.claim import Application, Claim
 from demandops.model.ledger.ledger import ClaimChange, Ledger, World
 from demandops.model.release import ServiceKey
 

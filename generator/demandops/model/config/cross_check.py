@@ -32,7 +32,7 @@ from demandops.model.config.inventory import comparable_kind, kind_of
 from demandops.model.config.override import Override, Selector, by_rank, patched_settings
 from demandops.model.config.policy import matches
 from demandops.model.config.registry import ChartSource
-from demandops.templating import chart_files
+from demandops.templating import charts
 
 _MERGED = ("values", "images")
 _SINGLE = ("version", "replicas", "node")
@@ -359,9 +359,9 @@ def _check_charts(config: Config, reader: ConfigReader) -> None:
         for channel, source in chart.channels.items():
             _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
     tops = (source.folder for chart in config.charts.values() for source in chart.sources())
-    folders = (each for top in tops if top for each in chart_files.folders(top, config.files))
+    folders = (each for top in tops if top for each in charts.folders(top, config.files))
     for folder in dict.fromkeys(folders):  # each library once, in the order in which it is needed
-        reader.faults += chart_files.faults(folder, config.files)
+        reader.faults += charts.faults(folder, config.files)
 
 
 def _check_chart(

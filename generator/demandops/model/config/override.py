@@ -33,7 +33,7 @@ from demandops.model.config.base_model import (
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.model.config.policy import matches
 from demandops.model.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
-from demandops.templating.chart_files import merge_patch
+from demandops.templating.charts import merge_patch
 
 OVERRIDES_ROOT = "overrides"
 

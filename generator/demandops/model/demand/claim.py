@@ -1,22 +1,300 @@
-"""Leases: how long a claim stays booked without a renewal.
-
-The recorded end may lag behind the last renewal by ``slack``, so that only some renewals make a
-commit. A renewal within the slack changes nothing, and a lease ends only after the recorded end and
-the slack have passed. So no generator, not even a restarted one, releases a claim early,
-but a release may be late by the slack.
-"""
+"""Applications: demands list them, claims hold them, and services are planned from them."""
 
 from __future__ import annotations
 
 import json
+from bisect import bisect_left
 from collections.abc import Container, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta, timezone
+from itertools import islice, takewhile
+from types import MappingProxyType
+from typing import NamedTuple
 
 from demandops.base import naming
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections.connection import Connection
-from demandops.model.demand.application import Application
+
+
+class InputTopic(NamedTuple):
+    """An input topic of an application, and the node that publishes it."""
+
+    topic: str
+    source: str
+    type: str = ""
+    # It was not the usual topic of its source when it was booked. The claim says so, because a name
+    # that is made from it must not change while it is demanded (plan/output_topics.py).
+    further: bool = False
+
+    def part_in(self, version: str) -> str:
+        """Return the text that stands for this input in topic names; ``version`` may be empty."""
+        return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
+
+    def distinguishing_text(self, further: bool, version: str) -> str:
+        """Return the text that makes topic names differ although their source is the same."""
+        if not further:
+            return version
+        return f"{self.topic} {version}" if version else self.topic
+
+
+class Delivery(NamedTuple):
+    """An output (``<service>.<output>``) that is brought to a node, as ``topic`` if that is set."""
+
+    output: str
+    node: str
+    topic: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Requirement:
+    """Requirements on a node; ``properties`` are texts like ``memoryGiB>=8``."""
+
+    role: str = ""
+    labels: tuple[tuple[str, str], ...] = ()
+    capabilities: tuple[str, ...] = ()
+    properties: tuple[str, ...] = ()
+
+    @property
+    def size(self) -> int:
+        return len(self.labels) + len(self.capabilities) + len(self.properties)
+
+    def united(self, other: Requirement) -> Requirement:
+        """Return the requirement that a node meets if it meets both; two roles must be the same."""
+        return Requirement(
+            self.role or other.role,
+            tuple(sorted({*self.labels, *other.labels})),
+            tuple(sorted({*self.capabilities, *other.capabilities})),
+            tuple(sorted({*self.properties, *other.properties})),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
+    """One application: its appdef, its node, and its inputs by role."""
+
+    id: str
+    # ``#<number>`` if a goal gives the application's type as a number that no appdef has
+    appdef: str
+    node: str
+    inputs: Mapping[str, tuple[InputTopic, ...]]
+    parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    version: str = ""
+    deliver: tuple[Delivery, ...] = ()
+    # the requirements on the node, kept to choose again; None if the demand names the node
+    place: Requirement | None = None
+    # this version runs beside others, and the id ends in it (demand/separate_instance.py)
+    separate: bool = False
+    # the nodes of services that have one of their own, by service
+    services: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    # the nodes to which an override moves services, by service
+    moved: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    # the services whose node the demand itself names; the generator chose the nodes of the others
+    named: tuple[str, ...] = ()
+    _further: dict[tuple[str, str], list[InputTopic]] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, Application):
+            return NotImplemented
+        compared = (field.name for field in fields(self) if field.compare)
+        same = all(getattr(self, name) == getattr(other, name) for name in compared)
+        # Python treats 1, 1.0 and True as equal, but a chart does not
+        return same and _exact(self.parameters) == _exact(other.parameters)
+
+    @property
+    def subject(self) -> Subject:
+        return Subject(SubjectKind.APPLICATION, self.id)
+
+    @property
+    def own_version(self) -> str:
+        """The version in the names of services and topics; empty unless ``separate``."""
+        return self.version if self.separate else ""
+
+    @property
+    def home(self) -> str:
+        """The node whose access domain sets leases and quotas."""
+        return self.node
+
+    @property
+    def nodes(self) -> tuple[str, ...]:
+        return (self.node,)
+
+    def all_inputs(self) -> list[tuple[str, InputTopic]]:
+        """Return every input as (role, topic)."""
+        return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
+
+    def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
+        """Return the inputs of a role with this source and topic; they must be sorted as in a
+        claim.
+        """
+        inputs = self.inputs.get(role, ())
+        start = bisect_left(inputs, InputTopic(topic, source))
+        same = takewhile(
+            lambda each: (each.topic, each.source) == (topic, source), islice(inputs, start, None)
+        )
+        return tuple(same)
+
+    def further_inputs(self, role: str, part: str) -> list[InputTopic]:
+        """Return the inputs of a role that topic names show as ``part``."""
+        if not self._further:  # computed only once, because the plans of many services need it
+            for each, topic in self.all_inputs():
+                if topic.further or self.separate:
+                    key = each, topic.part_in(self.own_version)
+                    self._further.setdefault(key, []).append(topic)
+        return self._further.get((role, part), [])
+
+    def needs(self, node: str) -> bool:
+        delivered = any(delivery.node == node for delivery in self.deliver)
+        return delivered or node in self.needed_nodes()
+
+    def needed_nodes(self) -> set[str]:
+        """Return the nodes at which services may run: the application's nodes and its sources."""
+        sources = (topic.source for _, topic in self.all_inputs())
+        return {*self.chosen_nodes, *self.moved.values(), *sources}
+
+    def chosen_node(self, service: str) -> str:
+        """Return the node that was chosen for a service, which an override may have moved away."""
+        return self.services.get(service, self.node)
+
+    @property
+    def chosen_nodes(self) -> set[str]:
+        return {self.node, *self.services.values()}
+
+    def has_same_definition_and_nodes(self, other: Application) -> bool:
+        mine, theirs = ((app.appdef, app.node, app.services, app.moved) for app in (self, other))
+        return mine == theirs
+
+    def moved_to_nodes_of(self, first: Application) -> Application:
+        """Return the application with the nodes of ``first``: its own and those of its services."""
+        if (self.node, self.services, self.moved) == (first.node, first.services, first.moved):
+            return self
+        return replace(self, node=first.node, services=first.services, moved=first.moved)
+
+    def booked(self) -> Application:
+        """Return the application in the form of a claim: sorted, without duplicates."""
+        # The order of a goal's lists must not reach the ledger, because the same demand in another
+        # order would make a commit.
+        inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items())}
+        place = self.place and self.place.united(self.place)
+        deliver = tuple(sorted({*self.deliver}))
+        return replace(self, deliver=deliver, place=place).with_inputs(inputs)
+
+    def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
+        """Return the application with other inputs; roles without topics are left out."""
+        kept = {role: topics for role, topics in inputs.items() if topics}
+        return replace(self, inputs=MappingProxyType(kept))
+
+    def extended(self, more: Application) -> Application:
+        """Return ``more`` with this application's inputs, parameters and deliveries added."""
+        roles = {*self.inputs, *more.inputs}
+        inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
+        parameters = MappingProxyType({**self.parameters, **more.parameters})
+        deliver = (*self.deliver, *more.deliver)
+        return replace(
+            more, inputs=MappingProxyType(inputs), parameters=parameters, deliver=deliver
+        )
+
+    def matches_listed(self, listed: object) -> bool:
+        """Return whether a shutdown that lists ``listed``, with the same id, means this."""
+        return (
+            isinstance(listed, Application)
+            and listed.node in ("", self.node)
+            and listed.appdef == self.appdef
+        )
+
+    def distinguishing_values(self) -> tuple[str, ...]:
+        """Return the values by which a shutdown distinguishes applications with the same id."""
+        return (self.node, self.appdef)
+
+    def topic_keys(self) -> Iterator[TopicKey]:
+        """Yield the key of each input, (role, topic, source); without inputs one empty key."""
+        for role, topic in self.all_inputs():
+            yield role, topic.topic, topic.source
+        if not any(self.inputs.values()):
+            yield ()
+
+    def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
+        """Yield (text, keys) for each input that a shutdown lists in ``listed``.
+
+        ``keys`` are the keys of this application's inputs that match it.
+        """
+        assert isinstance(listed, Application)  # noqa: S101 - see matches_listed
+        by_name: dict[TopicKey, list[TopicKey]] = {}
+        for key in self.topic_keys():
+            by_name.setdefault(key[:2], []).append(key)
+        for role, topic in listed.all_inputs():
+            named = by_name.get((role, topic.topic), [])
+            # listed without a source, a topic is that of any source
+            keys = [key for key in named if topic.source in ("", key[2])]
+            yield f"{role} {topic.topic} of {topic.source}", keys
+
+    def without_topics(self, gone: Container[TopicKey]) -> Application | None:
+        """Return the application without the inputs in ``gone``; ``None`` if no input is left."""
+        left = {
+            role: tuple(each for each in topics if (role, each.topic, each.source) not in gone)
+            for role, topics in self.inputs.items()
+        }
+        return self.with_inputs(left) if any(left.values()) else None
+
+    def without_node(self, node: str) -> Application | None:
+        """Return the application without its inputs from ``node`` and its deliveries to ``node``.
+
+        Return ``None`` if no input is left, or if the application or a service runs on the node.
+        """
+        if node in self.chosen_nodes or node in self.moved.values():
+            return None
+        deliver = tuple(delivery for delivery in self.deliver if delivery.node != node)
+        left = {
+            role: tuple(topic for topic in topics if topic.source != node)
+            for role, topics in self.inputs.items()
+        }
+        return replace(self, deliver=deliver).with_inputs(left) if any(left.values()) else None
+
+    def index_entries(self) -> Iterator[tuple[str, ...]]:
+        yield ("node", self.node)
+        yield ("definition", self.appdef)
+        for node in (*self.services.values(), *self.moved.values()):
+            yield ("node", node)
+        if self.moved:
+            yield ("moved",)
+        for role, topic in self.all_inputs():
+            yield ("takes", topic.source, topic.topic)
+            yield ("node", topic.source)
+            if topic.further or self.separate:
+                yield ("further", topic.part_in(self.own_version))
+            if not topic.further:
+                # with and without the topic, so that the claims with another topic can be counted
+                yield ("usual", topic.source, role)
+                yield ("usual", topic.source, role, topic.topic)
+        if self.version:
+            yield ("version", self.id, self.version)
+        for delivery in self.deliver:
+            yield ("node", delivery.node)
+        yield ("topics", naming.topic_part(self.id))
+
+
+def _exact(values: Mapping[str, object]) -> str:
+    return json.dumps(dict(values), sort_keys=True, default=repr) if values else ""
+
+
+def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
+    """Return the topics sorted, with one topic for each topic name and source."""
+    merged: dict[tuple[str, str], InputTopic] = {}
+    for topic in topics:
+        first = merged.setdefault((topic.topic, topic.source), topic)
+        # only some goals give the type of a topic, and the others must not take it away
+        if topic.type and not first.type:
+            merged[topic.topic, topic.source] = topic
+    return tuple(topic for _, topic in sorted(merged.items()))
+
+
+# ---- leases: how long a claim stays booked without a renewal ----
+#
+# The recorded end may lag behind the last renewal by ``slack``, so that only some renewals make a
+# commit. A renewal within the slack changes nothing, and a lease ends only after the recorded end
+# and the slack have passed. So no generator, not even a restarted one, releases a claim early, but
+# a release may be late by the slack.
 
 LONGEST_S = 366 * 24 * 3600
 

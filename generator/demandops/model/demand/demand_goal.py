@@ -24,7 +24,7 @@ from demandops.connections.connection import Connection, RouteOptions
 from demandops.connections.connection_types import type_named, type_word
 from demandops.model.config.base_model import FrozenModel, faults_of, seconds_of
 from demandops.model.config.inventory import Coordinate, Position, read_condition
-from demandops.model.demand.application import Application, Delivery, InputTopic, Requirement
+from demandops.model.demand.claim import Application, Delivery, InputTopic, Requirement
 from demandops.model.demand.demand_request import Demanded, DemandRequest, Put, Release, Renew
 
 # how deeply a goal may be nested: as deeply as a YAML file of the state repo

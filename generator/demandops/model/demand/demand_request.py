@@ -15,8 +15,7 @@ from demandops.base.errors import Fault, Refused, fault
 from demandops.base.naming import Subject, id_problem
 from demandops.connections.connection import Connection
 from demandops.model.config.inventory import Position
-from demandops.model.demand.application import Application
-from demandops.model.demand.claim import Term
+from demandops.model.demand.claim import Application, Term
 
 # Takes a field's path in an application or connection, and returns the field's path in the goal.
 # For example, ``inputs.ego_data[2].source`` becomes ``applications[0].inputs.ego_data[2].source``.

@@ -16,12 +16,11 @@ from pydantic import Field
 
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import absolute_topic
-from demandops.connections.connection import Connection, Route
-from demandops.connections.connection_type import ConnectionType
+from demandops.connections.connection import Connection, ConnectionType, Route
 from demandops.connections.connection_types import by_number, type_numbered
 from demandops.model.config.appdef import ApplicationDefinition
 from demandops.model.config.base_model import FrozenModel
-from demandops.model.demand.application import Application, InputTopic
+from demandops.model.demand.claim import Application, InputTopic
 from demandops.model.demand.demand_goal import parse_valid_part
 from demandops.model.demand.demand_request import Demanded, DemandRequest, Join, Shutdown
 

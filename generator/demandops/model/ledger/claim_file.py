@@ -23,8 +23,17 @@ from demandops.base.settings import LEDGER_API_VERSION
 from demandops.connections.connection import Connection, RouteOptions
 from demandops.connections.connection_types import type_named, type_word
 from demandops.model.config.base_model import FrozenModel, parse
-from demandops.model.demand.application import Application, Delivery, InputTopic, Requirement
-from demandops.model.demand.claim import LONGEST_S, UNSTARTED, Claim, ClaimKey, Lease
+from demandops.model.demand.claim import (
+    LONGEST_S,
+    UNSTARTED,
+    Application,
+    Claim,
+    ClaimKey,
+    Delivery,
+    InputTopic,
+    Lease,
+    Requirement,
+)
 
 LEDGER_ROOT = "ledger"
 

@@ -16,12 +16,10 @@ from rpds import HashTrieMap, HashTrieSet
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection_types
-from demandops.connections.connection import Connection
-from demandops.connections.connection_type import ConnectionType
+from demandops.connections.connection import Connection, ConnectionType
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, by_rank, still_active
-from demandops.model.demand.application import Application, InputTopic
-from demandops.model.demand.claim import UNSTARTED, Claim, ClaimKey
+from demandops.model.demand.claim import UNSTARTED, Application, Claim, ClaimKey, InputTopic
 from demandops.model.ledger.claim_file import minute_of
 from demandops.model.ledger.records import (
     Instance,

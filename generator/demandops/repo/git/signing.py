@@ -8,15 +8,20 @@ the key's path; ``ssh-keygen`` reads the key or asks an SSH agent.
 from __future__ import annotations
 
 import os
+import shutil
 import subprocess
-from collections.abc import Sequence
+import tempfile
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-from pygit2 import Oid, Signature
+import git
+from pygit2 import Commit, Oid, Repository, Signature
 from pygit2.enums import ObjectType
 
 from demandops.base.errors import StateRepoError
 from demandops.repo.git import child_processes
+from demandops.repo.git import tree as trees
 from demandops.repo.git.objects import NewObjects
 
 _TIMEOUT_S = 20
@@ -103,3 +108,101 @@ def create_commit(
         signature = signer.sign(content.encode()).replace("\n", "\n ")
         content = f"{head}\ngpgsig {signature}{end}{message}"
     return objects.add(ObjectType.COMMIT, content.encode())
+
+
+# ---- signatures of the generator's commits, checked against the keys that people allow ----
+#
+# People list the keys in ``policy/allowed-signers`` (ssh-keygen's ALLOWED SIGNERS format). The list
+# in the commit's parent counts, so that a commit cannot allow its own key. One git process checks
+# all commits with the same list.
+
+ALLOWED_SIGNERS = "policy/allowed-signers"
+
+_SSH = "-----BEGIN SSH SIGNATURE-----"
+_SSH_KEYGEN = "ssh-keygen"
+_CONFIG = ("-c", f"gpg.ssh.program={_SSH_KEYGEN}", "-c", "gpg.minTrustLevel=undefined")
+_MOST_KNOWN = 100_000
+
+
+class Check(NamedTuple):
+    """The result of checking a signature: who signed, or why it is not valid."""
+
+    signer: str = ""
+    fault: str = ""
+
+
+# Commit → result, for each commit whose signature was found valid. A result stays true, because
+# neither a commit, its signature nor its parent's list of keys changes.
+_good: dict[str, Check] = {}
+
+
+def are_listed(repo: Repository, commit: Oid) -> bool:
+    return trees.entry(trees.commit_of(repo, commit).tree, ALLOWED_SIGNERS) is not None
+
+
+def signature_of(commit: Commit) -> str:
+    return (commit.gpg_signature[0] or b"").decode("utf-8", "replace")
+
+
+def faults(repo: Repository, commits: Iterable[Commit]) -> dict[str, str]:
+    return {commit: check.fault for commit, check in checks(repo, commits).items() if check.fault}
+
+
+def checks(repo: Repository, commits: Iterable[Commit]) -> dict[str, Check]:
+    """Check the signatures of those commits whose first parent lists the allowed keys."""
+    signatures, results = dict[str, str](), dict[str, Check]()
+    lists: dict[str, list[str]] = {}
+    for commit in commits:
+        id = str(commit.id)
+        allowed = trees.read_text(trees.parent_tree(commit), ALLOWED_SIGNERS)
+        if allowed is not None and id in _good:
+            results[id] = _good[id]
+        elif allowed is not None:
+            signatures[id] = signature_of(commit)
+            lists.setdefault(allowed, []).append(id)
+    if len(_good) > _MOST_KNOWN:
+        _good.clear()
+    if any(signatures.values()) and shutil.which(_SSH_KEYGEN) is None:
+        raise StateRepoError(
+            f"{_SSH_KEYGEN}, which checks the signatures of commits, is missing; install it "
+            "(Debian: apt-get install openssh-client)"
+        )
+    for allowed, ids in lists.items():
+        states = _check_with_git(repo, allowed, ids)
+        for id in ids:
+            state, signer = states.get(id, ("", ""))  # %G? and %GS of git
+            signature = signatures[id]
+            if not signature:
+                fault = f"is not signed, but {ALLOWED_SIGNERS} requires a signature"
+            elif state == "B":
+                fault = "has a signature that does not match its content"
+            # git also finds a GPG signature good, by this machine's keyring
+            elif state != "G" or not signature.lstrip().startswith(_SSH):
+                fault = f"is signed, but not by a key that {ALLOWED_SIGNERS} lists"
+            else:
+                results[id] = _good[id] = Check(signer)
+                continue
+            results[id] = Check(fault=fault)
+    return results
+
+
+def _check_with_git(
+    repo: Repository, allowed: str, commits: list[str]
+) -> dict[str, tuple[str, str]]:
+    with tempfile.TemporaryDirectory(prefix="demandops-") as folder, git.Repo(repo.path) as opened:
+        file = Path(folder) / "allowed-signers"
+        file.write_text(allowed)
+        revisions = Path(folder) / "commits"
+        revisions.write_text("\n".join(commits) + "\n")
+        with revisions.open("rb") as lines:
+            output = opened.git.execute(
+                [
+                    *(opened.git.GIT_PYTHON_GIT_EXECUTABLE, *_CONFIG),
+                    *("-c", f"gpg.ssh.allowedSignersFile={file}"),
+                    *("log", "--no-show-signature", "--no-walk=unsorted", "--stdin"),
+                    *("-z", "--format=%H %G? %GS"),
+                ],
+                istream=lines,
+            )
+    rows = (row.split(" ", 2) for row in str(output).split("\0") if row)
+    return {id: (state, signer) for id, state, signer in rows}

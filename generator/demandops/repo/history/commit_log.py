@@ -24,10 +24,10 @@ from pygit2.enums import SortMode
 
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import escaped, harmless, is_visible, one_line
-from demandops.render.paths import CLUSTERS_ROOT
+from demandops.render.gitops import CLUSTERS_ROOT
+from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.tree import commit_of
-from demandops.repo.history import allowed_signers
 
 Trailers = Iterable[tuple[str, str]]
 
@@ -169,7 +169,7 @@ def entry_of(commit: Commit) -> LogEntry:
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
     """Return whether the generator made a commit, and signed it if a signature is required."""
-    return entry_of(commit).by_generator and not allowed_signers.faults(repo, [commit])
+    return entry_of(commit).by_generator and not signing.faults(repo, [commit])
 
 
 def commits(
@@ -219,7 +219,7 @@ def _with_checked_signatures(
 ) -> list[tuple[Commit, LogEntry]]:
     """Return :func:`commits`; those without a valid required signature are a person's."""
     pairs = list(commits(repo, tip, after))
-    faults = allowed_signers.faults(repo, [commit for commit, e in pairs if e.by_generator])
+    faults = signing.faults(repo, [commit for commit, e in pairs if e.by_generator])
     return [
         (commit, replace(entry, by_generator=entry.by_generator and entry.commit not in faults))
         for commit, entry in pairs

@@ -22,8 +22,8 @@ from demandops.base.errors import Fault, InvalidInput, StateRepoError, fault
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import API_VERSION, GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT, modeline
-from demandops.decide.changes import merge_preview
-from demandops.decide.changes.merge_preview import ABSENT, leaf_differences
+from demandops.decide import merge_preview
+from demandops.decide.merge_preview import ABSENT, leaf_differences
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS, Config

@@ -19,11 +19,10 @@ from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.runtime import REAL
 from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.base.strict_yaml import with_lines
-from demandops.decide import warnings
-from demandops.decide.changes import merge_preview
-from demandops.decide.changes.merge_preview import MergePreview
-from demandops.decide.claim_edit import faults_of_edit
-from demandops.decide.override_lifecycle import expired_overrides, update_ledger
+from demandops.decide import merge_preview, warnings
+from demandops.decide.decision import faults_of_edit
+from demandops.decide.merge_preview import MergePreview
+from demandops.decide.placement.relocation import expired_overrides, update_ledger
 from demandops.decide.state import State, rendered_files, try_configuration
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
@@ -32,15 +31,15 @@ from demandops.model.config.override import OVERRIDES_ROOT, format_time
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.ledger import Ledger, World, changes_on
-from demandops.render.paths import BOOTSTRAP_ROOT, path_of
+from demandops.render.gitops import BOOTSTRAP_ROOT, path_of
 from demandops.repo.git import tree as trees
 from demandops.repo.load import ledger_files
 from demandops.repo.pull_request import edited_checkout, rendered_charts
 from demandops.repo.pull_request.edited_checkout import Base, author_of, base_of, files_of
 from demandops.repo.pull_request.rendered_charts import RenderedCharts
-from demandops.templating import chart_files
+from demandops.templating import charts
 from demandops.templating.evaluator import EVALUATE
-from demandops.views import override_report
+from demandops.views import explanations
 from demandops.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 
 _MOST_LEFT = 5
@@ -143,7 +142,7 @@ def check(
         faults += charts.faults
         if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
             faults.append(fault("", rendered_charts.NO_HELM))
-        idle = override_report.warnings(override_report.override_report(state, edit.now))
+        idle = explanations.warnings(explanations.override_report(state, edit.now))
         # a topic that was lacking before is not of this edit
         old = missing_inputs(start.state) if start and start.state else ()
         lacking = {(topic.application, topic.reason) for topic in old}
@@ -368,8 +367,8 @@ class _Edit:
         edited = self.changed
         for folder, (name, source) in sorted(sources.items()):
             metadata = f"{folder}/Chart.yaml"
-            folders = chart_files.folders(folder, self.files)
-            changed = sorted(path for part in folders for path in chart_files.below(part, edited))
+            folders = charts.folders(folder, self.files)
+            changed = sorted(path for part in folders for path in charts.below(part, edited))
             if not changed or metadata not in self.before:
                 continue
             if _chart_version(self.before[metadata]) == source.version:

@@ -23,16 +23,16 @@ from typing import Any
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.decide.changes import merge_preview
-from demandops.decide.changes.trial_render import trial_releases
+from demandops.decide import merge_preview
+from demandops.decide.changeset import trial_releases
 from demandops.decide.state import State
 from demandops.model.config.config import DOMAINS_FILE
 from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
+from demandops.render.gitops import path_of
 from demandops.render.manifests import values_of
-from demandops.render.paths import path_of
 from demandops.repo.pull_request.helm import HELM_BIN, Helm, Report
-from demandops.templating import chart_files
+from demandops.templating import charts
 from demandops.templating.values import SchemaTask
 
 MISSING = "helm is missing"
@@ -81,8 +81,8 @@ def render_charts(
         if changed is None or not folder:  # a chart in a registry is reported as not rendered
             continue
         # where the chart's own files stay, only these releases may get other objects
-        parts = chart_files.folders(folder, config.files)
-        if not any(chart_files.below(part, edited) for part in parts):
+        parts = charts.folders(folder, config.files)
+        if not any(charts.below(part, edited) for part in parts):
             by_folder[folder] = [pair for pair in pairs if path_of(pair[0]) in wanted]
     for examples in trial_releases(config).values():
         for release in examples:
@@ -127,7 +127,7 @@ class _Run:
             self._not_rendered |= dict.fromkeys(names, "it is in a registry")
             return
         try:
-            files, missing = chart_files.with_libraries(folder, self._files, self._paths)
+            files, missing = charts.with_libraries(folder, self._files, self._paths)
             for place, path in files.items():
                 if place.rpartition("/")[2] == _SCHEMA:
                     self._state.evaluate(self._files, SchemaTask(path))
@@ -201,14 +201,14 @@ class _Run:
 
     def _check_libraries(self, folder: str, values: Mapping[str, Any]) -> None:
         """Check the values of the charts in ``charts/`` against their schemas, as Helm does."""
-        above = chart_files.merged(chart_files.defaults(folder, self._files), values)
-        for dependency in chart_files.dependencies(folder, self._files):
+        above = charts.merged(charts.defaults(folder, self._files), values)
+        for dependency in charts.dependencies(folder, self._files):
             own = above.get(dependency.alias)
             if dependency.optional or not isinstance(own, dict | None):
                 continue
             library = dependency.folder or f"{folder}/charts/{dependency.name}"
             try:
-                chart_files.defaults(library, self._files)
+                charts.defaults(library, self._files)
             except InvalidInput:  # YAML that only Helm reads, for example with anchors
                 continue
             inner = {"global": above.get("global", {}), **(own or {})}

@@ -19,12 +19,11 @@ from pygit2 import Signature
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.settings import GENERATED_ROOTS
-from demandops.decide.booking.leaving import Drain
-from demandops.decide.changes.changeset import Change, Changeset, ReleaseChange
-from demandops.decide.claim_edit import changeset_of_edit
-from demandops.decide.decision import Decision, decide
+from demandops.decide.booking import Drain
+from demandops.decide.changeset import Change, Changeset, ReleaseChange
+from demandops.decide.decision import Decision, changeset_of_edit, decide
 from demandops.decide.decision import scale_down as scaled_down
-from demandops.decide.override_lifecycle import (
+from demandops.decide.placement.relocation import (
     changed_override_files,
     end_override,
     update_claims,

@@ -16,7 +16,7 @@ from demandops.base.errors import Fault, InvalidInput, StateRepoError
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
-from demandops.decide.changes.changeset import FileReader
+from demandops.decide.changeset import FileReader
 from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN, StateRepository

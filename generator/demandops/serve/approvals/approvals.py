@@ -28,6 +28,7 @@ from demandops.base.errors import (
 )
 from demandops.base.quoting import quoted
 from demandops.base.settings import PROPOSAL_LIMIT
+from demandops.cluster.rollouts import targets_of_decision
 from demandops.decide.decision import Decision
 from demandops.decide.state import State
 from demandops.model.demand.claim import ClaimKey
@@ -62,7 +63,6 @@ from demandops.serve.approvals.proposal import (
 )
 from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.serve.queue import Receipt, Ticket, receipt_of
-from demandops.serve.rollout_targets import targets_of_decision
 
 log = logging.getLogger("demandops")
 

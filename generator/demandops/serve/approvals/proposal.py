@@ -17,7 +17,7 @@ from demandops.base.quoting import harmless, one_line
 from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.admission import permission
 from demandops.decide.admission.admitted_request import admit
-from demandops.decide.changes.changeset import FileReader
+from demandops.decide.changeset import FileReader
 from demandops.decide.decision import Decision, decide
 from demandops.decide.state import State
 from demandops.model.demand.claim import ClaimKey

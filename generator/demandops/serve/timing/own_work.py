@@ -14,9 +14,9 @@ from datetime import datetime, timedelta, timezone
 from demandops.base.errors import InvalidInput, OverLimit
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
-from demandops.decide.booking.leaving import Drain
+from demandops.decide.booking import Drain
 from demandops.decide.decision import decide
-from demandops.decide.override_lifecycle import expired_overrides
+from demandops.decide.placement.relocation import expired_overrides
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.demand.claim import Claim
@@ -25,7 +25,7 @@ from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.ledger.records import Instance, in_turn
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.queue import Receipt, Ticket
-from demandops.serve.timing.limits import within
+from demandops.serve.timing.timers import within
 
 log = logging.getLogger("demandops")
 

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
+from demandops.base.naming import Subject
 from demandops.decide.planning import overrides
 from demandops.decide.planning.overrides import suspended_by
 from demandops.decide.planning.planner import denied_release, plan
-from demandops.decide.planning.release_keys import all_keys, keys_of_claims
-from demandops.model.config.override import Override, format_time
-from demandops.model.demand.claim import Claim
-from demandops.model.ledger.ledger import World
-from demandops.model.release import Release, ServiceRelease, most_replicas
-from demandops.render.paths import path_of
+from demandops.decide.planning.release_keys import all_keys, keys_of, keys_of_claims, takes
+from demandops.model.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
+from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
+from demandops.model.config.repo_settings import ROOT_FILE
+from demandops.model.demand.claim import Claim, demand_id
+from demandops.model.ledger.ledger import Ledger, World
+from demandops.model.release import Release, ServiceRelease, claims_of, most_replicas
+from demandops.render.gitops import path_of
 
 # ``matches nothing``: the override selects nothing, or its effects do not apply to what it selects.
 # ``held back``: another override with ``hold`` keeps every file that this override would change.
@@ -138,3 +141,86 @@ def override_state(entry: Entry, world: World, not_rendered: Collection[str]) ->
         return entry.state
     paths = {path_of(release) for release in affected_releases(entry, world)}
     return "not rendered yet" if paths & {*not_rendered} else entry.state
+
+
+# ---- release causes ----
+#
+# Why a release runs as it does: the claims that need it, and the files of people that shape it.
+
+
+def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
+    """Yield the releases that run, or only those that claims on ``subject`` need."""
+    keys = keys_of(world, subject) if subject else all_keys(world)
+    yield from filter(None, (plan(world, key) for key in keys))
+
+
+def release_named(world: World, name: str) -> Release | None:
+    return next((release for release in releases(world) if release.name == name), None)
+
+
+def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
+    """Return the claims that need a running release, sorted by their booking time.
+
+    ``ledger`` has no suspended claims.
+    """
+    return by_booking(claim for claim in claims_of(release, ledger) if needs(claim, release))
+
+
+def by_booking(claims: Iterable[Claim]) -> list[Claim]:
+    return sorted(claims, key=lambda claim: (claim.booked, str(claim.subject), claim.demand))
+
+
+def needs(claim: Claim, release: Release) -> bool:
+    """Return whether a claim on an application or connection of a release needs the release."""
+    if not isinstance(release, ServiceRelease):
+        return True
+    return takes(claim.application, release.service, release.key)
+
+
+def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
+    """Return the versions that claims on a service's applications name, with requesters."""
+    asking: dict[str, set[str]] = {}
+    for claim in claims_of(release, ledger):
+        if claim.application.version:
+            asking.setdefault(claim.application.version, set()).update(claim.requesters)
+    return {version: sorted(requesters) for version, requesters in sorted(asking.items())}
+
+
+def how_to_release(claim: Claim) -> str:
+    if claim.keeping_override is not None:
+        return f"remove 'keep' from {OVERRIDES_ROOT}/{claim.keeping_override}.yaml"
+    if is_released_by_demand_id(claim):
+        return f"send 'operation: release' for demand '{claim.demand}'"
+    return f"send request '{claim.request}' again with shutdown: true"
+
+
+def is_released_by_demand_id(claim: Claim) -> bool:
+    # A goal of the reference's action has no demand id. The generator derives it from the request.
+    is_of_a_request = claim.demand == demand_id(claim.request, claim.requesters)
+    return claim.keeping_override is None and not is_of_a_request
+
+
+def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
+    """Return (file, entry, what the entry decides) for each file entry that shapes a release.
+
+    Overrides are left out: :attr:`.Shaping.by` has them.
+    """
+    images = {name: config.images[name] for name in release.images if name in config.images}
+    if isinstance(release, ServiceRelease):
+        images = {name: release.version.image(name, image) for name, image in images.items()}
+    node, domain, file_of = release.node, release.domain, config.file_of
+    return [
+        (ROOT_FILE, "gitops", f"written for {config.repo_settings.gitops}"),
+        *release.shaping_entries(config),
+        *(
+            (file_of(IMAGES_FILE, name), f"images.{name}", image.reference())
+            for name, image in images.items()
+        ),
+        (file_of(NODES_FILE, node.id), node.id, f"in cluster {node.cluster}"),
+        (file_of(DOMAINS_FILE, domain.name), domain.name, f"namespace {domain.namespace}"),
+    ]
+
+
+def denied_release_named(world: World, name: str) -> tuple[Release, Override] | None:
+    denied = (denied_release(world, key) for key in all_keys(world))
+    return next((pair for pair in denied if pair and pair[0].name == name), None)

@@ -1,4 +1,4 @@
-"""``demandops upgrade``: render with this version, or for the other GitOps controller."""
+"""``demandops init``: a new state repo."""
 
 from __future__ import annotations
 
@@ -10,23 +10,132 @@ from pathlib import Path
 
 import click
 
-from demandops.base.errors import fault
+from demandops.base import settings
+from demandops.base.errors import StateRepoError, fault
 from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, output_option, show
-from demandops.cli.output import Progress, busy, progress
+from demandops.cli.output import Progress, busy, errors, progress
+from demandops.cli.repo import schema
 from demandops.cli.target import (
     dry_run_option,
     signing_option,
     state_repo_option,
     writable_repo_option,
 )
-from demandops.render.paths import bootstrap_path, domains_by_cluster
-from demandops.repo import reader
+from demandops.render.gitops import bootstrap_path, domains_by_cluster
+from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
 from demandops.repo.git.signing import Signer
 from demandops.repo.upgrade import Upgrade, UpgradeRequest
 from demandops.repo.verification import Verdict
+from demandops.repo.write.journal import find_journals
 from demandops.templating.evaluator import processor_time
+
+
+@click.command()
+@click.argument("directory", type=click.Path(path_type=Path), metavar="DIR")
+@click.option(
+    "--gitops",
+    type=click.Choice(["flux", "argocd"]),
+    default="flux",
+    show_default=True,
+    help="The controller that reads the state repo.",
+)
+@click.option(
+    "--bare",
+    is_flag=True,
+    help="Create a bare repository, for `serve` and `request` on this machine. Without this "
+    "option, the files are checked out in DIR, so that you can push them to a Git server.",
+)
+@click.option(
+    "--url",
+    default="",
+    metavar="URL",
+    help="The URL (https or ssh, or git@host:path) from which the clusters fetch the state repo. "
+    "The command writes this URL to demandops.yaml, where you can change it. Without a URL, no "
+    "cluster can follow the state repo yet.",
+)
+@click.option(
+    "--example",
+    type=click.Choice(["experiment", "none"]),
+    default="experiment",
+    show_default=True,
+    help="The fleet to begin with: the paper's experiment with its application, or none.",
+)
+@signing_option
+@output_option
+def init(
+    directory: Path,
+    *,
+    gitops: str,
+    bare: bool,
+    url: str,
+    example: str,
+    signing_key: Path | None,
+    output: str,
+) -> None:
+    """Create a state repo.
+
+    The first commit has the files that people edit, with the fleet that --example names.
+    To make a cluster follow the state repo, install Flux or Argo CD on the cluster (docs/flux.md,
+    docs/argocd.md) and run:
+
+        git -C DIR show main:bootstrap/CLUSTER.yaml | kubectl apply -f -
+
+    \b
+    Examples:
+      demandops init fleet.git --bare
+      demandops init fleet --gitops argocd --url https://git.example/fleet.git
+    """
+    if gitops == "argocd" and not url:
+        raise StateRepoError(
+            "--gitops argocd needs --url, because all manifests for Argo CD name the URL from "
+            "which the clusters fetch the state repo: --url https://HOST/PATH or "
+            "--url git@HOST:PATH"
+        )
+    with busy("creating the state repo"):
+        commit = new_repo.init(
+            directory,
+            REAL.now(),
+            bare=bare,
+            gitops=gitops,
+            url=url,
+            example=example == "experiment",
+            schemas={name: schema.text(name) for name in schema.SCHEMAS},
+            signer=Signer(signing_key) if signing_key else None,
+        )
+    data = {"directory": str(directory), "commit": commit, "gitops": gitops, "bare": bare}
+    lines = [f"state repo in {directory}, first commit {commit[:10]} on main"]
+    if not url:
+        lines.append(
+            "no cluster can follow the state repo yet: "
+            "set the url for the clusters in demandops.yaml"
+        )
+    else:
+        cluster = "c-its" if example == "experiment" else "CLUSTER"
+        lines.append(
+            f"to make a cluster follow the state repo: git -C {directory} show "
+            f"main:bootstrap/{cluster}.yaml | kubectl apply -f -"
+        )
+    if bare:
+        lines.append(f"to see or edit the files of the state repo: git clone {directory}")
+    if example == "none":
+        where = ", in the clone" if bare else ""
+        lines += [
+            f"to add a fleet{where}: edit the files in inventory/, and run",
+            "      demandops new application (--help has examples); then check, commit and push",
+        ]
+    if bare:
+        lines.append(f"next: demandops serve --state-repo {directory}")
+    else:
+        lines += [
+            "next: edit inventory/ and policy/, commit, push to your Git server, and run",
+            "      demandops serve --state-repo URL",
+        ]
+    show(output, data, lines)
+
+
+# ---- ``demandops upgrade``: render with this version, or for the other GitOps controller ----
 
 _MOST_PATHS = 50
 _SWITCH = (
@@ -228,3 +337,59 @@ def _verify_lines(verdicts: list[Verdict]) -> Iterator[str]:
         good = sum(bool(verdict.signer) for verdict in verdicts)
         listed = f", {good} by keys that policy/allowed-signers lists" if good else ""
         yield f"{signed} of {len(verdicts)} are signed{listed}"
+
+
+# ---- journal ----
+#
+# ``demandops journal``: accepted demands that generators on this machine have yet to publish.
+
+
+@click.command()
+@writable_repo_option
+@click.option(
+    "--set-aside",
+    is_flag=True,
+    help="Rename journals that are damaged, so that the generator starts without them. A journal "
+    "that a running generator uses keeps its name.",
+)
+@output_option
+def journal(state_repo: str, set_aside: bool, output: str) -> None:
+    """List the accepted demands that are not published.
+
+    A generator on this machine accepted these demands. If it still runs, it carries them out.
+    Otherwise the next generator that starts here for the state repo does. If a journal is damaged,
+    no generator starts, because the journal may lack demands. In this case, use --set-aside, and
+    send again the listed demands that are still needed. --output json prints their goals.
+
+    \b
+    Examples:
+      demandops journal
+      demandops journal --set-aside
+    """
+    folder = settings.data_home(state_repo)
+    journals = list(find_journals(folder, REAL.now(), set_aside=set_aside))
+    rows, lines = [], []
+    for each in journals:
+        demands = [
+            {"operation_id": demand.operation, "received": demand.received, "goal": demand.goal}
+            for demand in each.demands
+        ]
+        rows.append(
+            {
+                "file": str(each.file),
+                "faults": [asdict(fault("", each.damage))] if each.damage else [],
+                "set_aside": str(each.set_aside) if each.set_aside else None,
+                "demands": demands,
+            }
+        )
+        lines += [f"{demand.operation}  received {demand.received}" for demand in each.demands]
+        if each.set_aside:
+            lines.append(f"the damaged journal {each.file} is now called {each.set_aside}")
+    number = sum(len(each.demands) for each in journals)
+    what = "demand is" if number == 1 else "demands are"
+    show(output, rows, [*lines, f"{number} {what} accepted and not published"])
+    damages = [each.damage for each in journals if each.damage and not each.set_aside]
+    for damage in damages:
+        errors.print(f"error: {damage}")
+    if damages:
+        raise click.exceptions.Exit(1)

@@ -13,14 +13,14 @@ from typing import Any, Literal
 
 from demandops.base.errors import Fault, InvalidInput
 from demandops.base.strict_yaml import load_all, short_repr
-from demandops.decide.changes.changeset import ReleaseChange, describe_change
+from demandops.decide.changeset import ReleaseChange, describe_change
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey, all_keys, keys_of
 from demandops.model.ledger import claim_file
 from demandops.model.ledger.ledger import World
 from demandops.model.release import Release
 from demandops.render import manifests
-from demandops.render.paths import path_of
+from demandops.render.gitops import path_of
 from demandops.templating.values import Evaluate
 
 _MOST_FACTS = 20

@@ -1,0 +1,554 @@
+"""Computes the health of releases: the part that is the same for Flux and Argo CD. Pure."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple, Protocol
+
+from demandops.render.gitops import bootstrap_path
+
+Level = Literal["pushed", "reconciled", "healthy"]
+State = Literal["waiting", "reconciled", "healthy"]
+
+_ORDER: dict[str, int] = {"waiting": 0, "pushed": 0, "reconciled": 1, "healthy": 2}
+
+
+class ObjectName(NamedTuple):
+    namespace: str
+    name: str
+
+
+class ObjectSelector(NamedTuple):
+    """Selects objects of a kind in a namespace, or only the one of a name."""
+
+    kind: str
+    namespace: str
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class ClusterDomain:
+    cluster: str
+    name: str
+    namespace: str
+    application: ObjectName | None = None  # of Argo CD, for the domain's folder; None with Flux
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    domain: ClusterDomain
+    name: str
+    is_service: bool  # else it is the Deployment of a communication client
+    wanted: bool = True
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    state: State
+    reason: str = ""  # why the next state is not reached, if possible in the controller's words
+    object: str = ""  # from which the reason comes
+    failing: bool = False
+
+    def reaches(self, level: Level) -> bool:
+        return _ORDER[self.state] >= _ORDER[level]
+
+
+Key = tuple[str, str, str]  # kind, namespace and name of an object
+Object = Mapping[str, Any]
+Objects = Mapping[Key, Object]
+
+
+class History(Protocol):
+    """Queries on the state repo's commits."""
+
+    def includes(self, commit: str, other: str) -> bool:
+        """Return whether ``commit`` is ``other`` or a descendant of ``other``."""
+        ...
+
+    def unchanged(self, commit: str, other: str, path: str) -> bool:
+        """Return whether ``path`` exists in two commits with equal content."""
+        ...
+
+
+def worst(healths: list[Health]) -> Health:
+    """Return the health with the lowest state, and among those a failing one; of none, healthy."""
+    return min(
+        healths,
+        key=lambda health: (_ORDER[health.state], not health.failing),
+        default=Health("healthy"),
+    )
+
+
+class HealthReader(ABC):
+    service_kind: str  # of the object that represents a service
+
+    @abstractmethod
+    def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+        """Return the objects on which the health of a domain and of its releases depends."""
+
+    def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+        """Return the objects to read again before a release counts as healthy."""
+        # in this order: a service object that is ready counts with Deployments read after it
+        kinds = (self.service_kind, "Deployment")
+        return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
+
+    @abstractmethod
+    def domain_health(
+        self, domain: ClusterDomain, commit: str, objects: Objects, history: History
+    ) -> Health:
+        """Return ``waiting`` until a domain has applied ``commit``, then ``reconciled``."""
+
+    def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
+        """Return the health of a release: ``waiting`` until its domain has applied ``commit``."""
+        domain = self.domain_health(target.domain, commit, objects, history)
+        if domain.state == "waiting":
+            return domain
+        return self.release_health(target, commit, objects, history)
+
+    def release_health(
+        self, target: Target, commit: str, objects: Objects, history: History
+    ) -> Health:
+        key = self.key(target)
+        item = objects.get(key)
+        if not target.wanted:  # then it is healthy if it is gone
+            if item is None and not (target.is_service and self._deployments(target, objects)):
+                return Health("healthy")
+            message = self._why_not_removed(item or {}) if target.is_service else ""
+            reason = f"is still being removed; {message}" if message else "is still being removed"
+            return Health("reconciled", reason, name_of(key), failing=bool(message))
+        if item is None:
+            return Health("reconciled", "does not exist yet", name_of(key))
+        if not target.is_service:
+            return deployment_health(item)
+        return self._service_health(target, item, commit, objects, history)
+
+    @abstractmethod
+    def follower(self, domain: ClusterDomain) -> Key:
+        """Return the key of the object, from the bootstrap file, that applies a domain's folder."""
+
+    @abstractmethod
+    def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
+        """Return the commit up to which a domain's folder is applied; empty if it is not known."""
+
+    def key(self, target: Target) -> Key:
+        kind = self.service_kind if target.is_service else "Deployment"
+        return kind, target.domain.namespace, target.name
+
+    @abstractmethod
+    def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
+        """Return whether ``item`` was created by a domain's :meth:`follower`."""
+
+    def last_transition(self, target: Target, objects: Objects) -> str:
+        """Return when the state of a release last changed; empty if the cluster does not say."""
+        status = (objects.get(self.key(target)) or {}).get("status") or {}
+        state = self._service_state(status) if target.is_service else condition(status, "Available")
+        return str(state.get("lastTransitionTime", ""))
+
+    @abstractmethod
+    def _service_health(
+        self, target: Target, item: Object, commit: str, objects: Objects, history: History
+    ) -> Health:
+        """Return the health of a service whose object exists."""
+
+    @abstractmethod
+    def _service_state(self, status: Object) -> Object:
+        """Return the part of a service object's status that has ``lastTransitionTime``."""
+
+    @abstractmethod
+    def _owns(self, target: Target, deployment: Object) -> bool:
+        """Return whether a service's release owns a Deployment."""
+
+    def _why_not_removed(self, item: Object) -> str:
+        """Return why the controller fails to remove a service; empty if no failure is known."""
+        return ""
+
+    def _deployments(self, target: Target, objects: Objects) -> list[Object]:
+        return [
+            item
+            for (kind, namespace, _), item in objects.items()
+            if kind == "Deployment"
+            and namespace == target.domain.namespace
+            and self._owns(target, item)
+        ]
+
+
+def name_of(key: Key) -> str:
+    """Return kind, namespace and name of an object as text: ``Deployment perception/od-edge``."""
+    kind, namespace, name = key
+    return f"{kind} {namespace}/{name}"
+
+
+def deployment_health(deployment: Object) -> Health:
+    """Return ``healthy`` if all replicas are available and run the current spec."""
+    metadata, status = deployment["metadata"], deployment.get("status") or {}
+    name = name_of(("Deployment", metadata.get("namespace"), metadata.get("name")))
+    replicas = (deployment.get("spec") or {}).get("replicas")
+    wanted = 1 if replicas is None else replicas  # the default of Kubernetes
+    current = (status.get("observedGeneration") or 0) >= (metadata.get("generation") or 0)
+    updated, available = status.get("updatedReplicas") or 0, status.get("availableReplicas") or 0
+    if current and updated >= wanted and available >= wanted:
+        return Health("healthy")
+    for kind, bad in (("ReplicaFailure", "True"), ("Progressing", "False")):
+        problem = condition(status, kind)
+        if problem.get("status") == bad:
+            message = str(problem.get("message", ""))
+            return Health("reconciled", message, name, failing=True)
+    return Health("reconciled", f"{available} of {wanted} replicas are available", name)
+
+
+def why_unavailable(pods: Iterable[Any]) -> str:
+    """Return why pods do not run, as a container or the scheduler reports; empty if unknown."""
+    for pod in pods:
+        for container in pod.status.container_statuses or ():
+            waiting = container.state.waiting if container.state else None
+            if waiting and waiting.reason not in (None, "ContainerCreating"):
+                message = f": {waiting.message}" if waiting.message else ""
+                return f"container {container.name}: {waiting.reason}{message}"
+        for reported in pod.status.conditions or ():
+            if reported.type == "PodScheduled" and reported.status == "False":
+                return f"not scheduled: {reported.message}"
+    return ""
+
+
+def condition(status: Object, kind: str) -> Object:
+    """Return the condition of type ``kind`` in a status; empty if there is none."""
+    conditions = status.get("conditions") or ()
+    return next((item for item in conditions if item.get("type") == kind), {})
+
+
+# ---- the health of releases, from Flux's objects. Pure ----
+#
+# Objects are plain data as the Kubernetes API returns them. The field names are those of Flux 2.9
+# (kustomize.toolkit.fluxcd.io/v1, helm.toolkit.fluxcd.io/v2).
+
+# The annotation that makes a controller reconcile an object now.
+REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
+# The labels that kustomize-controller sets on everything that it applies.
+_APPLIED_BY = "kustomize.toolkit.fluxcd.io/name"
+_APPLIED_IN = "kustomize.toolkit.fluxcd.io/namespace"
+# The label that helm-controller sets on everything that it installs.
+_HELM_NAME = "helm.toolkit.fluxcd.io/name"
+
+
+class Flux(HealthReader):
+    service_kind = "HelmRelease"
+
+    def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+        kinds = ("Kustomization", "GitRepository", "HelmRelease", "Deployment")
+        return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
+
+    def domain_health(
+        self, domain: ClusterDomain, commit: str, objects: Objects, history: History
+    ) -> Health:
+        kustomization = objects.get(self.follower(domain))
+        name = name_of(self.follower(domain))
+        if kustomization is None:
+            missing = f"does not exist; apply {bootstrap_path(domain.cluster)} to the cluster"
+            return Health("waiting", missing, name)
+        status = kustomization.get("status") or {}
+        reached = _commit(status.get("lastAppliedRevision"))
+        if reached and history.includes(reached, commit):
+            return Health("reconciled")
+        attempted = _commit(status.get("lastAttemptedRevision"))
+        ready = condition(status, "Ready")
+        if ready.get("status") == "False" and attempted and history.includes(attempted, commit):
+            return Health("waiting", str(ready.get("message", "")), name, failing=True)
+        source = self._source(domain, objects) or {}
+        fetched = condition(source.get("status") or {}, "Ready")
+        if fetched.get("status") == "False":
+            at = f"GitRepository {domain.namespace}/{_source_name(kustomization)}"
+            return Health("waiting", str(fetched.get("message", "")), at, failing=True)
+        return Health("waiting", "has not applied the commit yet", name)
+
+    def follower(self, domain: ClusterDomain) -> Key:
+        return "Kustomization", domain.namespace, domain.name
+
+    def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
+        kustomization = objects.get(self.follower(domain)) or {}
+        return _commit((kustomization.get("status") or {}).get("lastAppliedRevision"))
+
+    def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
+        labels = item["metadata"].get("labels") or {}
+        return (labels.get(_APPLIED_IN), labels.get(_APPLIED_BY)) == self.follower(domain)[1:]
+
+    def handled_request(self, domain: ClusterDomain, objects: Objects) -> str:
+        """Return the time stamp of the last fetch request that the source handled, or empty."""
+        return _handled(self._source(domain, objects) or {})
+
+    def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
+        """Return whether Flux has finished all work of a domain's last fetch.
+
+        ``before`` is what :meth:`handled_request` returned before the last fetch request was made,
+        if one was.
+        """
+        kustomization, source = objects.get(self.follower(domain)), self._source(domain, objects)
+        # what does not exist or is suspended never fetches, and must not hold up the next request
+        if kustomization is None or source is None:
+            return True
+        if any((each.get("spec") or {}).get("suspend") for each in (kustomization, source)):
+            return True
+        asked = (source["metadata"].get("annotations") or {}).get(REQUESTED_AT, "")
+        handled = _handled(source)
+        if handled == before or handled != asked:
+            return False
+        status = kustomization.get("status") or {}
+        fetched = ((source.get("status") or {}).get("artifact") or {}).get("revision")
+        ended = condition(status, "Ready").get("status") in ("True", "False")
+        return ended and status.get("lastAttemptedRevision") == fetched
+
+    def _source(self, domain: ClusterDomain, objects: Objects) -> Object | None:
+        kustomization = objects.get(self.follower(domain)) or {}
+        return objects.get(("GitRepository", domain.namespace, _source_name(kustomization)))
+
+    def _service_health(
+        self, target: Target, item: Object, commit: str, objects: Objects, history: History
+    ) -> Health:
+        del commit, history  # domain_health has checked the commit
+        name = name_of(self.key(target))
+        status = item.get("status") or {}
+        ready = condition(status, "Ready")
+        # until then, the condition is that of the former spec
+        current = status.get("observedGeneration") == item["metadata"].get("generation")
+        if ready.get("status") == "False":
+            return Health("reconciled", str(ready.get("message", "")), name, failing=True)
+        if not current or ready.get("status") != "True":
+            return Health("reconciled", str(ready.get("message") or "is being installed"), name)
+        return worst([deployment_health(each) for each in self._deployments(target, objects)])
+
+    def _service_state(self, status: Object) -> Object:
+        return condition(status, "Ready")
+
+    def _owns(self, target: Target, deployment: Object) -> bool:
+        return (deployment["metadata"].get("labels") or {}).get(_HELM_NAME) == target.name
+
+
+def _source_name(kustomization: Object) -> str:
+    return str(((kustomization.get("spec") or {}).get("sourceRef") or {}).get("name", ""))
+
+
+def _commit(revision: object) -> str:
+    """Return the commit of a Flux revision (``main@sha1:…``)."""
+    return str(revision or "").rpartition(":")[2]
+
+
+def _handled(source: Object) -> str:
+    return str((source.get("status") or {}).get("lastHandledReconcileAt", ""))
+
+
+# ---- the health of releases, from Argo CD's objects. Pure ----
+#
+# Objects are plain data as the Kubernetes API returns them. The field names are those of Argo CD
+# 3.2 (argoproj.io/v1alpha1). The status of an Application lags behind its spec. So a status counts
+# only if its ``sync.comparedTo`` holds the source of the current spec.
+
+_TRACKED_BY = "argocd.argoproj.io/tracking-id"
+# A reason lists at most this many objects on which a sync failed.
+_DETAILS = 3
+
+
+class ArgoCd(HealthReader):
+    service_kind = "Application"
+
+    def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
+        folder = ObjectSelector("Application", *_folder_application(domain))
+        return folder, *self.objects_to_confirm(domain)
+
+    def domain_health(
+        self, domain: ClusterDomain, commit: str, objects: Objects, history: History
+    ) -> Health:
+        name = name_of(self.follower(domain))
+        app = objects.get(self.follower(domain))
+        if app is None:
+            missing = f"does not exist; apply {bootstrap_path(domain.cluster)} to the cluster"
+            return Health("waiting", missing, name)
+        if any(history.includes(revision, commit) for revision in _applied_commits(app)):
+            return Health("reconciled")
+        waiting = "has not applied the commit yet"
+        message, revision = _failure(app)
+        if not message:
+            return Health("waiting", waiting, name)
+        # a failure at another commit may be over once Argo CD has tried this one
+        if revision and not history.includes(revision, commit):
+            reason = f"{waiting}; Argo CD reports for {revision[:10]}: {message}"
+            return Health("waiting", reason, name)
+        return Health("waiting", message, name, failing=True)
+
+    def follower(self, domain: ClusterDomain) -> Key:
+        return "Application", *_folder_application(domain)
+
+    def applied_commit(self, domain: ClusterDomain, objects: Objects) -> str:
+        app = objects.get(self.follower(domain))
+        return next(iter(_applied_commits(app)), "") if app else ""
+
+    def applied_by(self, domain: ClusterDomain, item: Object) -> bool:
+        annotations = item["metadata"].get("annotations") or {}
+        tracked = f"{_folder_application(domain).name}:"
+        return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
+
+    def _service_health(
+        self, target: Target, item: Object, commit: str, objects: Objects, history: History
+    ) -> Health:
+        name = name_of(self.key(target))
+        if item["metadata"].get("deletionTimestamp"):
+            return Health("reconciled", "is being removed and will then be created again", name)
+        outdated = _why_outdated(target.domain, item, commit, objects, history)
+        if not outdated and _status(item, "sync").get("status") == "Synced":
+            return _synced_health(item, name, objects)
+        message, _ = _failure(item)
+        if message:
+            return Health("reconciled", message, name, failing=True)
+        running = str(_status(item, "operationState").get("message") or "is being synced")
+        return Health("reconciled", outdated or running, name)
+
+    def _service_state(self, status: Object) -> Object:
+        return status.get("health") or {}
+
+    def _owns(self, target: Target, deployment: Object) -> bool:
+        annotations = deployment["metadata"].get("annotations") or {}
+        tracked = f"{target.domain.namespace}_{target.name}:"
+        return str(annotations.get(_TRACKED_BY, "")).startswith(tracked)
+
+    def _why_not_removed(self, item: Object) -> str:
+        return _error(item)
+
+
+def _folder_application(domain: ClusterDomain) -> ObjectName:
+    assert domain.application is not None  # noqa: S101 - otherwise Flux's reader is used
+    return domain.application
+
+
+def _applied_commits(app: Object) -> list[str]:
+    """Return the commits that an Application is known to have applied, the newest first."""
+    source = (app.get("spec") or {}).get("source")
+    sync, operation = _status(app, "sync"), _status(app, "operationState")
+    revisions = []
+    # a Synced Application has applied the commit that it was compared with
+    compared = (sync.get("comparedTo") or {}).get("source")
+    if sync.get("status") == "Synced" and _same(compared, source):
+        revisions.append(str(sync.get("revision", "")))
+    # If commits come fast, an Application may never be Synced, so the commit of its last successful
+    # sync counts too, unless that was only for some resources.
+    result = operation.get("syncResult") or {}
+    whole = operation.get("phase") == "Succeeded" and not _requested_sync(operation).get(
+        "resources"
+    )
+    if whole and _same(result.get("source"), source):
+        revisions.append(str(result.get("revision", "")))
+    return [revision for revision in revisions if revision]
+
+
+def _why_outdated(
+    domain: ClusterDomain, app: Object, commit: str, objects: Objects, history: History
+) -> str:
+    sync, source = _status(app, "sync"), (app.get("spec") or {}).get("source") or {}
+    if not sync:
+        return "has not been compared yet"
+    if not _same((sync.get("comparedTo") or {}).get("source"), source):
+        return "has not been compared with its current spec yet"
+    application = objects.get(("Application", *_folder_application(domain))) or {}
+    folder = (application.get("spec") or {}).get("source") or {}
+    if source.get("repoURL") != folder.get("repoURL"):
+        return ""  # the chart is in a registry, and its version is part of the compared source
+    revision = str(sync.get("revision", ""))
+    path = str(source.get("path", ""))
+    if history.includes(revision, commit) or history.unchanged(revision, commit, path):
+        return ""
+    return "has not applied the commit's chart yet"
+
+
+def _synced_health(app: Object, name: str, objects: Objects) -> Health:
+    for item in (app.get("status") or {}).get("resources") or ():
+        if item.get("kind") != "Deployment":
+            continue
+        key = ("Deployment", str(item.get("namespace", "")), str(item.get("name", "")))
+        if key not in objects:
+            return Health("reconciled", "does not exist yet", name_of(key))
+        health = deployment_health(objects[key])
+        if health.state != "healthy":
+            return health
+    reported = _status(app, "health")
+    if reported.get("status") == "Healthy":
+        return Health("healthy")
+    level = reported.get("status")
+    reason = str(reported.get("message") or f"its health is {level or 'not known yet'}")
+    return Health("reconciled", reason, name, failing=level == "Degraded")
+
+
+def _failure(app: Object) -> tuple[str, str]:
+    """Return why an Application fails, or an empty text, and for which commit, if it is known."""
+    operation = _status(app, "operationState")
+    result = operation.get("syncResult") or {}
+    revision = str(result.get("revision") or _requested_sync(operation).get("revision") or "")
+    synced = result.get("source")
+    stale = synced and not _same(synced, (app.get("spec") or {}).get("source"))
+    phase = operation.get("phase")
+    # A failed sync that will be retried has the phase Running and ``finishedAt``.
+    if phase == "Running" and operation.get("finishedAt"):
+        prefix = "its previous spec is still being retried: " if stale else ""
+        return prefix + _sync_message(operation), revision
+    if phase in ("Failed", "Error") and not stale:
+        return _sync_message(operation), revision
+    return _error(app), ""
+
+
+def _sync_message(operation: Object) -> str:
+    """Return the message of a failed sync, with those of failed objects that it lacks."""
+    message = str(operation.get("message", ""))
+    failed = [
+        item
+        for item in (operation.get("syncResult") or {}).get("resources") or ()
+        if item.get("status") in ("SyncFailed", "PruneSkipped") and item.get("message")
+    ]
+    details = [
+        f"{item.get('kind')} {item.get('name')}: {item['message']}"
+        for item in failed
+        if str(item["message"]) not in message
+    ]
+    return "; ".join([message, *details[:_DETAILS]])
+
+
+def _error(app: Object) -> str:
+    """Return the first error among the conditions of an Application, or an empty text."""
+    for item in (app.get("status") or {}).get("conditions") or ():  # the others are warnings
+        if str(item.get("type", "")).endswith("Error"):
+            return f"{item['type']}: {item.get('message', '')}"
+    return ""
+
+
+def _status(app: Object, part: str) -> Object:
+    return (app.get("status") or {}).get(part) or {}
+
+
+def _requested_sync(operation: Object) -> Object:
+    return (operation.get("operation") or {}).get("sync") or {}
+
+
+def _same(source: object, other: object) -> bool:
+    """Return whether two sources are equal apart from empty fields."""
+    try:  # Argo CD may omit an empty field or write it
+        return _without_empty(source) == _without_empty(other)
+    except RecursionError:  # nothing that the generator renders is nested so deeply
+        return False
+
+
+def _without_empty(value: object) -> object:
+    if isinstance(value, dict):
+        items = {key: _without_empty(item) for key, item in value.items()}
+        return {key: item for key, item in items.items() if item not in (None, "", {}, [])}
+    if isinstance(value, list):
+        return [_without_empty(item) for item in value]
+    return value
+
+
+# ---- the health of releases, computed from a cluster's objects. Pure ----
+#
+# Flux and Argo CD each have a reader. The reader is chosen for each :class:`ClusterDomain`, so a
+# state repo may switch from one controller to the other while rollouts are followed.
+
+_ARGOCD, _FLUX = ArgoCd(), Flux()
+
+
+def health_reader(domain: ClusterDomain) -> HealthReader:
+    return _ARGOCD if domain.application else _FLUX

@@ -1,1 +1,0 @@
-"""The health of releases, computed from objects of a cluster. Pure."""

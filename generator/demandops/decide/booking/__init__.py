@@ -1,1 +1,0 @@
-"""A request changes the ledger."""
