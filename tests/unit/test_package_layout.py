@@ -23,8 +23,6 @@ MOST_MODULES = 12
 
 SAME_NAME = {
     "__init__": "every package has one",
-    "flux": "render writes Flux's files, cluster/health reads Flux's objects",
-    "argocd": "render writes Argo CD's files, cluster/health reads Argo CD's objects",
 }
 """The module names that may occur more than once, with the reason."""
 
