@@ -32,9 +32,8 @@ from demandops.decide.booking import Drain, apply
 from demandops.decide.changeset import Changeset, FileReader, ReleaseChange
 from demandops.decide.checks import collisions, quotas, version_difference
 from demandops.decide.placement import capacity, relocation
-from demandops.decide.planning import flows
-from demandops.decide.planning import planner as scale_downs
-from demandops.decide.planning.flows import flows
+from demandops.decide.planning import planner
+from demandops.decide.planning.flows import flows, without_idle_deliveries
 from demandops.decide.planning.overrides import (
     with_kept_claims,
     without_kept_claims,
@@ -324,7 +323,7 @@ def _booked(
     # demands any longer, would contradict the request.
     ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
     if isinstance(request, Decommission):
-        ledger, changes = flows.without_idle_deliveries(
+        ledger, changes = without_idle_deliveries(
             state.ledger, replace(state, ledger=ledger), changes
         )
     after = replace(state, ledger=ledger)
@@ -339,7 +338,7 @@ def _booked(
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
-    ledger, kept = scale_downs.with_kept_replicas(state, after, keys, now)
+    ledger, kept = planner.with_kept_replicas(state, after, keys, now)
     after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
     clashes = list(collisions.topic_faults(request, state, after, paced(keys, checkpoint)))
     clashes += collisions.name_faults(
@@ -362,7 +361,7 @@ def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
     """Return the state after a step of a service's kept replicas has ended, and its changeset."""
-    after = replace(state, ledger=scale_downs.without_ended(state, instance, now))
+    after = replace(state, ledger=planner.without_ended(state, instance, now))
     changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
     change = changeset.build_changeset(
         state, after, changes, keys, state.evaluate, read, state.plans
