@@ -1,7 +1,4 @@
-"""The two actions that carry demands, with one adapter for each.
-
-An adapter turns goals into plain data, and stages and outcomes into messages.
-"""
+"""The two actions that carry demands: adapters for their messages, and their servers."""
 
 from __future__ import annotations
 
@@ -35,6 +32,11 @@ from unique_identifier_msgs.msg import UUID
 
 from demandops_ros.messages import ANSWER_LEVELS, demand_goal_to_data, message_to_data
 from demandops_ros.ros_process import ExecutorThread
+
+# ---- an adapter for each action ----
+#
+# An adapter turns goals into plain data, and stages and outcomes into messages.
+
 
 # The first kind that fits counts.
 _CODES: tuple[tuple[type[BaseException], str], ...] = (

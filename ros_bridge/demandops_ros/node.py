@@ -1,7 +1,4 @@
-"""Offers the bookkeeping over ROS 2, by a ROS service and on a latched topic.
-
-The service and the topic carry the JSON that ``demandops bookkeeping --output json`` prints.
-"""
+"""The ROS 2 node: action servers, bookkeeping and diagnostics."""
 
 from __future__ import annotations
 
@@ -40,6 +37,10 @@ from demandops_ros.actions import (
     LastingResults,
     OtherServers,
 )
+
+# ---- the bookkeeping over ROS 2, by a ROS service and on a latched topic ----
+#
+# The service and the topic carry the JSON that ``demandops bookkeeping --output json`` prints.
 
 
 def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401

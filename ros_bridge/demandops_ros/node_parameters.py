@@ -1,10 +1,4 @@
-"""Reads the parameters of the reference's node, and warns about those that have no effect.
-
-A fleet may start our node with the parameter file of the reference's node. The file calls that node
-``application_manager``. Our node takes the action's name from the file. Brokers, topics, namespaces
-and the image registry come from the state repo. If the file names one that the state repo lacks,
-the node warns. The node also warns about parameters that it replaces by other means.
-"""
+"""The parameters of the node: its own, and those of the reference's node that it understands."""
 
 from __future__ import annotations
 
@@ -33,6 +27,14 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
 from demandops_ros.messages import ANSWER_LEVELS
+
+# ---- reads the parameters of the reference's node, and warns about those without effect ----
+#
+# A fleet may start our node with the parameter file of the reference's node. The file calls that
+# node ``application_manager``. Our node takes the action's name from the file. Brokers, topics,
+# namespaces and the image registry come from the state repo. If the file names one that the state
+# repo lacks, the node warns. The node also warns about parameters that it replaces by other means.
+
 
 _NODE = "application_manager"
 ACTION_NAME = "deployment_action_name"

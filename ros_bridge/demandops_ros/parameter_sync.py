@@ -1,4 +1,4 @@
-"""Reads the parameters of a node from the text of a ROS parameter file."""
+"""``demandops parameter-sync``: keeps a ROS node's parameters equal to those in a ConfigMap."""
 
 from __future__ import annotations
 
@@ -19,6 +19,9 @@ from rclpy.parameter import Parameter
 from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros import ros_process
+
+# ---- reads the parameters of a node from the text of a ROS parameter file ----
+
 
 _EVERY_NODE = ("/**", "**", "/*", "*")
 _SECTION = "ros__parameters"

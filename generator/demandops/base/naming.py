@@ -1,12 +1,4 @@
-"""Names of Kubernetes objects, files, branches and derived topics.
-
-A name depends only on the ids that it is made from. If an id must be shortened or changed to fit, a
-hash of the exact id is appended. The hash is short, because people read names. So two ids have the
-same name only if somebody searched for them, and then the second is refused
-(:mod:`.collisions`). Object names follow DNS-1123 and have at most 53
-characters, Helm's limit for a release name. Topic names are made as the reference makes them, so
-the ids ``a/b`` and ``a-b`` both give ``a_b`` in a topic name.
-"""
+"""Ids, and the names that are made of them: of objects, files, branches, topics and subjects."""
 
 from __future__ import annotations
 
@@ -20,6 +12,16 @@ from functools import lru_cache
 from typing import TypeAlias
 
 from demandops.base.quoting import is_visible, quoted
+
+# ---- names of Kubernetes objects, files, branches and derived topics ----
+#
+# A name depends only on the ids that it is made from. If an id must be shortened or changed to fit,
+# a hash of the exact id is appended. The hash is short, because people read names. So two ids have
+# the same name only if somebody searched for them, and then the second is refused
+# (:mod:`.collisions`). Object names follow DNS-1123 and have at most 53 characters, Helm's limit
+# for a release name. Topic names are made as the reference makes them, so the ids ``a/b`` and
+# ``a-b`` both give ``a_b`` in a topic name.
+
 
 MAX_NAME = 53  # Helm's limit for a release name
 # 48 bits: a longer hash would only raise the price of a search, and people read names

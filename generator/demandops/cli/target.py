@@ -1,8 +1,4 @@
-"""Contexts: the fleets that a person works with. A file in the user's config folder lists them.
-
-A context replaces options that a person would repeat: the state repo, the access to the clusters,
-the signing key. docs/commands.md describes the file.
-"""
+"""The state repo that a command works on: from its options, a context, or the folder around it."""
 
 from __future__ import annotations
 
@@ -30,6 +26,12 @@ from demandops.views import explanations
 
 if TYPE_CHECKING:
     pass  # DROPPED
+
+# ---- contexts: the fleets that a person works with, from a file in the user's config folder ----
+#
+# A context replaces options that a person would repeat: the state repo, the access to the clusters,
+# the signing key. docs/commands.md describes the file.
+
 Filled = Annotated[str, StringConstraints(min_length=1)]
 
 

@@ -1,4 +1,8 @@
-"""Computes the health of releases: the part that is the same for Flux and Argo CD. Pure."""
+"""The health of releases, from the objects of Flux or Argo CD. Pure.
+
+The reader is chosen for each :class:`ClusterDomain`, so a state repo may switch from one controller
+to the other while rollouts are followed.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,9 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol
 
 from demandops.render.gitops import bootstrap_path
+
+# ---- the part that is the same for Flux and Argo CD ----
+
 
 Level = Literal["pushed", "reconciled", "healthy"]
 State = Literal["waiting", "reconciled", "healthy"]

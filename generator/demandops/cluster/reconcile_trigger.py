@@ -1,9 +1,4 @@
-"""Signed calls to a controller's webhook after a push.
-
-A call to Flux goes to a Receiver of type ``generic-hmac``, or ``generic`` if there is no secret. A
-call to Argo CD is a push event in GitHub's format. Argo CD compares the repository of the event
-with the source of each Application.
-"""
+"""Wakes Flux or Argo CD after a push, so that nobody waits for their interval."""
 
 from __future__ import annotations
 
@@ -30,6 +25,13 @@ from demandops.cluster.object_cache import ObjectCache
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain
 from demandops.render.gitops import domain_folder, domains_in_use, project_of
+
+# ---- signed calls to a controller's webhook ----
+#
+# A call to Flux goes to a Receiver of type ``generic-hmac``, or ``generic`` if there is no secret.
+# A call to Argo CD is a push event in GitHub's format. Argo CD compares the repository of the event
+# with the source of each Application.
+
 
 _TIMEOUT_S = 5.0
 _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")

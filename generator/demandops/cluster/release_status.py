@@ -1,4 +1,4 @@
-"""Finds the clusters whose bootstrap file is older than the one in the state repo."""
+"""What the clusters report: old bootstrap files, forgotten objects, the status of releases."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from demandops.cluster.health import (
 )
 from demandops.cluster.object_cache import ObjectCache
 from demandops.render.gitops import bootstrap_path, digest_in, digest_of
+
+# ---- the clusters whose bootstrap file is older than the one in the state repo ----
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The releases that a demand needs or removes, as targets whose rollout can be followed."""
+"""Follows what a demand needs or removes until it runs, or is gone."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ from demandops.model.config.repo_settings import RepoSettings
 from demandops.model.ledger.ledger import World
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import domains_in_use, project_of
+
+# ---- the releases that a demand needs or removes, as targets whose rollout can be followed ----
 
 
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:

@@ -1,8 +1,4 @@
-"""Routes: one topic of a connection, with its names, direction and options.
-
-Requests and claims contain routes, and the configuration of clients follows from the routes. This
-module knows all valid options. Each connection type knows which of these options it supports.
-"""
+"""Connections, their routes, and the interface that each type of connection implements."""
 
 from __future__ import annotations
 
@@ -34,6 +30,11 @@ from demandops.model.config.registry import ClientSettings
 
 if TYPE_CHECKING:
     pass  # DROPPED
+
+# ---- routes: one topic of a connection, with its names, direction and options ----
+#
+# Requests and claims contain routes, and the configuration of clients follows from the routes. This
+# module knows all valid options. Each connection type knows which of these options it supports.
 
 
 @dataclass(frozen=True, slots=True)

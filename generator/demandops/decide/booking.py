@@ -1,8 +1,4 @@
-"""The owners of a demand that has an id: the requesters for whom it holds claims or waits.
-
-A request is refused if it names none of the owners. So if a second requester chooses the same
-demand id by chance, its requests cannot change the demand of the first requester.
-"""
+"""Changes the ledger as a request asks, or refuses it. :func:`apply`, at the end, is the way in."""
 
 from __future__ import annotations
 
@@ -29,6 +25,11 @@ from demandops.model.demand.demand_request import (
 )
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
 from demandops.model.ledger.records import RecentShutdown, Wait
+
+# ---- owners: the requesters for whom a demand that has an id holds claims or waits ----
+#
+# A request is refused if it names none of the owners. So if a second requester chooses the same
+# demand id by chance, its requests cannot change the demand of the first requester.
 
 
 def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:

@@ -1,7 +1,4 @@
-"""The changes that a decision makes in the state repo: files by path, and how releases change.
-
-A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
-"""
+"""Renders what a decision changes, as files by path."""
 
 from __future__ import annotations
 
@@ -32,6 +29,11 @@ from demandops.render import manifests, release_file
 from demandops.render.gitops import path_of
 from demandops.render.release_file import check_files
 from demandops.templating.values import Evaluate
+
+# ---- the changes that a decision makes: files by path, and how releases change ----
+#
+# A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
+
 
 Change = Literal["start", "change", "stop"]
 

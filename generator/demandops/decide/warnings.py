@@ -1,9 +1,4 @@
-"""Missing inputs: topics that applications read or deliver, but that do not arrive.
-
-A demand that needs a connection gets the connection, or its requester gets a warning. Later an
-override may suspend the connection, demands may release the connection, or people may remove a node
-or an output from the configuration. Then a topic no longer arrives.
-"""
+"""What a requester or the author of a change should know, although nothing is refused for it."""
 
 from __future__ import annotations
 
@@ -31,6 +26,12 @@ from demandops.model.demand.demand_request import DemandRequest
 from demandops.model.ledger import claim_file
 from demandops.model.ledger.ledger import World
 from demandops.templating import charts
+
+# ---- missing inputs: topics that applications read or deliver, but that do not arrive ----
+#
+# A demand that needs a connection gets the connection, or its requester gets a warning. Later an
+# override may suspend the connection, demands may release the connection, or people may remove a
+# node or an output from the configuration. Then a topic no longer arrives.
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""Areas of the map: a point or a polygon, and how far a position is from it."""
+"""What a rule watches for: areas, hours, topics, and the conditions made of them."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from demandops.base.naming import topic_problem
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import CamelModel, DnsLabel, Positive, readable_by, without
 from demandops.model.config.inventory import Position
+
+# ---- areas of the map: a point or a polygon, and how far a position is from it ----
+
 
 # x and y in metres, in the map frame of the positions.
 Point = tuple[float, float]

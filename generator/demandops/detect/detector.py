@@ -1,4 +1,4 @@
-"""Finds, from the bookkeeping, the events that had started before a restart."""
+"""From observations to goals: the detector without ROS."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from demandops.detect.event_engine import EventEngine
 from demandops.detect.observations import Event, Key, Observation
 from demandops.detect.rule_file import BookedDemand, Goal, RuleFile, Values
 from demandops.model.config.base_model import seconds_of
+
+# ---- after a restart: the events that had started before it, found in the bookkeeping ----
 
 
 def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, Goal]:

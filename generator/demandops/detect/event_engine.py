@@ -1,4 +1,4 @@
-"""An index of areas by position, so that an entity is compared only with the areas near it."""
+"""Turns observations into events, by the rules of one file."""
 
 from __future__ import annotations
 
@@ -26,6 +26,9 @@ from demandops.model.config.base_model import seconds_of
 
 if TYPE_CHECKING:
     pass  # DROPPED
+
+# ---- an index of areas by position, so that an entity is compared only with those near it ----
+
 Item = TypeVar("Item")
 
 _SMALLEST_CELL_M = 10.0

@@ -1,4 +1,4 @@
-"""The engine's state between two steps: who was seen where, and which events have not ended."""
+"""What the engine knows: who was seen where, and how messages tell it."""
 
 from __future__ import annotations
 
@@ -10,6 +10,9 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, TypeAlias
 
 from demandops.detect.rule_file import RuleFile, is_entity
+
+# ---- the engine's state between two steps: who was seen where, which events have not ended ----
+
 
 # The identity of an event: its rule, and the entities that it is about.
 Key: TypeAlias = tuple[str, tuple[str, ...]]

@@ -1,8 +1,4 @@
-"""The template of a rule's demand: plain data in whose texts ``{entity}`` stands for a value.
-
-A text that is only a name in braces becomes the value itself, for example a number for ``{x}``.
-``{{`` and ``}}`` stand for single braces. A template has no expressions, attributes or formats.
-"""
+"""The file of rules for the event detector, and what a rule demands."""
 
 from __future__ import annotations
 
@@ -40,6 +36,12 @@ from demandops.model.config.base_model import (
 )
 from demandops.model.config.policy import Duration, Patterns, matches
 from demandops.model.demand import demand_goal, deployment_request_goal
+
+# ---- the template of a demand: plain data in whose texts ``{entity}`` stands for a value ----
+#
+# A text that is only a name in braces becomes the value itself, for example a number for ``{x}``.
+# ``{{`` and ``}}`` stand for single braces. A template has no expressions, attributes or formats.
+
 
 # The values of the names in a template.
 Values = Mapping[str, str | float]

@@ -1,4 +1,4 @@
-"""The number of replicas of a service; the service's definition derives it from the demands."""
+"""A release: one service or one end of a connection, as it is to run."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from demandops.model.demand.claim import Claim, InputTopic
 from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import Instance, Kept, Steps
+
+# ---- the number of replicas of a service; its definition derives it from the demands ----
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,4 @@
-"""The paths of generated files, the same for both controllers.
-
-Other programs rely on these paths. There is one folder for each access domain of each cluster.
-"""
+"""The files that Flux or Argo CD follows: where they are, and what is in them."""
 
 from __future__ import annotations
 
@@ -22,6 +19,11 @@ from demandops.model.config.registry import ChartSource
 from demandops.model.config.repo_settings import RepoSettings
 from demandops.model.release import Release, ServiceRelease
 from demandops.templating import engine
+
+# ---- the paths of generated files, the same for both controllers ----
+#
+# Other programs rely on these paths. There is one folder for each access domain of each cluster.
+
 
 CLUSTERS_ROOT = "clusters"
 BOOTSTRAP_ROOT = "bootstrap"

@@ -1,8 +1,4 @@
-"""The Helm values of a service: what its template renders to, checked against the chart.
-
-The variables that the template gets are the interface of application definitions
-(docs/appdef.md). Requesters are not among these variables.
-"""
+"""The text of a release: the values of its chart, or the Deployment of a communication client."""
 
 from __future__ import annotations
 
@@ -23,6 +19,11 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.render import gitops
 from demandops.templating import engine
 from demandops.templating.values import Evaluate, ValuesTask
+
+# ---- the Helm values of a service: what its template renders to, checked against the chart ----
+#
+# The variables that the template gets are the interface of application definitions
+# (docs/appdef.md). Requesters are not among these variables.
 
 
 def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> dict[str, Any]:

@@ -1,9 +1,4 @@
-"""The last check of rendered files before a commit.
-
-Objects of Kubernetes' built-in kinds must match the schemas of Kubernetes. Every path must be in a
-folder that the generator owns. No two objects of a cluster may have the same kind, namespace and
-name.
-"""
+"""A release as a file, and the last check of files before a commit."""
 
 from __future__ import annotations
 
@@ -27,6 +22,13 @@ from demandops.model.release import Release
 from demandops.render import manifests
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.templating.values import Evaluate
+
+# ---- the last check of rendered files before a commit ----
+#
+# Objects of Kubernetes' built-in kinds must match the schemas of Kubernetes. Every path must be in
+# a folder that the generator owns. No two objects of a cluster may have the same kind, namespace
+# and name.
+
 
 # whose schemas check the objects of built-in kinds
 KUBERNETES_VERSION = "1.36.0"

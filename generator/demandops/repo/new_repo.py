@@ -1,4 +1,4 @@
-"""The files of a new state repo: the skeleton, the appdefs and the rendered files."""
+"""``demandops init``: makes a new state repo from the skeleton, with its rendered files."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ from demandops.repo.git.objects import NewObjects
 from demandops.repo.git.signing import Signer
 from demandops.repo.history import commit_log, commit_message
 from demandops.templating.evaluator import EVALUATE
+
+# ---- the files of a new state repo: the skeleton, the appdefs and the rendered files ----
+
 
 EXAMPLE_URL = "https://git.example/fleet/state-repo.git"
 

@@ -1,8 +1,4 @@
-"""Finds the files that a commit of the generator changed, but was not allowed to change.
-
-A commit of the generator may change generated files, reports, and the claims that its message
-names. Some operations may change further files.
-"""
+"""Renders commits again and compares the bytes: each commit of a generator proves itself."""
 
 from __future__ import annotations
 
@@ -31,6 +27,12 @@ from demandops.repo.git import tree as trees
 from demandops.repo.history.commit_log import PROPOSAL, LogEntry, entry_of
 from demandops.repo.load import ledger_files, state_in_effect
 from demandops.repo.load.snapshot import changed_kept_replicas
+
+# ---- the files that a commit of the generator changed, but was not allowed to change ----
+#
+# A commit of the generator may change generated files, reports, and the claims that its message
+# names. Some operations may change further files.
+
 
 _OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
 # Operations that may record or forget recent shutdowns.

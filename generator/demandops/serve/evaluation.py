@@ -1,9 +1,4 @@
-"""A rollback as a goal: plain data that passes through queue and journal like a demand.
-
-Only the command line makes this goal; actions and request files cannot contain it. The goal is
-evaluated on the newest tip, so a rollback works while others write. What others book until then
-counts as newer than the commit to roll back to.
-"""
+"""Decides one demand, or rolls back, on top of the commits of its batch."""
 
 from __future__ import annotations
 
@@ -29,6 +24,13 @@ from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.serve.queue import Receipt, Ticket, receipt_of
 from demandops.serve.timing.timers import RateLimit, within
 from demandops.templating.evaluator import DEMAND_S, processor_time
+
+# ---- a rollback as a goal: plain data that passes queue and journal like a demand ----
+#
+# Only the command line makes this goal; actions and request files cannot contain it. The goal is
+# evaluated on the newest tip, so a rollback works while others write. What others book until then
+# counts as newer than the commit to roll back to.
+
 
 _KIND = "Rollback"
 

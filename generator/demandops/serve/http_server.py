@@ -1,9 +1,4 @@
-"""The HTTP servers of the webhook and of the page, which no slow or busy client can fill.
-
-Anyone who reaches the address may connect. A client that neither sends nor reads is cut off, and so
-is one that sends in tiny pieces, because each piece costs as much as a large one. When too many
-connections are open, the oldest that waits for its client gives way, so a health check gets in.
-"""
+"""HTTP served: the server that no client can fill, and the webhook that Git servers call."""
 
 from __future__ import annotations
 
@@ -28,6 +23,14 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
+
+# ---- the server of the webhook and of the page, which no slow or busy client can fill ----
+#
+# Anyone who reaches the address may connect. A client that neither sends nor reads is cut off, and
+# so is one that sends in tiny pieces, because each piece costs as much as a large one. When too
+# many connections are open, the oldest that waits for its client gives way, so a health check gets
+# in.
+
 
 _PORT = re.compile(r"[0-9]{1,5}")
 _REMEDIES = {

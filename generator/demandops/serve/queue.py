@@ -1,4 +1,4 @@
-"""A demand under way, from its submission to its receipt."""
+"""Demands under way, from submission to receipt, and their order."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from demandops.cluster.health import Target
 from demandops.decide.decision import Decision, Outcome
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo.write.journal import JournalEntry, ProposalRecord
+
+# ---- a demand under way, from its submission to its receipt ----
+
 
 log = logging.getLogger("demandops")
 

@@ -1,4 +1,4 @@
-"""Records whether the remote can be reached, for logs and diagnostics."""
+"""The worker: follows the state repo, and publishes the demands as commits."""
 
 from __future__ import annotations
 
@@ -45,6 +45,9 @@ from demandops.serve.timing.timers import (
     may_take_long,
 )
 from demandops.templating.evaluator import DEMAND_S, processor_time
+
+# ---- records whether the remote can be reached, for logs and diagnostics ----
+
 
 log = logging.getLogger("demandops")
 

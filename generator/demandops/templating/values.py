@@ -1,4 +1,4 @@
-"""Finds the line of a values template that produced a faulty line of the rendered text."""
+"""Evaluates what people write: values templates, charts' schemas, patterns."""
 
 from __future__ import annotations
 
@@ -23,6 +23,9 @@ from demandops.base.quoting import quoted
 from demandops.base.strict_yaml import not_writable
 from demandops.templating import charts
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
+
+# ---- the line of a values template that produced a faulty line of the rendered text ----
+
 
 _EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
 _PLACE = re.compile(r"line (\d+)")

@@ -1,7 +1,4 @@
-"""The demands that hold something or wait for room, as a list for people.
-
-An override that keeps claims is listed like a demand.
-"""
+"""Demands and nodes as lists for people."""
 
 from __future__ import annotations
 
@@ -19,6 +16,11 @@ from demandops.model.demand.claim import Claim, Lease, requesters_of
 from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release
+
+# ---- the demands that hold something or wait for room ----
+#
+# An override that keeps claims is listed like a demand.
+
 
 # The state of a claim or of a demand. A claim is held by its demand, kept by an override, or
 # suspended by an override. A demand has the state of its claims. If the states of its claims

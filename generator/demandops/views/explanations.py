@@ -1,4 +1,4 @@
-"""The override report, for ``get overrides`` and ``check``: the effect of each override now."""
+"""What overrides do now, and why releases run."""
 
 from __future__ import annotations
 
@@ -20,6 +20,9 @@ from demandops.model.demand.claim import Claim, demand_id
 from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.release import Release, ServiceRelease, claims_of, most_replicas
 from demandops.render.gitops import path_of
+
+# ---- the override report, for ``get overrides`` and ``check``: what each override does now ----
+
 
 # ``matches nothing``: the override selects nothing, or its effects do not apply to what it selects.
 # ``held back``: another override with ``hold`` keeps every file that this override would change.

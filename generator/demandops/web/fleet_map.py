@@ -1,4 +1,4 @@
-"""The layout of the map: nodes are drawn at their positions, or by cluster and type."""
+"""The map: nodes with their services, and the connections between nodes."""
 
 from __future__ import annotations
 
@@ -11,6 +11,9 @@ from demandops.model.config.inventory import Node
 from demandops.model.release import ServiceRelease
 from demandops.web.lists import Filter, Row, rows_of
 from demandops.web.situation import RANKS, WORDS, Situation, word_of
+
+# ---- the layout: nodes are drawn at their positions, or by cluster and type ----
+
 
 WIDTH = 1200.0
 HEAD = 30.0

@@ -1,4 +1,4 @@
-"""Watches the releases on their clusters, and records the changes of their health."""
+"""Follows the state repo and the clusters, and provides what the page shows."""
 
 from __future__ import annotations
 
@@ -30,6 +30,9 @@ from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.web.situation import Commit, CommitState, HealthChange, Situation, word_of
+
+# ---- watches the releases on their clusters, and records the changes of their health ----
+
 
 # How many changes of health are kept. They are in memory only, because the page writes nothing.
 _KEPT = 2_000

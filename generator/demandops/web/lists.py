@@ -1,4 +1,4 @@
-"""Lists that can be filtered, sorted and paged, as plain values."""
+"""The lists of the page, and the table that shows them."""
 
 from __future__ import annotations
 
@@ -18,6 +18,9 @@ from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
 from demandops.views import demand_lists
 from demandops.web.situation import RANKS, WORDS, ReusableRows, Situation, word_of, worst_word
+
+# ---- lists that can be filtered, sorted and paged, as plain values ----
+
 
 # How many rows a page of a list has at most.
 PAGE = 100

@@ -1,4 +1,4 @@
-"""Who can probably fix a release that is not ready, judged by the files and the cluster."""
+"""Which applications are not ready, why and since when, and who can fix the causes."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from demandops.repo.load.last_valid_config import Problem
 from demandops.views import explanations
 from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of, worst_word
+
+# ---- who can probably fix a release that is not ready, judged by the files and the cluster ----
+
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
 

@@ -1,4 +1,4 @@
-"""The view of one demand: what it holds, and what would change if it were released."""
+"""The views of one demand and of one release."""
 
 from __future__ import annotations
 
@@ -24,6 +24,8 @@ from demandops.repo.reader import Reader
 from demandops.views import explanations
 from demandops.views.explanations import how_to_release, is_released_by_demand_id
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of
+
+# ---- the view of one demand: what it holds, and what would change if it were released ----
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The views: for each address, the function that returns a template and its data."""
+"""The page: its addresses, its views and its server."""
 
 from __future__ import annotations
 
@@ -39,6 +39,9 @@ from demandops.web import fleet_map, lists, not_ready, release_view, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Link, Row, rows_of
 from demandops.web.situation import Situation
+
+# ---- the views: for each address, the function that returns a template and its data ----
+
 
 # The parameters that a link to another view keeps: the chosen commit or time, and the filter.
 _KEPT = ("at", "q")

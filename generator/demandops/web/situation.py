@@ -1,4 +1,4 @@
-"""The health of a release in one word, and the color of this word on the page."""
+"""What the page shows: the state at a commit, the health of releases and the open proposals."""
 
 from __future__ import annotations
 
@@ -33,6 +33,9 @@ from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.proposal_branch import PendingProposal
 from demandops.views import explanations
 from demandops.views.explanations import Entry, override_report
+
+# ---- the health of a release in one word, and the color of this word on the page ----
+
 
 # The words for a health, each with its color on the page, from the worst to the best health.
 WORDS = {

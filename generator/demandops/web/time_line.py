@@ -1,4 +1,4 @@
-"""The time line, with the events of demands, overrides, people's commits and health."""
+"""The time line, and plots of rates and latencies."""
 
 from __future__ import annotations
 
@@ -13,6 +13,9 @@ from demandops.model.config.override import OVERRIDES_ROOT
 from demandops.repo.history.commit_log import PROPOSAL
 from demandops.web.lists import Filter, Row, cell
 from demandops.web.situation import WORDS, Commit, HealthChange
+
+# ---- the time line, with the events of demands, overrides, people's commits and health ----
+
 
 # The title of each lane of the time line, from top to bottom, by the lane's name.
 LANES = {

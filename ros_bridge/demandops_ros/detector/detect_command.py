@@ -1,4 +1,4 @@
-"""The detector's parameters: their defaults, descriptions and ranges."""
+"""``demandops detect``, and the parameters of its node."""
 
 from __future__ import annotations
 
@@ -15,6 +15,9 @@ from demandops.detect import rule_file
 from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
+
+# ---- the detector's parameters: their defaults, descriptions and ranges ----
+
 
 # Each parameter: its default, its description and, if it is a number, its range.
 PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {

@@ -1,7 +1,4 @@
-"""Subscriptions to the topics that match the sources of rules.
-
-Topics may appear and vanish at any time.
-"""
+"""The node of the event detector: subscriptions, demands that it sends, diagnostics."""
 
 from __future__ import annotations
 
@@ -35,6 +32,11 @@ from demandops_ros.client import DemandClient
 from demandops_ros.detector import detect_command
 from demandops_ros.messages import fill_message
 from demandops_ros.node import status
+
+# ---- subscriptions to the topics that match the sources of rules ----
+#
+# Topics may appear and vanish at any time.
+
 
 # A subscription is reliable if all publishers that it finds are. The queue is deep, because many
 # entities may share a topic.

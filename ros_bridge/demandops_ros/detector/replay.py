@@ -1,4 +1,4 @@
-"""Reads a recorded bag, MCAP or sqlite3, without ROS. Only this module imports rosbags."""
+"""``demandops detect --replay``: tries rules on a recorded bag."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from demandops.detect.observations import Event, Key, MessageReader, Observation
 from demandops.detect.rule_file import Goal, RuleFile
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+
+# ---- reads a recorded bag, MCAP or sqlite3, without ROS; only this module imports rosbags ----
+
 
 # Stands in `left_out` for the damaged end of a bag, whose topics are unknown. Its count is 1, as
 # the lost messages cannot be counted.

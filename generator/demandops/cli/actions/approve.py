@@ -1,4 +1,4 @@
-"""``demandops approve``: merge a proposal in the caller's own name."""
+"""``demandops approve`` and ``demandops reject``: a person answers a proposal."""
 
 from __future__ import annotations
 
@@ -29,6 +29,9 @@ from demandops.repo.write.proposal_branch import (
     ProposalBranches,
     pending_proposals,
 )
+
+# ---- ``demandops approve``: merge a proposal in the caller's own name ----
+
 
 commit_option = click.option(
     "--commit",

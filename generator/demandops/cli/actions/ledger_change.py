@@ -1,4 +1,4 @@
-"""Shared parts of the commands that change the ledger: booking, and printing the changes."""
+"""Commands that change the ledger: what they share, ``decommission`` and ``rollback``."""
 
 from __future__ import annotations
 
@@ -38,6 +38,9 @@ from demandops.repo.reader import Reader
 from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 from demandops.serve.queue import Receipt
+
+# ---- booking, and printing the changes ----
+
 
 _LOOK_UP_S = 0.5
 

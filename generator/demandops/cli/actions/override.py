@@ -1,4 +1,4 @@
-"""``demandops override``: create or end an override, by a commit in the caller's own name."""
+"""``demandops override``, ``suspend`` and ``resume``: deviations that a person declares."""
 
 from __future__ import annotations
 
@@ -35,6 +35,8 @@ from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time, parse_time
 from demandops.repo.reader import Reader
 from demandops.views.explanations import Entry
+
+# ---- ``demandops override``: create or end an override, by a commit in the caller's own name ----
 
 
 @click.group()

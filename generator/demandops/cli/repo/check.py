@@ -1,10 +1,4 @@
-"""The result of ``demandops check`` as a comment on a pull request.
-
-Text that people wrote appears only as code, so that this text cannot mention users, make links or
-break the layout. Each code span or fence uses more backticks than any run of backticks in its text.
-The length of a comment is limited. So the most important parts come first, and the comment states
-how many parts are omitted.
-"""
+"""``demandops check``: its result on the terminal, as JSON, and as a comment on a pull request."""
 
 from __future__ import annotations
 
@@ -26,6 +20,14 @@ from demandops.repo.pull_request.merge_check import CheckResult
 from demandops.repo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
 from demandops.templating.evaluator import processor_time
 from demandops.views.bookkeeping import EntryChange
+
+# ---- the result as a comment on a pull request ----
+#
+# Text that people wrote appears only as code, so that this text cannot mention users, make links or
+# break the layout. Each code span or fence uses more backticks than any run of backticks in its
+# text. The length of a comment is limited. So the most important parts come first, and the comment
+# states how many parts are omitted.
+
 
 # The first line of every report. A pipeline finds its earlier comment by this line.
 MARK = "<!-- demandops check -->"

@@ -1,4 +1,4 @@
-"""``demandops version``: the versions of the program and of the formats that it writes."""
+"""Commands about the program itself: ``version``, ``completion`` and ``config``."""
 
 from __future__ import annotations
 
@@ -18,6 +18,8 @@ from demandops.cli.output import print_lines
 from demandops.cli.table import Column, Table
 from demandops.cli.target import context_names
 from demandops.model.config.base_model import parse
+
+# ---- ``demandops version``: the versions of the program and of the formats that it writes ----
 
 
 @click.command()

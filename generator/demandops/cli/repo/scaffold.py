@@ -1,4 +1,4 @@
-"""The text of YAML files that people edit. Pure."""
+"""What ``demandops new`` lays down: YAML files, images with pipelines, and applications. Pure."""
 
 from __future__ import annotations
 
@@ -19,6 +19,8 @@ from demandops.model.config.policy import AccessDomain, Rule, matches
 from demandops.model.config.registry import Image
 from demandops.model.config.repo_settings import as_git_url
 from demandops.templating import charts
+
+# ---- the text of YAML files that people edit ----
 
 
 def document(path: str, schema: str, kind: str, fields: Mapping[str, Any], note: str = "") -> str:

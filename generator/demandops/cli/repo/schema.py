@@ -1,4 +1,4 @@
-"""A description and an example of each property of a JSON Schema, for editors and the docs."""
+"""``demandops schema``, and what it says of each property."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ from demandops.model.config.registry import ChartsFile, ClientsFile, ImagesFile,
 from demandops.model.config.repo_settings import RepoSettings
 from demandops.model.demand.demand_goal import DemandGoal
 from demandops.model.demand.deployment_request_goal import WireGoal
+
+# ---- a description and an example of each property, for editors and the docs ----
+
 
 _INHERITS = "inherits"
 _COMMON = {

@@ -1,4 +1,4 @@
-"""``demandops init``: a new state repo."""
+"""Commands about a state repo as a whole: ``init``, ``upgrade``, ``verify`` and ``journal``."""
 
 from __future__ import annotations
 
@@ -30,6 +30,8 @@ from demandops.repo.upgrade import Upgrade, UpgradeRequest
 from demandops.repo.verification import Verdict
 from demandops.repo.write.journal import find_journals
 from demandops.templating.evaluator import processor_time
+
+# ---- ``demandops init``: a new state repo ----
 
 
 @click.command()

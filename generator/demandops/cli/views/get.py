@@ -1,4 +1,4 @@
-"""The proposals that await a person's approval, with links to their pull requests."""
+"""``demandops get``: the kinds of things that it lists, and their columns."""
 
 from __future__ import annotations
 
@@ -54,6 +54,8 @@ from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.views import demand_lists, explanations
 from demandops.views.bookkeeping import bookkeeping
 from demandops.views.explanations import override_report, override_state
+
+# ---- the proposals that await a person's approval, with links to their pull requests ----
 
 
 def proposals(repo: Reader) -> list[Json]:

@@ -1,4 +1,4 @@
-"""Finds the release, demand, node or other object whose name is given to ``demandops why``."""
+"""``demandops why``: what a name means, and all that explains why it runs or ran."""
 
 from __future__ import annotations
 
@@ -44,6 +44,9 @@ from demandops.repo.reader import Reader
 from demandops.views import explanations
 from demandops.views.demand_lists import nodes_of
 from demandops.views.explanations import affected_releases, override_report
+
+# ---- what is meant: the release, demand, node or other object that has the given name ----
+
 
 KINDS = (
     "release",

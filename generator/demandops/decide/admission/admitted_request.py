@@ -1,14 +1,4 @@
-"""The choice of an access domain if a demand names a node that is in several domains.
-
-In each further domain the node has the name ``<node>@<domain>``, which a demand may give wherever
-it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
-
-A demand may name a node without a domain: as the node of an application or of a service, or as an
-end of a connection. If the application or connection is booked already, its domain stays. If it is
-not booked yet, the domain is the only one in which the rules let the requesters use the node. If
-there is no such domain, the node's first domain is meant. If there are several, the demand is
-refused.
-"""
+"""The first part of a decision: a goal becomes a request that is complete and allowed."""
 
 from __future__ import annotations
 
@@ -40,6 +30,18 @@ from demandops.model.demand.demand_request import (
     Put,
 )
 from demandops.model.ledger.records import Wait, WaitingDemand
+
+# ---- the choice of an access domain if a demand names a node that is in several domains ----
+#
+# In each further domain the node has the name ``<node>@<domain>``, which a demand may give wherever
+# it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
+#
+# A demand may name a node without a domain: as the node of an application or of a service, or as an
+# end of a connection. If the application or connection is booked already, its domain stays. If it
+# is not booked yet, the domain is the only one in which the rules let the requesters use the node.
+# If there is no such domain, the node's first domain is meant. If there are several, the demand is
+# refused.
+
 
 Held = Application | Connection
 # returns the application or connection that a subject's first claim holds

@@ -1,9 +1,4 @@
-"""Topic clashes: a demand is refused if a node would have two sources of one topic.
-
-A subscriber would mix the two, without an error. Topics are named as the reference names them, so
-two ids of nodes or applications may give the same topic, for example ``a/b`` and ``a-b``. A
-connection may also bring a topic to a node where a service publishes the same topic.
-"""
+"""Refuses a demand if something that must be unique would be there twice."""
 
 from __future__ import annotations
 
@@ -37,6 +32,12 @@ from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.claim_file import path_of
 from demandops.model.ledger.ledger import Changes, World
 from demandops.model.release import ServiceKey
+
+# ---- topic clashes: a demand is refused if a node would have two sources of one topic ----
+#
+# A subscriber would mix the two, without an error. Topics are named as the reference names them, so
+# two ids of nodes or applications may give the same topic, for example ``a/b`` and ``a-b``. A
+# connection may also bring a topic to a node where a service publishes the same topic.
 
 
 def topic_faults(

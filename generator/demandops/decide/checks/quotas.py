@@ -1,8 +1,4 @@
-"""Denials: a demand is refused if an override with ``deny`` selects what the demand asks for.
-
-A demand that only repeats existing claims is never denied. If an override suspends these claims,
-the requester gets a warning.
-"""
+"""Refuses a demand for what people forbid: by overrides that deny, and by quotas."""
 
 from __future__ import annotations
 
@@ -28,6 +24,11 @@ from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Demanded, DemandRequest
 from demandops.model.ledger.ledger import Changes, World
 from demandops.model.release import ServiceKey
+
+# ---- denials: a demand is refused if an override with ``deny`` selects what it asks for ----
+#
+# A demand that only repeats existing claims is never denied. If an override suspends these claims,
+# the requester gets a warning.
 
 
 def denial_faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[Fault]:

@@ -1,7 +1,4 @@
-"""Moved connections: when an application moves, the connections of its demands follow.
-
-The connections then carry the same topics to or from the new node, with the same type and options.
-"""
+"""Moves applications and services to other nodes: off drained ones, and where overrides say."""
 
 from __future__ import annotations
 
@@ -52,6 +49,12 @@ from demandops.model.demand.claim import (
 from demandops.model.demand.demand_request import Demanded, Put
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
+
+# ---- moved connections: when an application moves, the connections of its demands follow ----
+#
+# The connections then carry the same topics to or from the new node, with the same type and
+# options.
+
 
 # Returns the given application on its new nodes.
 Move = Callable[[Application], Application]

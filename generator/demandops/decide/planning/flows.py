@@ -1,14 +1,4 @@
-"""The topics that services publish, named as the reference names them.
-
-``{instance}`` in an output pattern stands for the application or the node for which a service runs.
-For a service with ``each``, ``{instance}`` stands for the source of the input. A source has one
-usual topic for an input role: the topic in the source's inventory entry or, if there is none, the
-first topic that a demand booked. Any other topic is a further topic of the source. A name that is
-made from a further topic contains the source and this topic. If the inventory names no usual topic,
-the claims record which topics are further topics. So a name stays the same while anybody demands
-the topic and nobody changes the usual topic in the inventory. The reference's programs subscribe to
-outputs by name: with other names, they would hear nothing, without an error.
-"""
+"""What flows where: the topics that services publish, who reads them, and what must carry them."""
 
 from __future__ import annotations
 
@@ -27,6 +17,18 @@ from demandops.model.demand.claim import Application, ClaimKey, InputTopic
 from demandops.model.demand.demand_request import AnyRequest, Demanded, Put
 from demandops.model.ledger.ledger import Changes, Ledger, World, claim_changes
 from demandops.model.release import ServiceKey
+
+# ---- the topics that services publish, named as the reference names them ----
+#
+# ``{instance}`` in an output pattern stands for the application or the node for which a service
+# runs. For a service with ``each``, ``{instance}`` stands for the source of the input. A source has
+# one usual topic for an input role: the topic in the source's inventory entry or, if there is none,
+# the first topic that a demand booked. Any other topic is a further topic of the source. A name
+# that is made from a further topic contains the source and this topic. If the inventory names no
+# usual topic, the claims record which topics are further topics. So a name stays the same while
+# anybody demands the topic and nobody changes the usual topic in the inventory. The reference's
+# programs subscribe to outputs by name: with other names, they would hear nothing, without an
+# error.
 
 
 def outputs(

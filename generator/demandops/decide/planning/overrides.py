@@ -1,12 +1,4 @@
-"""The effects of overrides on claims: ``deny`` suspends claims, ``keep`` books further claims.
-
-A suspended claim stays booked, but nothing runs for it. The planner reads the ledger through a view
-that leaves out suspended claims.
-
-When the last claim on a subject is released, ``keep`` books a claim with the same content for the
-owner of the override. A later demand for the subject replaces this kept claim. Bookkeeping and
-history show a kept claim like any other claim.
-"""
+"""The effects of overrides: on claims, and on the releases that are planned from them."""
 
 from __future__ import annotations
 
@@ -29,6 +21,15 @@ from demandops.model.demand.claim import (
 from demandops.model.demand.demand_request import Demanded
 from demandops.model.ledger.ledger import Changes, Ledger, World, claim_changes
 from demandops.model.release import Release, ServiceRelease, claims_of, overridden
+
+# ---- effects on claims: ``deny`` suspends claims, ``keep`` books further claims ----
+#
+# A suspended claim stays booked, but nothing runs for it. The planner reads the ledger through a
+# view that leaves out suspended claims.
+#
+# When the last claim on a subject is released, ``keep`` books a claim with the same content for the
+# owner of the override. A later demand for the subject replaces this kept claim. Bookkeeping and
+# history show a kept claim like any other claim.
 
 
 @dataclass(frozen=True, slots=True)

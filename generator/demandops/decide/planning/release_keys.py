@@ -1,11 +1,4 @@
-"""The version of an application that is deployed: the newest version that its claims ask for.
-
-A claim on an application asks for a named version, or for the default version. A service that
-several applications share has the newest of the versions of these applications. So the order of
-the claims does not matter, and two demands that renew in turn do not restart the pods again and
-again. :mod:`.version_difference` decides whether a demand may ask for another
-version than the existing demands.
-"""
+"""Which releases claims need, by key, and which of them a change of claims affects."""
 
 from __future__ import annotations
 
@@ -23,6 +16,14 @@ from demandops.model.config.registry import ApplicationVersion, precedence
 from demandops.model.demand.claim import Application, Claim
 from demandops.model.ledger.ledger import ClaimChange, Ledger, World
 from demandops.model.release import ServiceKey
+
+# ---- the version of an application that is deployed: the newest that its claims ask for ----
+#
+# A claim on an application asks for a named version, or for the default version. A service that
+# several applications share has the newest of the versions of these applications. So the order of
+# the claims does not matter, and two demands that renew in turn do not restart the pods again and
+# again. :mod:`.version_difference` decides whether a demand may ask for another version than the
+# existing demands.
 
 
 def running_version(world: World, application: str) -> ApplicationVersion | None:

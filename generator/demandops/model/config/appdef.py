@@ -1,4 +1,10 @@
-"""The number of replicas of a service, and the fields of a definition that decide it."""
+"""Application definitions (appdefs): a YAML file and a folder define a type of application.
+
+An appdef lists inputs, parameters and services. The services read topics of the demand and outputs
+of other services. A service that an appdef defines itself runs only for applications of this
+appdef. A service that several appdefs share has a file of its own (paper, section on object
+detection), and each of these appdefs lists the service's name under ``uses``.
+"""
 
 from __future__ import annotations
 
@@ -31,6 +37,9 @@ from demandops.model.config.inventory import (
     Resources,
 )
 from demandops.model.config.policy import Duration
+
+# ---- the number of replicas of a service, and the fields of a definition that decide it ----
+
 
 Count = Annotated[int, Field(ge=0, le=1000)]
 

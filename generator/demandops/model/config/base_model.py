@@ -1,4 +1,4 @@
-"""Durations and times for people: ``1h30m``, ``in 10m``, ``3m20s ago``."""
+"""The base classes of all models that are parsed, and the types that they share."""
 
 from __future__ import annotations
 
@@ -21,6 +21,9 @@ from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path, suggestion
 from demandops.base.naming import PATTERN_WORDS, control_character
 from demandops.base.quoting import quoted
+
+# ---- durations and times for people: ``1h30m``, ``in 10m``, ``3m20s ago`` ----
+
 
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
 _UNITS = ((86_400, "d"), (3_600, "h"), (60, "m"), (1, "s"))

@@ -1,4 +1,4 @@
-"""The whole configuration as one frozen, indexed value: :class:`Config`."""
+"""What people wrote, as one value, and the reader that makes it of files."""
 
 from __future__ import annotations
 
@@ -40,6 +40,9 @@ from demandops.model.config.registry import (
     VersionList,
 )
 from demandops.model.config.repo_settings import RepoSettings
+
+# ---- the whole configuration as one frozen, indexed value: :class:`Config` ----
+
 
 CLUSTERS_FILE = "inventory/clusters.yaml"
 NODES_FILE = "inventory/nodes.yaml"

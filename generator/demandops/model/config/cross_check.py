@@ -1,8 +1,4 @@
-"""Refuses two overrides of equal priority that could change one release differently.
-
-Such a pair needs an order, and only different priorities give one. It is refused even if no release
-matches both overrides yet, because a later demand could add a release that does.
-"""
+"""Faults that only several files show together."""
 
 from __future__ import annotations
 
@@ -33,6 +29,12 @@ from demandops.model.config.override import Override, Selector, by_rank, patched
 from demandops.model.config.policy import matches
 from demandops.model.config.registry import ChartSource
 from demandops.templating import charts
+
+# ---- two overrides of equal priority that could change one release differently ----
+#
+# Such a pair needs an order, and only different priorities give one. It is refused even if no
+# release matches both overrides yet, because a later demand could add a release that does.
+
 
 _MERGED = ("values", "images")
 _SINGLE = ("version", "replicas", "node")

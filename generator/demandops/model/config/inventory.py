@@ -1,9 +1,4 @@
-"""Properties of nodes: typed values in the inventory, and the conditions of ``place`` on them.
-
-The value of a property is a number, text, true or false. A condition is a text: ``ros=jazzy``,
-``memoryGiB>=8`` or ``memoryGiB<=64``. A property has values of the same type on all nodes. This
-type decides how the generator reads the value in a condition.
-"""
+"""The inventory: nodes with their properties, clusters and brokers."""
 
 from __future__ import annotations
 
@@ -36,6 +31,13 @@ from demandops.model.config.base_model import (
     readable_by,
     without,
 )
+
+# ---- properties of nodes: typed values, and the conditions of ``place`` on them ----
+#
+# The value of a property is a number, text, true or false. A condition is a text: ``ros=jazzy``,
+# ``memoryGiB>=8`` or ``memoryGiB<=64``. A property has values of the same type on all nodes. This
+# type decides how the generator reads the value in a condition.
+
 
 _NAME = "[a-z][A-Za-z0-9_]*"
 _TEXT = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._+:/-]{0,61}[A-Za-z0-9])?")

@@ -1,4 +1,4 @@
-"""Applications: demands list them, claims hold them, and services are planned from them."""
+"""What a demand asks for and holds: applications, leases, claims."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from typing import NamedTuple
 from demandops.base import naming
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections.connection import Connection
+
+# ---- applications: demands list them, claims hold them, and services are planned from them ----
 
 
 class InputTopic(NamedTuple):

@@ -1,8 +1,4 @@
-"""Validation of the form of a goal: the valid part of plain data, and the faults.
-
-Fields of the wrong form are left out, and the other fields are kept. So the caller can report
-faults of form and of content together.
-"""
+"""A ``Demand`` as plain data, from ROS, a file or the journal, becomes a request."""
 
 from __future__ import annotations
 
@@ -26,6 +22,12 @@ from demandops.model.config.base_model import FrozenModel, faults_of, seconds_of
 from demandops.model.config.inventory import Coordinate, Position, read_condition
 from demandops.model.demand.claim import Application, Delivery, InputTopic, Requirement
 from demandops.model.demand.demand_request import Demanded, DemandRequest, Put, Release, Renew
+
+# ---- the form of a goal: the valid part of plain data, and the faults ----
+#
+# Fields of the wrong form are left out, and the other fields are kept. So the caller can report
+# faults of form and of content together.
+
 
 # how deeply a goal may be nested: as deeply as a YAML file of the state repo
 _DEEPEST_GOAL = 100

@@ -1,7 +1,4 @@
-"""The ledger: which demand holds which subject, as a set of persistent maps.
-
-A :class:`Ledger` never changes, because each request makes a new one.
-"""
+"""What is booked, as one value: the ledger, its changes, and the world that it is part of."""
 
 from __future__ import annotations
 
@@ -28,6 +25,11 @@ from demandops.model.ledger.records import (
     RecentShutdowns,
     WaitingDemands,
 )
+
+# ---- the ledger: which demand holds which subject, as a set of persistent maps ----
+#
+# A :class:`Ledger` never changes, because each request makes a new one.
+
 
 _ENDS = "ends"
 _DEMAND = attrgetter("demand")

@@ -1,11 +1,4 @@
-"""Kept replicas: those that a service keeps for a while although its demands need fewer.
-
-A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service has
-the highest number of replicas that its demands needed within this time. Its record, the file
-``ledger/replicas/<hh>/<name>.yaml``, lists each number above the present need, with the time until
-which it is kept. When that time passes, the generator removes the number by a commit. The replicas
-depend on the record, never on the clock, so ``demandops verify`` computes the same bytes again.
-"""
+"""The files of the ledger that are not claims: what the generator must remember between commits."""
 
 from __future__ import annotations
 
@@ -35,6 +28,16 @@ from demandops.model.ledger.claim_file import (
     parse_timestamp,
     segment,
 )
+
+# ---- kept replicas: those that a service keeps for a while although its demands need fewer ----
+#
+# A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service
+# has the highest number of replicas that its demands needed within this time. Its record, the file
+# ``ledger/replicas/<hh>/<name>.yaml``, lists each number above the present need, with the time
+# until which it is kept. When that time passes, the generator removes the number by a commit. The
+# replicas depend on the record, never on the clock, so ``demandops verify`` computes the same bytes
+# again.
+
 
 REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
 

@@ -1,4 +1,4 @@
-"""The state repo as a bare repository on this disk, written in place and fsynced."""
+"""State repos on this disk, and how the repo at an address is opened."""
 
 from __future__ import annotations
 
@@ -27,6 +27,9 @@ from demandops.repo.git.repository import (
     missing_main,
     unopened,
 )
+
+# ---- the state repo as a bare repository on this disk, written in place and fsynced ----
+
 
 # From this age on, a branch's lock counts as left behind by a killed process: Git locks a branch
 # only for milliseconds.

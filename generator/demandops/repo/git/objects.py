@@ -1,8 +1,4 @@
-"""Writes and syncs a pack and its index in Git's format.
-
-Each object is compressed and stored whole, not as a delta, because the search for deltas would take
-longer than the rest of a demand's commit. Git's housekeeping makes deltas later.
-"""
+"""New Git objects, in memory and as a pack."""
 
 from __future__ import annotations
 
@@ -26,6 +22,12 @@ from typing import NamedTuple
 import pygit2
 from pygit2 import Oid, Repository, Tree
 from pygit2.enums import ObjectType
+
+# ---- writes and syncs a pack and its index in Git's format ----
+#
+# Each object is compressed and stored whole, not as a delta, because the search for deltas would
+# take longer than the rest of a demand's commit. Git's housekeeping makes deltas later.
+
 
 _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
 # The level of compression. A pack is short-lived, so speed counts more than size.

@@ -1,9 +1,4 @@
-"""Commits signed by an SSH key, in the same way as git signs them.
-
-``ssh-keygen`` signs the commit's bytes, and the signature goes into the header ``gpgsig``, so
-``git verify-commit`` accepts it, and so do forges that check SSH signatures. This module knows only
-the key's path; ``ssh-keygen`` reads the key or asks an SSH agent.
-"""
+"""Signatures of commits: made with an SSH key, and checked against the keys that people allow."""
 
 from __future__ import annotations
 
@@ -23,6 +18,13 @@ from demandops.base.errors import StateRepoError
 from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
 from demandops.repo.git.objects import NewObjects
+
+# ---- commits signed by an SSH key, in the same way as git signs them ----
+#
+# ``ssh-keygen`` signs the commit's bytes, and the signature goes into the header ``gpgsig``, so
+# ``git verify-commit`` accepts it, and so do forges that check SSH signatures. This module knows
+# only the key's path; ``ssh-keygen`` reads the key or asks an SSH agent.
+
 
 _TIMEOUT_S = 20
 

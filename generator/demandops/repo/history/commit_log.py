@@ -1,13 +1,4 @@
-"""The text of commit messages: paragraphs of lines, and trailers in the last paragraph.
-
-Only this module writes and reads messages. A line of a paragraph is for people: its text is
-escaped and shortened. A trailer is for programs: its value is read back exactly. A value of visible
-characters on which no forge acts is written unchanged, so
-``git log --format='%(trailers:key=Requester)'`` shows it; any other value is written in double
-quotes with escapes like ``\\u202e``. So no value can begin a line, end the message, look like a
-trailer or give a forge an order. Messages of earlier versions, which did not quote, are read
-the same way.
-"""
+"""The history, and the form of the messages that it consists of."""
 
 from __future__ import annotations
 
@@ -28,6 +19,16 @@ from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.tree import commit_of
+
+# ---- the text of commit messages: paragraphs of lines, and trailers in the last paragraph ----
+#
+# Only this module writes and reads messages. A line of a paragraph is for people: its text is
+# escaped and shortened. A trailer is for programs: its value is read back exactly. A value of
+# visible characters on which no forge acts is written unchanged, so ``git log
+# --format='%(trailers:key=Requester)'`` shows it; any other value is written in double quotes with
+# escapes like ``\u202e``. So no value can begin a line, end the message, look like a trailer or
+# give a forge an order. Messages of earlier versions, which did not quote, are read the same way.
+
 
 Trailers = Iterable[tuple[str, str]]
 

@@ -1,10 +1,4 @@
-"""Commit messages: what changed in the desired state and why, for people and programs.
-
-The trailers are a contract: an auditor without this program finds everything with
-``git log --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
-:mod:`.commit_log` quotes them.
-:mod:`.state_in_effect` adds the trailers about quarantined files.
-"""
+"""What a commit says, and who made it."""
 
 from __future__ import annotations
 
@@ -39,6 +33,13 @@ from demandops.model.ledger.records import Instance, Wait
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME, REPLACES, compose
+
+# ---- commit messages: what changed in the desired state and why, for people and programs ----
+#
+# The trailers are a contract: an auditor without this program finds everything with ``git log
+# --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
+# :mod:`.commit_log` quotes them. :mod:`.state_in_effect` adds the trailers about quarantined files.
+
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200

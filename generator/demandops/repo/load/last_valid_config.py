@@ -1,10 +1,4 @@
-"""The problem report: a file in the state repo that lists the invalid files.
-
-The report names the first 100 faults and counts the others. A fault has the commit that caused it
-and the author of the commit, if the commit was found. The same problems give the same bytes, so an
-unchanged report causes no commit. This module only converts between problems and text; it reads and
-writes no files.
-"""
+"""The configuration at a commit, when a file that people merged may be invalid."""
 
 from __future__ import annotations
 
@@ -23,6 +17,14 @@ from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import records
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log
+
+# ---- the problem report: a file in the state repo that lists the invalid files ----
+#
+# The report names the first 100 faults and counts the others. A fault has the commit that caused it
+# and the author of the commit, if the commit was found. The same problems give the same bytes, so
+# an unchanged report causes no commit. This module only converts between problems and text; it
+# reads and writes no files.
+
 
 PATH = f"{NOTES_ROOT}/reports/problems.yaml"
 _HEAD = (

@@ -1,8 +1,4 @@
-"""Overrides that do the same as manual edits of generated files, for values, replicas and images.
-
-The generator's next commit undoes a manual edit, but an override lasts. So the check suggests one
-where it can, and a person has to write only the reason into it.
-"""
+"""A checkout that a person edited, and what to do in place of edits of generated files."""
 
 from __future__ import annotations
 
@@ -34,6 +30,12 @@ from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import reading, unopened
 from demandops.repo.history import revisions
 from demandops.repo.load import state_in_effect
+
+# ---- overrides that do the same as manual edits, for values, replicas and images ----
+#
+# The generator's next commit undoes a manual edit, but an override lasts. So the check suggests one
+# where it can, and a person has to write only the reason into it.
+
 
 _VALUES = (("spec", "values"), ("spec", "source", "helm", "valuesObject"))  # Flux, Argo CD
 _IMAGE_KEYS = {"repository", "tag", "digest"}

@@ -1,15 +1,4 @@
-"""The journal: a file with all accepted, unpublished demands, so that a crash loses none of them.
-
-The journal has one JSON line for each demand received, for each change of its proposal, and for
-each demand done. A demand is written and fsynced before it is evaluated. After a restart, demands
-that are not done are evaluated again. Their operation ids show which of them already have a
-published commit.
-
-The last key of a line is a digest of the line and of the previous line's digest. So a reader
-detects a changed, missing or moved line, but not that whole lines at the end are missing
-(docs/decisions/0020-journal.md). Journals of the first version have no digests, and can still be
-read.
-"""
+"""The journal, and the slot that keeps it for one process."""
 
 from __future__ import annotations
 
@@ -29,6 +18,19 @@ from demandops.base.errors import StateRepoError, Unsound
 from demandops.model.demand.claim import UNSTARTED
 from demandops.repo.git.objects import sync_folder
 from demandops.repo.git.repository import disk_error
+
+# ---- the journal: a file with all accepted, unpublished demands, so that a crash loses none ----
+#
+# The journal has one JSON line for each demand received, for each change of its proposal, and for
+# each demand done. A demand is written and fsynced before it is evaluated. After a restart, demands
+# that are not done are evaluated again. Their operation ids show which of them already have a
+# published commit.
+#
+# The last key of a line is a digest of the line and of the previous line's digest. So a reader
+# detects a changed, missing or moved line, but not that whole lines at the end are missing
+# (docs/decisions/0020-journal.md). Journals of the first version have no digests, and can still be
+# read.
+
 
 _MOST_BYTES = 1 << 20
 _SEALED = re.compile(rb'(\{.*), "digest": "([0-9a-f]{64})"\}')

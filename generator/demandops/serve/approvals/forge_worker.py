@@ -1,4 +1,4 @@
-"""When to check the proposals: soon after main has moved, and otherwise at an interval."""
+"""Keeps pull requests in step with proposals, in a thread of its own."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from demandops.base.runtime import Runtime, Thread
 from demandops.base.settings import MAIN_BRANCH
 from demandops.model.config.repo_settings import Proposals
 from demandops.repo.forge import Forge, ForgeError, PullRequest, forge_for
+
+# ---- when to check the proposals: soon after main has moved, and otherwise at an interval ----
+
 
 # The seconds between two checks of the branches, as only a check detects a deleted branch.
 CHECK_LOCAL_S = 1.0

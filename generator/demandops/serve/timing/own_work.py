@@ -1,8 +1,4 @@
-"""Moves placed applications and services off drained nodes.
-
-While any of them cannot move, another attempt is made each minute, and at each change of the
-configuration.
-"""
+"""The work that becomes due without a new demand: drains, ends of leases and overrides, waiting."""
 
 from __future__ import annotations
 
@@ -26,6 +22,12 @@ from demandops.model.ledger.records import Instance, in_turn
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.queue import Receipt, Ticket
 from demandops.serve.timing.timers import within
+
+# ---- moves placed applications and services off drained nodes ----
+#
+# While any of them cannot move, another attempt is made each minute, and at each change of the
+# configuration.
+
 
 log = logging.getLogger("demandops")
 

@@ -1,9 +1,4 @@
-"""The delay until the next attempt to publish, and how many demands to publish at once.
-
-There are two kinds of delays: after another writer published first, and while the remote cannot be
-reached. Both kinds are jittered and bounded, so no writer starves, and the writers do not flood a
-remote that comes back.
-"""
+"""When and how long: pauses, intervals, the sign of life, budgets and rates."""
 
 from __future__ import annotations
 
@@ -22,6 +17,13 @@ from demandops.model.config.base_model import seconds_of
 from demandops.model.config.config import Config
 from demandops.model.config.repo_settings import ROOT_FILE, Limits
 from demandops.model.demand.demand_request import DemandRequest
+
+# ---- the delay until the next attempt to publish, and how many demands to publish at once ----
+#
+# There are two kinds of delays: after another writer published first, and while the remote cannot
+# be reached. Both kinds are jittered and bounded, so no writer starves, and the writers do not
+# flood a remote that comes back.
+
 
 FIRST_PAUSE_S = 0.05
 # While the remote cannot be reached.
