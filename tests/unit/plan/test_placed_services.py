@@ -86,7 +86,7 @@ def assert_sound(repo: MemoryRepo, demands: Demands) -> None:
         for name, definition in repo.config.services[app["type"]].items():
             assert name in placed[app["id"]] or not definition.place
         for name, node in app.get("services", {}).items():
-            assert placed[app["id"]][name] == node
+            assert placed[app["id"]].get(name, app["node"]) == node
     running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
     wanted = {k for app in apps for k in instances(demands.graphs, app, placed[app["id"]])}
     assert running == wanted
@@ -254,3 +254,18 @@ def test_a_service_at_its_sources_has_no_node_that_a_demand_names() -> None:
     refused = repo.take(DEMAND | {"applications": [APP | {"services": named}]})
     assert isinstance(refused, Refused)
     assert "services.object-detection: object-detection runs at its sources" in str(refused)
+
+
+def test_another_demand_may_name_the_node_on_which_a_service_runs_with_its_application() -> None:
+    repo = MemoryRepo(state=state_of(load(configuration())))
+    repo.send(DEMAND)
+
+    def naming(node: str) -> dict[str, Any]:
+        app = APP | {"services": {"object-fusion": node}}
+        return DEMAND | {"demand": "e", "requesters": ["w"], "applications": [app]}
+
+    assert repo.send(naming(APP["node"])).outcome == "booked"
+    assert services(repo) == {"app": {}}, "all claims on the application say the same"
+    refused = repo.take(naming("cloud"))
+    assert isinstance(refused, Refused)
+    assert {fault.code for fault in refused.faults} == {"conflict"}
