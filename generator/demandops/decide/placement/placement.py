@@ -308,8 +308,8 @@ def _with_services(
                     f"'{node}'; name node '{node}', or use another application id"
                 )
                 faults.append(item.fault(f"services.{name}", message, code="conflict"))
-        # A service that the claim does not place runs with its application. To name that node changes
-        # nothing, and is not recorded, because all claims on an application say the same.
+        # A service that the claim does not place runs with its application. To name that node
+        # changes nothing, and is not recorded, because all claims on an application say the same.
         named = tuple(name for name in app.named if name in first.services)
         item = replace(item, held=replace(app, services=first.services, named=named))
         room.book([_claim(request, item)])
