@@ -38,7 +38,8 @@ def mark() -> dict[str, str]:
 
 @cache  # by process: a fork is a process of its own, which may live longer
 def _mark(pid: int) -> dict[str, str]:
-    name, value = "_DEMANDOPS_PROCESS", REAL.fresh_id()
+    # with the number, because two forks of one process may make the same id
+    name, value = "_DEMANDOPS_PROCESS", f"{pid} {REAL.fresh_id()}"
     watch = subprocess.Popen(
         ["sh", "-c", _WATCH, "demandops-watch", f"{name}={value}"],
         stdin=subprocess.PIPE,
