@@ -146,26 +146,6 @@ def decide(
     """
     if isinstance(goal, DemandRequest):
         return _decided(state, goal, now, read, on_stage)
-    try:
-        return _decide_goal(state, goal, now, read, on_stage, throttle, checkpoint)
-    except OverBudget as spent:
-        raise Refused([_too_large(spent)]) from None
-
-
-def _too_large(spent: OverBudget) -> Fault:
-    return fault("", str(spent), code="too-large")
-
-
-def _decide_goal(
-    state: State,
-    goal: object,
-    now: datetime,
-    read: FileReader,
-    on_stage: Callable[[Stage], None],
-    throttle: Throttle,
-    checkpoint: Checkpoint,
-) -> Decision:
-    """Decide a goal; if it is refused on the nodes chosen first, look for others."""
     throttled, told = list[Fault](), set[Stage]()
 
     # who was throttled must not get another try on other nodes
@@ -181,6 +161,8 @@ def _decide_goal(
     try:
         request = admitted(state, goal, now, noted, checkpoint)
         return _decided(state, request, now, read, once, checkpoint)
+    except OverBudget as spent:
+        raise Refused([_too_large(spent)]) from None
     except Refused as refused:
         if throttled or any(each.code not in _BY_NODE for each in refused.faults):
             raise
@@ -198,6 +180,10 @@ def _decide_goal(
             # keep the faults of the first refusal: they tell the requester what to change
             raise Refused([_too_large(spent), *refused.faults]) from None
         raise
+
+
+def _too_large(spent: OverBudget) -> Fault:
+    return fault("", str(spent), code="too-large")
 
 
 # The codes of faults that might not occur if other nodes were chosen for the demand
@@ -370,15 +356,14 @@ def scale_down(
     return state.followed_by(after.ledger, change, usage), change
 
 
-# ---- notes that the requester gets about a decision, in addition to the outcome ----
+# ---- notes for the requester, in addition to the outcome ----
 
 
 def notes_on(
     request: DemandRequest, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
-    """Yield notes for the requester of a demand that is booked and rendered, or that waits."""
     yield from admitted_request.notes(request)
-    yield from _connection_warnings(request, after)
+    yield from _connection_notes(request, after)
     yield from warnings.notes(request, after)
     yield from rendered.blocked
     if changes.repeats is not None:
@@ -398,7 +383,7 @@ def notes_on(
             )
 
 
-def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
+def _connection_notes(request: DemandRequest, world: World) -> Iterator[str]:
     # a connection that an override denies carries nothing
     ledger = without_suspended(world).ledger
     for item in request.demanded if request.adds_claims else ():
@@ -422,7 +407,7 @@ def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
                 )
 
 
-# ---- claims that a person edits in the ledger: the effect of the edit, and the faults in it ----
+# ---- claims that a person edits in the ledger ----
 
 
 def changeset_of_edit(
@@ -441,8 +426,14 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
     """Yield the faults of claims that a person wrote, each located in the claim's file."""
     for change in changes:
         claim = change.after
+        if claim is None:
+            continue
         # an edit that only takes requesters away has the effect of a release, which is allowed
-        if claim is None or _only_reduces(change):
+        if (
+            (old := change.before)
+            and replace(claim, requesters=old.requesters, partial=old.partial) == old
+            and {*claim.requesters} <= {*old.requesters}
+        ):
             continue
         wanted, config = restoration.request_for(claim), after.config
         malformed = list(admission.faults(wanted, config))
@@ -463,11 +454,3 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
             faults += capacity.faults(usage, grown, config)
         for each in faults:
             yield each.within(claim_file.path_of(claim.key))
-
-
-def _only_reduces(change: ClaimChange) -> bool:
-    before, after = change.before, change.after
-    if before is None or after is None:
-        return False
-    as_before = replace(after, requesters=before.requesters, partial=before.partial)
-    return as_before == before and {*after.requesters} <= {*before.requesters}

@@ -13,7 +13,7 @@ from rpds import HashTrieMap, HashTrieSet
 from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
-from demandops.connections.connection import ClientKey, Connection
+from demandops.connections.connection import ClientKey
 from demandops.decide.planning.flows import flows, outputs, usual_topic
 from demandops.decide.planning.planner import service_name
 from demandops.decide.planning.release_keys import (
@@ -45,9 +45,8 @@ def topic_faults(
 ) -> Iterator[Fault]:
     """Yield a fault for each new service, route or delivery that clashes with another source.
 
-    It clashes if it would be a topic's second source on a node. Of a service's outputs, only the
-    first that clashes is reported. ``keys`` are the keys of the releases that the demand may
-    change.
+    Of a service's outputs, only the first that clashes is reported. ``keys`` are the keys of the
+    releases that the demand may change.
     """
     if not request.adds_claims:
         return
@@ -55,10 +54,26 @@ def topic_faults(
         if isinstance(key, ServiceKey) and not is_needed(before, key):
             yield from islice(_clashes_of_service(request, after, key), 1)
     for item in request.demanded:
-        if isinstance(item.held, Connection):
-            yield from _clashes_of_connection(item, item.held, before, after)
-        else:
+        if isinstance(item.held, Application):
             yield from _clashes_of_flows(item, item.held, after)
+            continue
+        connection = item.held
+        for index, route in enumerate(connection.topics):
+            _, node = route.sender_and_receiver(*connection.nodes)
+            topic = route.written_topic
+            if connection.id in before.ledger.connections_bringing(node, topic):
+                continue
+            # Only services that run before and after the demand count. If an application moves, a
+            # connection may bring the application's output back to the old node.
+            staying = (key for key in _publishers(before, node, topic) if is_needed(after, key))
+            for other in islice(staying, 1):
+                yield item.fault(
+                    f"topics[{index}].{'source' if route.reverse else 'target'}",
+                    f"connection '{connection.id}' brings {topic} to '{node}', where "
+                    f"{words(other)} already publishes this topic; use a connection that brings "
+                    "the topic under another name",
+                    code="conflict",
+                )
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
@@ -91,27 +106,6 @@ def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -
             yield fault(
                 _field(request, key, service),
                 f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}",
-                code="conflict",
-            )
-
-
-def _clashes_of_connection(
-    item: Demanded, connection: Connection, before: World, after: World
-) -> Iterator[Fault]:
-    for index, route in enumerate(connection.topics):
-        _, node = route.sender_and_receiver(*connection.nodes)
-        topic = route.written_topic
-        if connection.id in before.ledger.connections_bringing(node, topic):
-            continue
-        # Only services that run before and after the demand count. If an application moves, a
-        # connection may bring the application's output back to the old node.
-        staying = (key for key in _publishers(before, node, topic) if is_needed(after, key))
-        for other in islice(staying, 1):
-            yield item.fault(
-                f"topics[{index}].{'source' if route.reverse else 'target'}",
-                f"connection '{connection.id}' brings {topic} to '{node}', where "
-                f"{words(other)} already publishes this topic; use a connection that brings the "
-                "topic under another name",
                 code="conflict",
             )
 
@@ -172,12 +166,23 @@ def _publishers(
                 match = re.fullmatch(expression, topic)
                 if match is None:
                     continue
-                keys = (
-                    _keys_called(world, node, service, match[1], excluded)
-                    if others
-                    else _keys_on(world, node, service)
-                )
-                yield from (key for key in keys if key != excluded and is_needed(world, key))
+                keys: Iterable[ReleaseKey]
+                if others:
+                    keys = _keys_called(world, node, service, match[1], excluded)
+                elif service.scope == "cluster":
+                    keys = [ServiceKey(service.name, node, for_cluster=True)]
+                else:
+                    ids = world.ledger.applications_at(node)
+                    subjects = (Subject(SubjectKind.APPLICATION, id) for id in ids)
+                    keys = (key for subject in subjects for key in keys_of(world, subject))
+                for key in keys:
+                    if (
+                        isinstance(key, ServiceKey)
+                        and (key.node, key.service) == (node, service.name)
+                        and key != excluded
+                        and is_needed(world, key)
+                    ):
+                        yield key
 
 
 def _keys_called(
@@ -185,7 +190,7 @@ def _keys_called(
 ) -> Iterator[ServiceKey]:
     """Yield the keys of a service's instances on ``node`` that topic names show as ``instance``.
 
-    Some of the instances may not run. The instance ``excluded`` may be left out.
+    Some may not run.
     """
     ledger, config = world.ledger, world.config
     name, role = service.name, service.root
@@ -206,18 +211,6 @@ def _keys_called(
     for further, version in ledger.further_topics(role, instance):
         own = "" if service.shared else version
         yield ServiceKey(name, node, source=further.source, topic=further.topic, version=own)
-
-
-def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys of a service's instances on a node; some of them may not run."""
-    name = service.name
-    if service.scope == "cluster":
-        yield ServiceKey(name, node, for_cluster=True)
-        return
-    for id in world.ledger.applications_at(node):
-        for key in keys_of(world, Subject(SubjectKind.APPLICATION, id)):
-            if isinstance(key, ServiceKey) and (key.node, key.service) == (node, name):
-                yield key
 
 
 def words(key: ReleaseKey) -> str:
@@ -303,7 +296,6 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
 
 
 def all_names(world: World) -> Names:
-    """Return the names of all releases. This takes time for a large ledger."""
     keys = (key for claims in world.ledger.claims.values() for key in keys_of_claims(world, claims))
     return with_keys(NONE, world, dict.fromkeys(keys))
 

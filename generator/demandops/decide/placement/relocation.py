@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial, reduce
 from itertools import islice
@@ -50,10 +50,7 @@ from demandops.model.demand.demand_request import Demanded, Put
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
 
-# ---- moved connections: when an application moves, the connections of its demands follow ----
-#
-# The connections then carry the same topics to or from the new node, with the same type and
-# options.
+# ---- when an application moves, the connections of its demands follow, with type and options ----
 
 
 # Returns the given application on its new nodes.
@@ -67,16 +64,16 @@ def with_moved(
 
     The connections of the demands that hold these claims follow the applications.
     """
-    ledger, keys, claims = world.ledger, list[ClaimKey](), tuple(claims)
+    ledger, claims = world.ledger, tuple(claims)
+    keys = [claim.key for claim in claims]
     for claim in claims:
         ledger = ledger.replace(claim.key, replace(claim, held=move(claim.application)))
-        keys.append(claim.key)
     for claim in claims:
         # A goal of the reference's action lists its connections itself, and its clients shut down
         # what they listed. So a move does not change these connections.
         if not claim.joined:
-            ledger, touched = _followed(replace(world, ledger=ledger), claim, move)
-            keys += touched
+            ledger, changed = _followed(replace(world, ledger=ledger), claim, move)
+            keys += changed
     return replace(world, ledger=ledger), claim_changes(world.ledger, ledger, keys)
 
 
@@ -87,8 +84,8 @@ def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[Clai
     """
     config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
     app = claim.application
-    old, new = (flows(config, each) for each in (app, move(app)))
-    before, after = ({_path(flow) for flow in each} for each in (old, new))
+    old, new = flows(config, app), flows(config, move(app))
+    before, after = {_path(flow) for flow in old}, {_path(flow) for flow in new}
     needed = list(new)
     for other in ledger.claims_of_demand(claim.demand):
         if other.is_on_application and other.subject != claim.subject:
@@ -122,10 +119,7 @@ def _path(flow: Flow) -> tuple[str, str, str, str]:
 
 
 def renaming(world: World, claim: Claim) -> Iterator[tuple[Flow, Route]]:
-    """Yield (flow, route) for each input whose topic is renamed by a connection of the demand.
-
-    The flow brings the input to the application, and the route renames the topic on the way.
-    """
+    """Yield (flow, route) for each input whose topic a connection of the demand renames."""
     for flow in flows(world.config, claim.application):
         for _, route in _carrying(world.ledger, claim.demand, flow):
             if flow.delivery is None and route.read_topic != route.written_topic:
@@ -167,7 +161,6 @@ def _carried_by(flow: Flow, carrier: Connection | None, claim: Claim, world: Wor
 # ---- relocation: applications and services leave a drained node, and overrides move services ----
 #
 # Claims and definitions contain what is required of a node, so the original demands are not needed.
-# The connections of a moved application follow (:mod:`.relocation`).
 
 
 def with_moves(
@@ -179,18 +172,29 @@ def with_moves(
     """
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
     room, tried, last = Room(world, usage), 0, request.after
-    for id in applications_of(world.ledger, request.id):
+    node = request.id
+    for id in applications_of(world.ledger, node):
         if id <= request.after:
             continue
         if tried >= most:
             break
         last = id
-        for service in _placed_at(request.id, id, world):
-            ids = _moving_with(id, service, request.id, world)
-            claims = tuple(claim for each in ids for claim in world.ledger.application_claims(each))
-            what = [f"application '{each}'" for each in ids]
-            what = [f"service '{service.name}' of {each}" for each in what] if service else what
-            fixed = (_why_fixed(claim, request.id, service) for claim in claims)
+        app = world.ledger.application(id)
+        assert app is not None  # noqa: S101 - applications_of lists only claimed ones
+        definitions = world.config.services.get(app.appdef, {})
+        # The application itself is first, as ``None``.
+        leaving: list[Service | None] = [None] if app.node == node else []
+        leaving += [
+            definitions[name]
+            for name, at in sorted(app.services.items())
+            if at == node and name in definitions
+        ]
+        for service in leaving:
+            ids = _moving_with(id, service, node, world)
+            claims = tuple(claim for id in ids for claim in world.ledger.application_claims(id))
+            what = [f"application '{id}'" for id in ids]
+            what = [f"service '{service.name}' of {text}" for text in what] if service else what
+            fixed = (_why_fixed(claim, node, service) for claim in claims)
             outcome: _Moved | str = next(filter(None, fixed), "")
             tried += 1
             if not outcome:
@@ -200,12 +204,12 @@ def with_moves(
             if isinstance(outcome, str):
                 stays.append(f"{what[0]} stays, because {outcome}")
                 continue
-            world, chosen, touched, names = outcome
+            world, chosen, changed, names = outcome
             # ``world`` has the application on its new node, so ``room`` must count it on this node
-            for each in ids:
-                room.book(world.ledger.application_claims(each))
-            keys += touched
-            moved += [f"{each} is placed on {quoted(chosen.node)}, {chosen.why}" for each in what]
+            for moved_id in ids:
+                room.book(world.ledger.application_claims(moved_id))
+            keys += changed
+            moved += [f"{text} is placed on {quoted(chosen.node)}, {chosen.why}" for text in what]
     else:
         last = ""
     moves = claim_changes(start.ledger, world.ledger, keys)
@@ -214,16 +218,6 @@ def with_moves(
 
 # The world after a move, the chosen node, the keys of the changed claims, and the names after it.
 _Moved = tuple[World, Chosen, list[ClaimKey], Names]
-
-
-def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return the services of an application on ``node``, and ``None`` first for itself."""
-    app = world.ledger.application(id)
-    if app is None:
-        return []
-    definitions = world.config.services.get(app.appdef, {})
-    names = sorted(name for name, at in app.services.items() if at == node and name in definitions)
-    return [*([None] if app.node == node else []), *(definitions[name] for name in names)]
 
 
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
@@ -300,18 +294,21 @@ def _moved(
 
 
 @dataclass(frozen=True, slots=True)
-class LedgerAfterMoves:
+class LedgerUpdate:
+    """The ledger after a change of overrides or claims, and the ledger files to write.
+
+    ``keys`` are the keys of the claims that may have changed. A file with ``None`` is removed.
+    """
+
     ledger: Ledger
-    # those of the claims that may have changed
     keys: tuple[ClaimKey, ...]
-    # (file, message) for each override that cannot move a service of an application
+    # (file, reason) for each override and each application whose service it cannot move
     stays: tuple[tuple[str, str], ...]
+    files: Mapping[str, str | None] = field(default_factory=dict)
 
 
-def following_overrides(
-    world: World, subjects: Iterable[Subject] | None = None
-) -> LedgerAfterMoves:
-    """Return the ledger after services have moved to the nodes that overrides name.
+def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> LedgerUpdate:
+    """Return the ledger after services have moved to the nodes that overrides name; no files.
 
     The connections follow the services. A service also moves back when no override moves it any
     longer. A service stays if the move would cause a fault. ``subjects`` are the subjects whose
@@ -353,7 +350,7 @@ def following_overrides(
             keys += [each.key for own in changes.values() for each in own]
         else:
             stays += _unmoved(ids[0], world, fault)
-    return LedgerAfterMoves(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
+    return LedgerUpdate(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
@@ -462,20 +459,6 @@ def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
 # stays in effect, so what runs depends on files alone and not on a clock.
 
 
-@dataclass(frozen=True, slots=True)
-class LedgerUpdate:
-    """The ledger after a change of overrides or claims, and the ledger files to write.
-
-    ``keys`` are the keys of the claims that may have changed. A file with ``None`` is removed.
-    """
-
-    ledger: Ledger
-    keys: tuple[ClaimKey, ...]
-    files: Mapping[str, str | None]
-    # (file, reason) for each override and each application whose service it cannot move
-    stays: tuple[tuple[str, str], ...] = ()
-
-
 def update_ledger(
     before: World,
     after: World,
@@ -486,7 +469,7 @@ def update_ledger(
     """Return the ledger that a change of the configuration requires, and the files to write.
 
     ``subjects`` are those whose claims a person changed. ``markers`` are the ledger's markers of
-    ended overrides, by path. ``now`` is also the booking time of claims that an override books.
+    ended overrides, by path.
     """
     # An override that is merged after its end never applies. One that was in effect before stays
     # in effect until the generator's own commit ends it.
@@ -512,23 +495,19 @@ def update_ledger(
     moved = following_overrides(replace(after, ledger=update.ledger))
     keys = (*update.keys, *moved.keys)
     files |= changed_claim_files(after.ledger, moved.ledger, keys)
-    return LedgerUpdate(moved.ledger, keys, files, moved.stays)
+    return replace(moved, keys=keys, files=files)
 
 
 def update_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> LedgerUpdate:
-    """After claims changed, update the kept claims and the moved services on these subjects.
-
-    ``before`` is the ledger before the change, ``after`` the world after it. ``now`` is the booking
-    time of each claim that an override books.
-    """
+    """Update the kept claims and the moved services on subjects whose claims changed."""
     subjects = tuple(subjects)
     ledger, kept = update_kept_claims(before, after, subjects, now)
     moved = following_overrides(replace(after, ledger=ledger), subjects)
     keys = (*kept, *moved.keys)
     files = changed_claim_files(after.ledger, moved.ledger, keys)
-    return LedgerUpdate(moved.ledger, keys, files, moved.stays)
+    return replace(moved, keys=keys, files=files)
 
 
 def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
@@ -559,12 +538,9 @@ def changed_claim_files(
 
 def expired_overrides(world: World, now: datetime) -> list[Override]:
     """Return the overrides in effect although their end has passed, sorted by end."""
-    expired = [
-        (override.end, override.name, override)
-        for override in world.overrides
-        if override.end and override.end <= now
-    ]
-    return [override for _, _, override in sorted(expired, key=lambda item: item[:2])]
+    ends = [(each.end, each.name, each) for each in world.overrides if each.end]
+    expired = [each for each in ends if each[0] <= now]
+    return [override for _, _, override in sorted(expired, key=lambda each: each[:2])]
 
 
 def changed_override_files(before: World, after: World) -> list[str]:

@@ -39,9 +39,7 @@ from demandops.model.release import Release, ServiceKey, ServiceRelease, replica
 
 
 def plan(world: World, key: ReleaseKey) -> Release | None:
-    """Return the release at ``key`` with the effects of overrides.
-
-    Return ``None`` if no claim needs the release, or if an override denies it.
+    """Return the release at ``key``, or ``None`` if no claim needs it or an override denies it.
 
     Raises:
         Refused: if claims contradict each other in a parameter; if the value of a parameter cannot
@@ -61,7 +59,6 @@ def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
-    """Return the release at ``key`` and the override that denies it, or ``None``."""
     world = without_suspended(world)
     release = _unshaped(world, key)
     override = overrides.service_denied_by(release, world) if release else None
@@ -202,15 +199,11 @@ def demanded_inputs(
 
 
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
-    """Return the release name of a service instance, such as ``od-edge-vehicle00``.
-
-    If the instance runs for a topic, the name contains the node and the topic's source. The name
-    also contains a slug of the topic, unless ``topics`` in the source's inventory entry lists the
-    topic as the usual one. For a separate instance, the name also contains the version.
-    """
+    """Return the release name of a service instance, such as ``od-edge-vehicle00``."""
     if service.root is None:
         return naming.object_name(service.prefix, key.application or key.node)
     source, topic = str(key.source), str(key.topic)
+    # Only the inventory makes a topic the usual one here, so a name never depends on other demands.
     further = [] if topic == usual_topic(config, source, service.root) else [topic]
     version = [key.version] if key.version else []
     return naming.object_name(service.prefix, key.node, source, *further, *version)
@@ -298,7 +291,6 @@ class _ClaimedConnections:
 
 
 def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
-    """Return one route for each source topic that the claims list, sorted by topic."""
     return routes.merged_routes(route for claim in claims for route in claim.connection.topics)
 
 
@@ -312,9 +304,7 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
     return route.read_topic in node.bridged.get(receiver, ())
 
 
-# ---- scale down ----
-#
-# When a service gets fewer replicas: at once, or after the time in the service's definition.
+# ---- scale down: a service gets fewer replicas at once, or after the time in its definition ----
 #
 # If the definition has such a time and demands need fewer replicas than before, the decision
 # records how many replicas the service keeps, and until when (:mod:`.records`). When that time is
@@ -366,9 +356,8 @@ def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
 
 # ---- a plan that follows a sequence of ledgers, to verify commits ----
 #
-# Planning is a function of ledger and configuration. The plan records which parts of the ledger
-# were read for each release. As long as none of these parts changes, the release stays the same, so
-# only the other releases are planned again. The generator instead predicts which releases a claim
+# The plan records which parts of the ledger were read for each release. Only if one of these parts
+# changes is the release planned again. The generator instead predicts which releases a claim
 # affects (:func:`.release_keys.affected_keys`), but a proof must not rely on that prediction.
 
 T = TypeVar("T")
@@ -412,7 +401,7 @@ class TracedPlan:
         for subject in ledger.claims:
             if subject in stale or subject not in self._keys:
                 self._keys[subject] = self._traced(ledger, subject, keys_needed)
-        for subject in [unit for unit in stale if unit in self._keys]:
+        for subject in self._keys.keys() & stale:
             if subject not in ledger.claims:
                 del self._keys[subject]
         needed = {key for keys in self._keys.values() for key in keys}
