@@ -34,7 +34,6 @@ from demandops.templating.values import Evaluate
 #
 # A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
 
-
 Change = Literal["start", "change", "stop"]
 
 # the order in which lists of changes show them
@@ -89,16 +88,10 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
 ) -> Changeset:
     """Return the changes in the state repo that follow from a change of the ledger.
 
-    Args:
-        before, after: the world before and after the change, with the same configuration.
-        changes: the differences between both ledgers.
-        keys: the keys of the releases that may differ.
-        evaluate: computes the values of services.
-        read: returns the text of a file of the state repo before the change.
-        plans: releases of ``before`` that the caller has planned already.
-        keeps_late: whether a release whose values take too long to compute keeps its file, instead
-            of OverLimit.
-        checkpoint: called for each file and release; it may raise an exception to end the work.
+    ``keys`` are those of the releases that may differ, and ``plans`` are releases of ``before``
+    that the caller has planned already. With ``keeps_late``, a release whose values take too long
+    to compute keeps its file, instead of OverLimit. ``checkpoint`` is called for each file and
+    release; it may raise an exception to end the work.
 
     Raises:
         Refused, InvalidInput: if a release cannot be planned or rendered, or if a file would not be
@@ -268,16 +261,13 @@ def _overrides(release: Release | None) -> list[str]:
     return [f"{override.path}: {', '.join(effects)}" for override, effects in by]
 
 
-# ---- checks a new configuration by rendering invented demands, before real demands arrive ----
+# ---- trial demands: a new configuration must render before real demands arrive ----
 
 _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return the services' releases that a trial demand gives, for each appdef.
-
-    Overrides do not apply. If no node is in an access domain, the map is empty.
-    """
+    """Return the services that a trial demand gives, for each appdef, without overrides."""
     if not config.domain_of:
         return {}
     plain = replace(config, overrides={})
@@ -331,8 +321,8 @@ def overridden_releases(
 def render_trial_demands(world: World, evaluate: Evaluate) -> None:
     """Render every service of every appdef, with invented claims on a real node.
 
-    A service is rendered for each version that ``registry/versions.yaml`` lists, and with each
-    override that is in effect. If no node is in an access domain, nothing is checked.
+    This renders each version that ``registry/versions.yaml`` lists, and each override in effect. If
+    no node is in an access domain, nothing is checked.
 
     Raises:
         Refused, InvalidInput: if a service cannot be planned or rendered. The error names the

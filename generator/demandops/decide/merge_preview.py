@@ -64,7 +64,6 @@ class MergePreview:
 
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
-    """Return all releases that can be planned, by key."""
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
         try:
@@ -104,8 +103,8 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
     for key, failure in errors:
         claims = files.get(key, [])
         edited_claim = next((path for path in claims if path in edited), "")
-        for fault in failure.faults:
-            faults.append(fault.within(edited_claim or fault.file or (claims or [""])[0]))
+        first = next(iter(claims), "")
+        faults += [fault.within(edited_claim or fault.file or first) for fault in failure.faults]
     return list(dict.fromkeys(faults))
 
 
@@ -115,11 +114,9 @@ def preview(
     current: Mapping[str, str],
     files: Mapping[str, str],
 ) -> MergePreview:
-    """Return the releases and the files that a merge changes.
+    """Return what a merge changes: from ``old`` and ``current`` to ``new`` and ``files``.
 
-    Args:
-        old, new: the releases before and after the merge.
-        current, files: path → text of the generated files before and after the merge.
+    ``current`` and ``files`` have the texts of the generated files, by path.
     """
     file_changes = tuple(
         FileChange(path, current.get(path), files.get(path))

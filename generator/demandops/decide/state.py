@@ -84,11 +84,7 @@ def rendered_files(
     *,
     keeps_late: bool = False,
 ) -> dict[str, str]:
-    """Return every generated file that the state requires, as a map from path to text.
-
-    ``current`` are the current generated files, which ``hold`` overrides and ``keeps_late`` may
-    preserve (:func:`.changeset.render_all`).
-    """
+    # ``hold`` overrides and ``keeps_late`` may keep files of ``current``.
     return changeset.render_all(state, state.evaluate, current, keeps_late=keeps_late)
 
 

@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from demandops.base.errors import Fault, Refused
-from demandops.base.naming import Subject
 from demandops.connections.connection import Connection
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
@@ -29,6 +28,7 @@ from demandops.model.demand.demand_request import (
     DemandRequest,
     Put,
 )
+from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import Wait, WaitingDemand
 
 # ---- the choice of an access domain if a demand names a node that is in several domains ----
@@ -44,17 +44,15 @@ from demandops.model.ledger.records import Wait, WaitingDemand
 
 
 Held = Application | Connection
-# returns the application or connection that a subject's first claim holds
-Booked = Callable[[Subject], "Held | None"]
 
 
 def with_chosen_domains(
-    request: AnyRequest, config: Config, booked: Booked
+    request: AnyRequest, config: Config, ledger: Ledger
 ) -> tuple[AnyRequest, list[Fault]]:
     """Return the request with a chosen access domain for each node.
 
-    There is a fault for each node for which several access domains are possible. In a request that
-    adds no claims, such a node stays as it is named.
+    There is a fault for each node for which several are possible. In a request that adds no claims,
+    such a node stays as it is named.
     """
     if not config.hosts:
         return request, []
@@ -62,7 +60,8 @@ def with_chosen_domains(
     demanded = []
     for item in request.demanded:
         held = _with_short_names(item.held, config)
-        booked_nodes = dict(_named(at)) if (at := booked(held.subject)) else {}
+        first = ledger.held(held.subject)
+        booked_nodes = dict(_named(first)) if first else {}
         chosen = dict(_chosen(item, booked_nodes, config, request.adds_claims, faults))
         if isinstance(held, Application):
             services = {name: chosen.get(_field(name), n) for name, n in held.services.items()}
@@ -152,7 +151,6 @@ def _chosen(
 
 
 def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with separate instances for versions other than the default."""
     demanded = (
         replace(item, held=_separated(item.held, config))
         if isinstance(item.held, Application) and item.held.version
@@ -184,9 +182,7 @@ def notes(request: DemandRequest) -> Iterator[str]:
             yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"
 
 
-# ---- admitted request ----
-#
-# The request that a goal becomes: parsed, completed, and checked against the configuration.
+# ---- the request that a goal becomes: parsed, completed, checked against the configuration ----
 
 _ITEM = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
@@ -266,14 +262,14 @@ def admit(
             checkpoint()
         # the id of a separate instance comes first, because the placement looks for claims on it
         parsed = with_separate_instances(parsed, config)
-        parsed, unclear = with_chosen_domains(parsed, config, ledger.held)
+        parsed, unclear = with_chosen_domains(parsed, config, ledger)
         request = flows.with_further_topics(parsed, ledger, config)
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
         _refuse(admission.size_faults(wired, limits))
-        request, unclear = with_chosen_domains(wired, config, ledger.held)
+        request, unclear = with_chosen_domains(wired, config, ledger)
     request, not_placed = placement.with_chosen_nodes(
         request, state, state.usage(), trial, checkpoint
     )
@@ -305,8 +301,13 @@ def admit(
     # last, because a goal with faults does not count against the limits of its requesters
     faults = faults or list(throttle(request, config))
     if faults:
+
+        def item_of(each: Fault) -> tuple[str, int]:
+            match = _ITEM.match(each.field)
+            return (match[1], int(match[2])) if match else ("", 0)
+
         # the faults of one application or connection are reported together
-        raise Refused(sorted(dict.fromkeys(faults), key=lambda each: _item_of(each.field)))
+        raise Refused(sorted(dict.fromkeys(faults), key=item_of))
     return request
 
 
@@ -362,8 +363,3 @@ def _with_parents(field: str) -> Iterator[str]:
     yield field
     for match in re.finditer(r"[.\[]", field):
         yield field[: match.start()]
-
-
-def _item_of(field: str) -> tuple[str, int]:
-    match = _ITEM.match(field)
-    return (match[1], int(match[2])) if match else ("", 0)

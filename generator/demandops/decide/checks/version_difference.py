@@ -54,10 +54,7 @@ class Difference:
     fault: Fault
 
     def matters_to(self, asked: str) -> bool:
-        """Return whether the difference concerns a demand that names the version ``asked``.
-
-        ``asked`` is empty if the demand names no version.
-        """
+        # A demand that names no version has an empty text for ``asked``.
         return bool(asked) or self.newer or self.is_refused
 
     @property
@@ -65,10 +62,7 @@ class Difference:
         return self.policy in _REFUSING
 
     def approval_reason(self) -> str:
-        """Return why a person must approve the difference; empty if no approval is needed.
-
-        The result has no meaning if :attr:`is_refused`.
-        """
+        """Return why a person must approve the difference, or ``""``; of no use if refused."""
         # Another major version breaks what others get, in both directions. In 0.x, too, only the
         # first number counts.
         same_major = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
@@ -96,9 +90,8 @@ def differences(
 ) -> Iterator[Difference]:
     """Yield the differences between the versions that a demand and other demands ask for.
 
-    A difference that existed before the demand is left out, and so is one that does not concern the
-    demand (:meth:`Difference.matters_to`). ``plans`` are the releases that the demand may change,
-    as they are after it.
+    A difference that existed before the demand is left out, and so is one that does not matter to
+    it. ``plans`` are the releases that the demand may change, as they are after it.
     """
     if not request.adds_claims:
         return

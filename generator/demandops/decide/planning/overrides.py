@@ -157,7 +157,6 @@ def without_suspended(world: World) -> World:
 
 
 def suspended_by(claim: Claim, world: World) -> Override | None:
-    """Return the override of the highest rank that suspends a claim, or ``None``."""
     return denied_by(traits_of(claim), world) if world.overrides else None
 
 
@@ -195,10 +194,7 @@ def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
 def with_kept_claims(
     before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, Changes]:
-    """Update the kept claims after a booking; return the ledger and all changes.
-
-    ``subjects`` are updated as well, although the booking may not have changed them.
-    """
+    # ``subjects`` are updated even if the booking did not change them.
     keys = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
     ledger, kept = update_kept_claims(before, after, touched, now)
@@ -211,7 +207,6 @@ def update_kept_claims(
     """Return the ledger in which ``subjects`` have exactly the kept claims that overrides want.
 
     The second value has the keys of all kept claims on ``subjects``, before and after the update.
-    ``now`` is the booking time of each claim that an override books.
     """
     keys, ledger = list[ClaimKey](), after.ledger
     for subject in subjects:
@@ -274,7 +269,7 @@ def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     return [override for override in keeping if selects(override, traits, world.config)]
 
 
-# ---- the effects of overrides on a planned release: version, node, replicas, or denial ----
+# ---- effects on a planned release: version, node, replicas, or denial ----
 #
 # Pins of images and patches of Helm values are applied later, when the release is rendered.
 
@@ -312,10 +307,9 @@ def service_denied_by(release: Release, world: World) -> Override | None:
 def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release with the effects of overrides; the last override wins.
+    """Return a release with the effects of overrides, of which the last one wins.
 
-    ``by`` has pairs of an override and the names of its effects on the release. The effects on
-    images and Helm values are only recorded, in :attr:`ServiceRelease.shaping`.
+    Effects on images and Helm values are only recorded, in :attr:`ServiceRelease.shaping`.
     """
     by = tuple(by)
     if not by:
@@ -337,7 +331,7 @@ def apply_effects(
 
 
 def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
-    """Return the names of the effects that an override has on a release that it selects.
+    """Return the names of an override's effects on a release that it selects.
 
     ``deny`` and ``keep`` are never among them, because they are not effects on a release.
     """

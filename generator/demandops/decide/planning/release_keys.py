@@ -27,10 +27,7 @@ from demandops.model.release import ServiceKey
 
 
 def running_version(world: World, application: str) -> ApplicationVersion | None:
-    """Return the deployed version of an application.
-
-    Return ``None`` if no claim holds the application, or if its appdef is missing.
-    """
+    """Return the deployed version; ``None`` if nobody holds it or its appdef is missing."""
     app = world.ledger.application(application)
     versions = world.config.application_versions.get(app.appdef) if app else None
     return newest_asked(world.ledger, application, versions) if versions else None
@@ -45,7 +42,6 @@ def newest_asked(
 
 
 def same_version(one: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
-    """Return whether two versions of one appdef have the same rank, or both are ``None``."""
     return (one and one.rank) == (other and other.rank)
 
 
@@ -89,8 +85,7 @@ def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...
 # ---- the keys of the releases that claims need, and of those that a change of claims affects ----
 #
 # Only the releases that :func:`affected_keys` returns are planned again for a demand, so the cost
-# of a demand does not grow with the number of other demands. :mod:`.planner` plans the release at
-# each key.
+# of a demand does not grow with the number of other demands.
 
 ReleaseKey = ServiceKey | ClientKey
 
@@ -108,10 +103,7 @@ def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator
 def keys_of_claims(
     world: World, claims: Iterable[Claim], *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that ``claims`` need in ``world``, each once.
-
-    ``strict`` means the same as for :func:`keys_of`.
-    """
+    """Yield the keys of the releases that ``claims`` need in ``world``, each once."""
     keys: dict[ReleaseKey, None] = {}
     for claim in claims:
         if not claim.is_on_application:
@@ -225,11 +217,7 @@ def affected_keys(
 
 
 def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim | None]:
-    """Return the claim before and the claim after a change, reduced to what differs.
-
-    If the claims differ only in inputs, the inputs that are in both claims are left out of both.
-    Otherwise both claims are returned whole.
-    """
+    """Return the claims before and after a change, reduced to the inputs that differ if no more."""
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
         return before, after
