@@ -35,7 +35,6 @@ class CompiledRule:
         return self._names is None or self._names.match(entity) is not None
 
     def takes(self, who: Who) -> bool:
-        """Return whether the rule is for ``who``, an entity of one of the rule's sources."""
         return self.is_for(who[1])
 
     def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
@@ -43,11 +42,6 @@ class CompiledRule:
         return tuple(zip((*self.sources, *self.sources), subjects, strict=False))
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the current facts of an event.
-
-        ``seen`` has the last observation of each of the event's entities. ``count`` is how many
-        entities the rule counts.
-        """
         raise NotImplementedError
 
     def _named(self, subjects: tuple[str, ...]) -> dict[str, str | float]:
@@ -141,10 +135,7 @@ class PairRule(CompiledRule):
         before: Observation | None,
         after: Observation | None,
     ) -> None:
-        """Move an entity in ``cells`` from the square where it was to the square where it is now.
-
-        An entity without an observation or without a position is in no square.
-        """
+        # An entity without an observation or without a position is in no square.
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
             return

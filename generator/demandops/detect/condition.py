@@ -43,19 +43,16 @@ class Area:
         edges = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)
         nearest, inside = math.inf, False
         for (x1, y1), (x2, y2) in edges:
-            nearest = min(nearest, _to_edge(x, y, x1, y1, x2, y2))
+            along_x, along_y = x2 - x1, y2 - y1
+            length = along_x * along_x + along_y * along_y
+            share = ((x - x1) * along_x + (y - y1) * along_y) / length if length else 0.0
+            share = min(1.0, max(0.0, share))
+            to_edge = math.hypot(x - x1 - share * along_x, y - y1 - share * along_y)
+            nearest = min(nearest, to_edge)
             # each edge that a ray to the right crosses swaps inside and outside
             if (y1 > y) != (y2 > y) and x < x1 + (y - y1) / (y2 - y1) * (x2 - x1):
                 inside = not inside
         return 0.0 if inside else nearest
-
-
-def _to_edge(x: float, y: float, x1: float, y1: float, x2: float, y2: float) -> float:
-    along_x, along_y = x2 - x1, y2 - y1
-    length = along_x * along_x + along_y * along_y
-    share = ((x - x1) * along_x + (y - y1) * along_y) / length if length else 0.0
-    share = min(1.0, max(0.0, share))
-    return math.hypot(x - x1 - share * along_x, y - y1 - share * along_y)
 
 
 # ---- schedules: the days and hours at which a rule's demand is wanted ----
@@ -100,9 +97,7 @@ class Schedule:
         return min(moment for moment in ahead if moment > now)
 
 
-# ---- topic pattern ----
-#
-# Patterns of topics, such as ``/vehicles/{entity}/pose``: ``{entity}`` stands for any entity.
+# ---- patterns of topics, such as ``/vehicles/{entity}/pose`` ----
 
 ENTITY = "{entity}"
 _PART = r"(?P<entity>[A-Za-z0-9_]+)"

@@ -40,10 +40,9 @@ def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, G
     return goals
 
 
-# ---- the detector without ROS: it turns observations into the goals that its rules want ----
+# ---- the detector holds the rules in effect and the engine's state ----
 #
-# The detector holds the rules in effect and the engine's state. The caller reads files and clocks,
-# and sends the goals.
+# The caller reads files and clocks, and sends the goals.
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,19 +73,14 @@ class Detector:
 
     @property
     def entities(self) -> int:
-        """How many entities have been seen and do not count as gone."""
         return len(self._state.seen)
 
     def resume(self, booked: Mapping[Key, Goal], now: float, settle_s: float) -> list[Want]:
         """Continue the events whose demands were booked before the detector started.
 
         Call this before the first step, because it forgets what steps have found. ``booked`` has a
-        goal for each event, which may lack everything except the demand's id and requesters. The
-        events' entities count as gone if they stay unseen for ``settle_s`` seconds, or for the
-        timeout of their source if that is longer.
-
-        Return what each event wants: its demand or, if no rule is for the event any longer, the end
-        of its demand.
+        goal for each event, which may lack everything except the demand's id and requesters. An
+        event that no rule is for any longer wants the end of its demand.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting
@@ -107,7 +101,7 @@ class Detector:
         return wants
 
     def set_clock(self, seconds: float) -> None:
-        """Shift all recorded times, because the clock was set forward by ``seconds``, or back."""
+        # The clock was set forward by ``seconds``, or back, so all recorded times move with it.
         self._state = self._state.shifted(seconds)
 
     def replace_rules(self, file: RuleFile, now: float, settle_s: float) -> list[Want]:
@@ -147,9 +141,8 @@ class Detector:
 
 # ---- which demands are wanted, which are held, and which goal to send next ----
 #
-# This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports
-# the outcome. Each event has at most one goal under way. If an event ends before its demand was
-# sent, nothing is sent for it.
+# The caller sends what :meth:`WantedDemands.next` returns and reports the outcome. Each event has
+# at most one goal under way. If an event ends before its demand was sent, nothing is sent for it.
 
 Purpose = Literal["start", "renew", "end"]
 

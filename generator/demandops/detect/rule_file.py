@@ -130,12 +130,14 @@ def candidates(template: str, text: str) -> Mapping[str, str]:
     return matched.groupdict() if matched else {}
 
 
-# ---- what a rule demands: a template for goals of one of the two actions ----
+# ---- what a rule demands: a template for goals that start, renew and end a demand ----
 #
-# The template makes the goals that start, renew and end a demand. It also recognizes which demands
-# in the bookkeeping the rule has made, so that a restart of the detector changes nothing.
+# The template also recognizes which demands in the bookkeeping the rule has made, so that a restart
+# of the detector changes nothing.
 
 Action = Literal["demand", "deployment_request"]
+# What a goal of ``Demand`` also has in a file.
+_HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +147,6 @@ class Goal:
 
     @property
     def id(self) -> str:
-        """The id by which people know the goal: the demand's, or the request's."""
         return str(self.data["demand" if self.action == "demand" else "id"])
 
     @property
@@ -154,26 +155,26 @@ class Goal:
 
     @property
     def action_name(self) -> str:
-        """The action's type in ROS: ``Demand`` or ``DeploymentRequest``."""
         return "Demand" if self.action == "demand" else "DeploymentRequest"
 
     @property
     def document(self) -> Mapping[str, Any]:
         """The goal in the form that a file for ``demandops request`` has."""
-        head = {"apiVersion": API_VERSION, "kind": "Demand"} if self.action == "demand" else {}
-        return {**head, **self.data}
+        return {**_HEAD, **self.data} if self.action == "demand" else self.data
 
     def ended(self) -> Goal:
         if self.action == "deployment_request":
             return Goal(self.action, {**self.data, "shutdown": True})
-        kept = {name: self.data[name] for name in ("demand", "requesters")}
-        return Goal(self.action, {**kept, "operation": "release"})
+        return Goal(self.action, {**_identity(self.data), "operation": "release"})
 
     def renewed(self) -> Goal:
         if self.action == "deployment_request":
             return self  # the same request again renews the leases of its claims
-        kept = {name: self.data[name] for name in ("demand", "requesters")}
-        return Goal(self.action, {**kept, "operation": "renew"})
+        return Goal(self.action, {**_identity(self.data), "operation": "renew"})
+
+
+def _identity(data: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: data[name] for name in ("demand", "requesters")}
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,24 +202,18 @@ class RuleDemand:
         return {name for _, text in texts(self.data, "") for name in names(text)}
 
     def outline(self, values: Values) -> Goal:
-        """Return the goal that starts the demand, if ``values`` has all names of the template.
-
-        If ``values`` lacks a name, the template must be that of a ``Demand``. The goal then has
-        only the demand's id and its requesters, which suffice to end the demand.
-        """
+        """Return a goal that suffices to end the demand, and starts it if no value is missing."""
         if self.names() <= set(values):
             return self.goal(values)
-        kept = {name: self.data[name] for name in ("demand", "requesters")}
-        return Goal(self.action, filled(kept, values))
+        # Only the template of a ``Demand`` may have names whose values become unknown.
+        return Goal(self.action, filled(_identity(self.data), values))
 
     def subjects_of(
         self, held: BookedDemand, subjects: tuple[str, ...], rule: str
     ) -> Values | None:
-        """Return the entities of the event for which the rule made a booked demand.
+        """Return the entities of the event for which the rule made a booked demand, or ``None``.
 
-        ``subjects`` are the names by which the template refers to the event's entities. ``rule`` is
-        the name of the rule. Return ``None`` if the rule makes no demand with this id and these
-        requesters.
+        ``subjects`` are the names by which the template refers to the event's entities.
         """
         named = {*requesters_in(self.action, self.data)}
         is_own, held_id = self.action == "demand", held.demand or held.request
@@ -250,9 +245,8 @@ def requesters_in(action: Action, data: Mapping[str, Any]) -> Iterator[str]:
         yield from connection.get("requester_ids", ())
 
 
-# ---- checks what a rule demands: the names in the template, the demand's form and its ids ----
+# ---- the checks of what a rule demands: the template's names, the demand's form and ids ----
 
-_HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
 # Values of the right types, with which the form of a demand is checked before any event.
 _SAMPLE: Values = {
     "rule": "rule",
@@ -346,7 +340,7 @@ def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: A
             yield fault(f"{field}.{name}", "is missing; add it")
 
 
-# ---- the file of rules for the event detector, and the checks across its parts ----
+# ---- the file of rules, and the checks across its parts ----
 #
 # :func:`read` reports many faults of a file together, each with its line and field. But the parts
 # are compared only if the fields are valid, and a demand's form is checked only if its names are
@@ -484,12 +478,6 @@ class RuleFile(FileModel):
 
 
 def read(text: str, file: str) -> RuleFile:
-    """Return the rules in the text of a file.
-
-    Raises:
-        InvalidInput: with the faults that were found together, each with its line. When they are
-            mended, further ones may appear.
-    """
     with located_in(text):
         rules = parse_file(RuleFile, text, file)
         if faults := list(_faults(rules)):

@@ -175,12 +175,7 @@ def _validator(schema: Path) -> Any:  # noqa: ANN401
 
 
 def render(release: Release, config: Config, evaluate: Evaluate) -> str:
-    """Return the manifests of a release as the text of one file.
-
-    Raises:
-        Refused: if the registry has no image for a communication client.
-        InvalidInput: if the values of a service or the configuration of a client are not valid.
-    """
+    """Return the manifests of a release as text; raise Refused or InvalidInput if not possible."""
     if not isinstance(release, ServiceRelease):
         return render_connection(release, config)
     values = values_of(release, config, evaluate)
