@@ -180,11 +180,7 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
 
 
 def render_all(
-    world: World,
-    evaluate: Evaluate,
-    current: Mapping[str, str],
-    *,
-    keeps_late: bool,
+    world: World, evaluate: Evaluate, current: Mapping[str, str], *, keeps_late: bool
 ) -> dict[str, str]:
     """Return all generated files except those of the ledger, by path.
 

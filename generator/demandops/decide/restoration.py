@@ -70,8 +70,7 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
     booked = {who for change in changes if change.after for who in change.after.requesters}
     shutdowns, forgotten = start.shutdowns.forget(now, booked)
     return replace(ledger, shutdowns=shutdowns), Changes(
-        claims=claim_changes(start, ledger, [change.key for change in changes]),
-        shutdowns=forgotten,
+        claims=claim_changes(start, ledger, [change.key for change in changes]), shutdowns=forgotten
     )
 
 

@@ -79,10 +79,7 @@ class State(World):
 
 
 def rendered_files(
-    state: State,
-    current: Mapping[str, str] = MappingProxyType({}),
-    *,
-    keeps_late: bool = False,
+    state: State, current: Mapping[str, str] = MappingProxyType({}), *, keeps_late: bool = False
 ) -> dict[str, str]:
     # ``hold`` overrides and ``keeps_late`` may keep files of ``current``.
     return changeset.render_all(state, state.evaluate, current, keeps_late=keeps_late)

@@ -23,7 +23,6 @@ from demandops.render.gitops import path_of
 
 # ---- the override report, for ``get overrides`` and ``check``: what each override does now ----
 
-
 # ``matches nothing``: the override selects nothing, or its effects do not apply to what it selects.
 # ``held back``: another override with ``hold`` keeps every file that this override would change.
 # ``not rendered yet``: a generator has not written the changed files yet
@@ -62,8 +61,14 @@ def override_report(world: World, now: datetime) -> list[Entry]:
         held = tuple(claims[name])
         state: State = "matches nothing"
         if changed or held:
-            is_held_back = not held and all(_is_held(release, override) for release in changed)
-            state = "held back" if is_held_back else "in force"
+            state = "in force" if held else "held back"
+            for release in changed:
+                own = next(
+                    (effects for each, effects in release.shaping.by if each == override), ()
+                )
+                # only another override with ``hold`` keeps this one from changing the release
+                if not release.shaping.held or "hold" in own or {*own} == {"keep"}:
+                    state = "in force"
         if (override.end is not None and override.end <= now) or override not in world.overrides:
             state, changed, held = "expired", (), ()
         entries.append(Entry(override, state, changed, held))
@@ -127,28 +132,15 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
                 )
 
 
-def _is_held(release: Release, override: Override) -> bool:
-    """Return whether another override with ``hold`` keeps ``override`` from changing a release."""
-    effects = next((effects for each, effects in release.shaping.by if each == override), ())
-    return release.shaping.held and "hold" not in effects and {*effects} != {"keep"}
-
-
-# ---- override state ----
-#
-# The state of an override, which is in force only once the files that it changes are written.
-
-
 def override_state(entry: Entry, world: World, not_rendered: Collection[str]) -> State:
-    """Return the state of an override; ``not_rendered`` are paths of files."""
+    # An override is in force only once the files that it changes are written.
     if entry.state != "in force" or not not_rendered:
         return entry.state
     paths = {path_of(release) for release in affected_releases(entry, world)}
     return "not rendered yet" if paths & {*not_rendered} else entry.state
 
 
-# ---- release causes ----
-#
-# Why a release runs as it does: the claims that need it, and the files of people that shape it.
+# ---- why a release runs as it does: its claims, and the files of people that shape it ----
 
 
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
@@ -162,10 +154,7 @@ def release_named(world: World, name: str) -> Release | None:
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
-    """Return the claims that need a running release, sorted by their booking time.
-
-    ``ledger`` has no suspended claims.
-    """
+    # callers pass a ledger without suspended claims
     return by_booking(claim for claim in claims_of(release, ledger) if needs(claim, release))
 
 
@@ -181,7 +170,6 @@ def needs(claim: Claim, release: Release) -> bool:
 
 
 def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
-    """Return the versions that claims on a service's applications name, with requesters."""
     asking: dict[str, set[str]] = {}
     for claim in claims_of(release, ledger):
         if claim.application.version:

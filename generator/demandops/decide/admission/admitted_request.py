@@ -108,11 +108,7 @@ def _field(service: str) -> str:
 
 
 def _chosen(
-    item: Demanded,
-    booked_nodes: Mapping[str, str],
-    config: Config,
-    adds: bool,
-    faults: list[Fault],
+    item: Demanded, booked_nodes: Mapping[str, str], config: Config, adds: bool, faults: list[Fault]
 ) -> Iterator[tuple[str, str]]:
     """Yield (field, the node's name in the chosen domain) for each node in several domains."""
     held = item.held
@@ -194,11 +190,7 @@ Checkpoint = Callable[[], None]
 
 
 def admitted(
-    state: State,
-    goal: object,
-    now: datetime,
-    throttle: Throttle,
-    checkpoint: Checkpoint,
+    state: State, goal: object, now: datetime, throttle: Throttle, checkpoint: Checkpoint
 ) -> DemandRequest:
     """Return the request that a goal becomes: to wait, if it lacks only room and may wait.
 

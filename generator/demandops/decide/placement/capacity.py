@@ -62,7 +62,6 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return how much more ``after`` requests than ``before``; what stays the same is left out."""
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
@@ -151,10 +150,6 @@ class Room:
         self.book([claim])
 
     def book(self, claims: Iterable[Claim], *, give_back: bool = False) -> None:
-        """Reduce the room of the nodes by what these claims on applications need.
-
-        With ``give_back``, the claims are released instead.
-        """
         if self._world.config.limits_capacity:
             self._world, grown = self._after(claims, give_back=give_back)
             self._usage = self._usage.plus(grown)
@@ -190,8 +185,8 @@ class Room:
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
         """Return what an application requests at least of its node, as resource → amount.
 
-        Services that it shares do not count, and neither do services with a node of their own. If
-        ``service`` is not empty, only the service of this name counts.
+        Services that it shares do not count, nor do services with a node of their own. If
+        ``service`` is not empty, only this service counts.
         """
         subject, world = claims[0].subject, self._world
         # Planning for each node takes long. This amount is the same on all nodes, so it is planned
@@ -238,7 +233,6 @@ class Room:
 
 
 def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:
-    """Yield (node, excess in words) for each resource of which services request too much."""
     for (id, resource), used in sorted(usage.amounts.items()):
         node = world.config.nodes.get(id)
         most = node.most(resource) if node else None
