@@ -82,10 +82,7 @@ def refuse_other_owners(owners: Sequence[str], request: DemandRequest) -> None:
 
 
 def conflicts(item: Demanded, ledger: Ledger, *, above: bool = False) -> Iterator[Fault]:
-    """Yield the faults of a demanded application or connection that contradicts claims on it.
-
-    With ``above``, the messages say that ``item`` contradicts an earlier item of the same request.
-    """
+    """Yield the faults of an item that contradicts claims, or with ``above`` earlier items."""
     held = item.held
     if isinstance(held, Application):
         # all claims on an application agree about its node and type, so the first speaks for all
@@ -179,10 +176,7 @@ def book(
     *,
     joined: bool = False,
 ) -> Ledger:
-    """Return the ledger with a claim on a demanded application or connection.
-
-    ``current`` is the demand's claim on the same subject so far. A join keeps what it holds.
-    """
+    """Book an item; ``current`` is the demand's claim on the same subject so far."""
     claim = Claim(
         held=item.held.booked(),
         demand=key.demand,
@@ -325,10 +319,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
 def _holds(
     item: Demanded, requester: str, claims: list[Claim]
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
-    """Yield (text, claim, keys) for each topic that a shutdown lists.
-
-    ``claim`` is the first in which the requester holds matching topics, whose keys are ``keys``.
-    """
+    """Yield (text, first claim with matching holds, their keys) for each topic that is listed."""
     subject = item.held.subject
     listed = [words for words, _ in item.held.listed_topics(item.held)]
     # who lists no topic means all of the first claim

@@ -166,10 +166,7 @@ def _facts(before: str, after: str) -> Iterator[str]:
 
 
 def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
-    """Yield (path, old, new) for each smallest part that differs between two values.
-
-    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`.
-    """
+    """Yield (path, old, new) for each smallest part that differs; :data:`ABSENT` if missing."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
             inner = f"{path}.{key}" if path else str(key)

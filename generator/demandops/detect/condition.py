@@ -111,10 +111,7 @@ def topic_pattern_problem(pattern: str) -> str:
 
 
 def entity_in(pattern: str, topic: str) -> str | None:
-    """Return the entity that ``topic`` names; ``None`` if ``topic`` does not match ``pattern``.
-
-    If the topic matches and the pattern has no ``{entity}``, the result is an empty text.
-    """
+    """Return the entity that ``topic`` names, ``""`` if none, ``None`` if it does not match."""
     before, entity, after = pattern.partition(ENTITY)
     if not entity:
         return "" if topic == pattern else None

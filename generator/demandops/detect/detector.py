@@ -17,10 +17,7 @@ from demandops.model.config.base_model import seconds_of
 
 
 def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, Goal]:
-    """Return each event whose demand is booked or waits for room, with a goal that can end it.
-
-    ``bookkeeping`` has the form that ``demandops bookkeeping --output json`` prints.
-    """
+    """Return each booked or waiting event, with a goal that can end its demand."""
     demands = []
     for id, entry in bookkeeping.get("demands", {}).items():
         own_id = id if entry["action"] == "Demand" else ""
@@ -168,10 +165,7 @@ class Sending:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The answer to a goal.
-
-    ``code`` is empty if the goal succeeded. ``lease_s`` is 0 without a lease.
-    """
+    """The answer to a goal: ``code`` is empty if it succeeded, ``lease_s`` 0 without a lease."""
 
     code: str = ""
     message: str = ""
@@ -180,11 +174,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class _Entry:
-    """The demand of one event: what is wanted, and what is held.
-
-    ``held`` is the goal that the node has booked. ``is_sure`` is false if it is not certain that
-    the node has booked it.
-    """
+    """One event's demand; ``held`` is booked, for certain only if ``is_sure``."""
 
     wanted: Goal | None = None
     held: Goal | None = None
@@ -197,7 +187,6 @@ class _Entry:
     refusal: str = ""
 
     def next(self, now: float) -> tuple[Purpose, Goal] | None:
-        """Return the goal to send at ``now`` and its purpose, or ``None``."""
         wanted, held = self.wanted, self.held
         if self.is_under_way or now < self.not_before:
             return None
@@ -216,10 +205,7 @@ class _Entry:
         return ("renew", wanted.renewed()) if now >= self.renew_at else None
 
     def due(self) -> float:
-        """Return the time from which :meth:`next` may have a goal to send.
-
-        It is infinite while a goal is under way, and if nothing remains to be sent.
-        """
+        """Return the time from which :meth:`next` may have a goal; infinite if nothing remains."""
         if self.is_under_way:
             return inf
         is_steady = self.wanted is not None and self.wanted == self.held and self.is_sure
@@ -240,10 +226,7 @@ class WantedDemands:
         self._enqueue(want.key, entry)
 
     def hold(self, key: Key, goal: Goal) -> None:
-        """Record that a demand was booked before the detector started.
-
-        The caller then calls :meth:`want` for the same event.
-        """
+        """Record a demand that was booked before; the caller then wants it or its end."""
         entry = self._entries.setdefault(key, _Entry())
         # Nobody knows how much time its lease has left, so it is renewed at once.
         entry.held, entry.renew_at = goal, -inf
@@ -251,10 +234,7 @@ class WantedDemands:
         self._enqueue(key, entry)
 
     def next(self, now: float) -> Sending | None:
-        """Return a goal to send now, or ``None`` if there is none.
-
-        The goal counts as under way until :meth:`answered` is called for it.
-        """
+        """Return a goal to send now; it is under way until :meth:`answered` is called for it."""
         while self._queue and self._queue[0][0] <= now:
             _, _, key = heappop(self._queue)
             entry = self._entries.get(key)
@@ -275,10 +255,7 @@ class WantedDemands:
         return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
 
     def next_at(self) -> float:
-        """Return the time at which to call :meth:`next` again; infinite if nothing is to be sent.
-
-        A call of :meth:`want`, :meth:`hold` or :meth:`answered` may make that time earlier.
-        """
+        """Return when to call :meth:`next` again, unless another call here comes first."""
         return self._queue[0][0] if self._queue else inf
 
     def answered(self, sending: Sending, outcome: Outcome, now: float) -> str:

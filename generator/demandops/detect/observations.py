@@ -41,10 +41,7 @@ class Observation(NamedTuple):
 
 
 class Event(NamedTuple):
-    """An event that starts or ends: from now on its demand is wanted, or no longer wanted.
-
-    ``values`` are for the rule's template. ``why`` explains to people what has happened.
-    """
+    """A demand is wanted from now on, or no longer; ``why`` is for people."""
 
     rule: str
     subjects: tuple[str, ...]
@@ -59,10 +56,7 @@ class Event(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """The dwell time before an event, or the event itself if it ``lasts``.
-
-    ``since`` is the time at which the phase began.
-    """
+    """The dwell time before an event, or the event itself if it ``lasts``."""
 
     since: float
     lasts: bool

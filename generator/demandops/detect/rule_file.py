@@ -94,10 +94,7 @@ def names(text: str) -> set[str]:
 
 
 def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
-    """Return a fault for each name in braces that ``known`` lacks, and for each stray brace.
-
-    A brace is stray if it is neither doubled nor part of a pair around a name.
-    """
+    """Return a fault for each unknown name in braces, and for each single brace."""
     problems = []
     for path, text in texts(template, field):
         for token in _TOKEN.finditer(text):
@@ -111,11 +108,7 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
 
 
 def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return entities whose names turn the template into ``text``, by the names in braces.
-
-    If several combinations of entities give this text, the result is one of them. The result is
-    empty if none does, or if the template has no names in braces.
-    """
+    """Return entities that turn the template into ``text``, by name; empty if none do."""
     seen: set[str] = set()
     pattern, end = "", 0
     for token in _TOKEN.finditer(template):
@@ -179,11 +172,7 @@ def _identity(data: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class BookedDemand:
-    """A demand that the bookkeeping lists.
-
-    ``demand`` is the demand's id. It is empty for a demand by ``DeploymentRequest``, of which
-    ``request`` is the id.
-    """
+    """A demand in the bookkeeping; without an id, ``request`` is of a DeploymentRequest."""
 
     demand: str
     request: str

@@ -73,10 +73,7 @@ _SELECTOR = "variables.selector"
 
 
 def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
-    """Return the expression that is true if a pod's selector has all labels of a node's selector.
-
-    Only nodes of the domain count.
-    """
+    """Return the expression that is true for the selectors of the domain's nodes."""
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
     for node in config.nodes.values():

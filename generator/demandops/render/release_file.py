@@ -178,10 +178,7 @@ def override_comment(override: Override, effects: tuple[str, ...]) -> str:
 def kept_charts(
     files: Mapping[str, str], current: Mapping[str, str], world: World
 ) -> dict[str, str]:
-    """Return, by path, the chart sources that stay because a held release may still use them.
-
-    ``files`` are the new generated files, and ``current`` are those in the state repo.
-    """
+    """Return the chart sources in ``current`` that stay for releases that are held."""
     if not any(override.hold for override in world.overrides):
         return {}
     # not that of a chart in a folder of the state repo: it would fetch the folder's newest version

@@ -356,10 +356,7 @@ def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
 def with_chosen_types(
     request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
 ) -> AnyRequest:
-    """Return ``request`` with the type that each connection gets, if any type can carry it.
-
-    ``current`` takes an id and returns the claimed connection that has it, or ``None``.
-    """
+    """Return the request with a type for each connection, if any type can carry it."""
     if not request.adds_claims:
         return request
 

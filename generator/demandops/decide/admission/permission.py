@@ -50,10 +50,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 def needed_access(
     held: Application | Connection, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield (access domain, access) for each node where services run or a connection has an end.
-
-    The access is what a rule of this domain must grant. A node without a domain is left out.
-    """
+    """Yield (domain, what a rule of it must grant) for each node of services or of an end."""
     more: Access = []
     if isinstance(held, Application):
         first = [("applications", held.appdef)]
@@ -153,10 +150,7 @@ def _wanted_lease(request: DemandRequest) -> int | None:
 def approval_reasons(
     request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
 ) -> tuple[str, ...]:
-    """Return the reasons why a request needs approval, such as ``access domain 'edge'``, each once.
-
-    ``changes`` has each changed claim as (before the request, after the request).
-    """
+    """Return why a request needs approval, by its changed claims as (before, after)."""
     if not request.adds_claims:
         return ()
     listed = set(request.subjects())  # without the claims of overrides, which need no approval

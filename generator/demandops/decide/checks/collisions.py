@@ -152,10 +152,7 @@ def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterato
 def _publishers(
     world: World, node: str, topic: str, *, excluded: ServiceKey | None = None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of the service instances on a node that publish ``topic``.
-
-    The instance ``excluded`` and each instance that no claim needs are left out.
-    """
+    """Yield the keys of the needed instances on a node that publish ``topic``."""
     # The output patterns of the definitions tell which instances would publish the topic. So only
     # these are looked up, and not the outputs of all services on the node.
     for services in world.config.services.values():
@@ -188,10 +185,7 @@ def _publishers(
 def _keys_called(
     world: World, node: str, service: Service, instance: str, excluded: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of a service's instances on ``node`` that topic names show as ``instance``.
-
-    Some may not run.
-    """
+    """Yield keys on ``node`` that topic names show as ``instance``; some may not run."""
     ledger, config = world.ledger, world.config
     name, role = service.name, service.root
     if service.scope in ("node", "cluster"):
@@ -325,11 +319,7 @@ def name_faults(
     changes: Changes,
     names: Names,
 ) -> Iterator[Fault]:
-    """Yield a fault for each new release that needs a name of another release.
-
-    ``keys`` are the keys of the releases that the demand may change. ``names`` are the names of the
-    releases in ``before``.
-    """
+    """Yield a fault for each new release that needs one of ``names``, those of ``before``."""
     for key in keys:
         for name in names_of(after, key):
             others = (names.get(name) or HashTrieSet()).discard(key)
@@ -350,10 +340,7 @@ def name_faults(
 def faults_in_files(
     request: DemandRequest, changes: Changes, text_at: Callable[[str], str | None]
 ) -> Iterator[Fault]:
-    """Yield a fault for each new claim or waiting demand whose file belongs to another.
-
-    ``text_at`` returns the text of a file of the state repo before the change.
-    """
+    """Yield a fault for each new claim or waiting demand whose file belongs to another."""
     owners: dict[str, ClaimKey] = {}
     for change in changes.claims:
         path = claim_file.path_of(change.key)

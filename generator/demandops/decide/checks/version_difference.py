@@ -154,10 +154,7 @@ def _of_service(
     before: World,
     after: World,
 ) -> Iterator[Difference]:
-    """Yield a difference for each demanded application whose version of a shared service differs.
-
-    ``demanded`` has the applications of the demand by id, each with the version that it asks for.
-    """
+    """Yield the differences of demanded applications, each with the version it asks for."""
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}
     if len({contents(version, service) for version in versions.values() if version}) == 1:

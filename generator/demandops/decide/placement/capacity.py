@@ -98,10 +98,7 @@ def _requests(plans: Plans, config: Config) -> Counter[Need]:
 
 
 def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
-    """Yield (node, reason) for each resource of which a node has too little for the growth.
-
-    ``usage`` is what services request before the growth.
-    """
+    """Yield (node, reason) for each resource of which a node has too little for the growth."""
     for (id, resource), amount in sorted(grown.items()):
         node = config.nodes.get(id)
         most = node.most(resource) if node else None

@@ -108,10 +108,7 @@ class Choice:
         return not self._closed(entry) and self._is_permitted(entry)
 
     def candidates(self) -> Iterator[Chosen]:
-        """Yield the nodes that fit, have room and pass :attr:`suits`, the best first.
-
-        The choice ends early if the demand cannot be booked on :data:`MOST_TRIED` nodes.
-        """
+        """Yield the nodes that fit, have room and pass :attr:`suits`, the best first."""
         fitting = self._fitting()
         centre = self._centre()
         fitting.sort(key=lambda node: self._rank(node, centre))
@@ -230,10 +227,7 @@ class Choice:
         return permission.may_place(self.item, self.app.appdef, node.id, self.config)
 
     def none_fits(self) -> Fault:
-        """Return the fault if :meth:`candidates` yields no node; it lists what nodes lack.
-
-        The nodes that lack the least come first.
-        """
+        """Return the fault if no node fits: what nodes lack, first those that lack the least."""
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
         centre, code = self._centre(), "no-node"

@@ -249,11 +249,7 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
 
 
 def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
-    """Return the node on which the application of ``demand`` is booked already and stays.
-
-    Return ``None`` if the generator may choose a node. Return a fault if another demand holds the
-    application on a node that lacks what ``demand`` requires.
-    """
+    """Return the booked node if it stays, a fault if it must but lacks something, or ``None``."""
     app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
     if not claims:
         return None

@@ -60,10 +60,7 @@ Move = Callable[[Application], Application]
 def with_moved(
     world: World, claims: Iterable[Claim], move: Move
 ) -> tuple[World, tuple[ClaimChange, ...]]:
-    """Return the world with the applications of ``claims`` moved, and the changes of claims.
-
-    The connections of the demands that hold these claims follow the applications.
-    """
+    """Return the world with applications moved, followed by connections of their demands."""
     ledger, claims = world.ledger, tuple(claims)
     keys = [claim.key for claim in claims]
     for claim in claims:
@@ -78,10 +75,7 @@ def with_moved(
 
 
 def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger in which the connections of a demand follow, and the changed keys.
-
-    ``claim`` is the demand's claim on the application before the move.
-    """
+    """Let a demand's connections follow an application, ``claim`` on which is not moved yet."""
     config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
     app = claim.application
     old, new = flows(config, app), flows(config, move(app))
@@ -118,14 +112,6 @@ def _path(flow: Flow) -> tuple[str, str, str, str]:
     return flow.topic, flow.sender, flow.receiver, flow.target
 
 
-def renaming(world: World, claim: Claim) -> Iterator[tuple[Flow, Route]]:
-    """Yield (flow, route) for each input whose topic a connection of the demand renames."""
-    for flow in flows(world.config, claim.application):
-        for _, route in _carrying(world.ledger, claim.demand, flow):
-            if flow.delivery is None and route.read_topic != route.written_topic:
-                yield flow, route
-
-
 def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
     """Yield (the demand's claim, route) for each connection of a demand that carries a flow."""
     for id in ledger.connections_bringing(flow.receiver, flow.target):
@@ -138,11 +124,7 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
 
 
 def _carried_by(flow: Flow, carrier: Connection | None, claim: Claim, world: World) -> Claim:
-    """Return a demand's new or extended claim on the connection that carries a flow from now on.
-
-    ``carrier`` is the connection that carried the topic before the move, or ``None``. If no claim
-    brings the topic to the receiver yet, the connection gets its type and options.
-    """
+    """Return a demand's claim on the connection that carries a flow after a move."""
     route = carrier.topics[0] if carrier else None
     flow = replace(flow, topic=route.read_topic) if route else flow
     connection = connection_for(flow, carrier.known_type.word if carrier else "auto", world.ledger)
@@ -166,10 +148,7 @@ def _carried_by(flow: Flow, carrier: Connection | None, claim: Claim, world: Wor
 def with_moves(
     request: Drain, world: World, usage: Usage, names: Names, most: float = inf
 ) -> Drain:
-    """Return ``request`` with the moves of all applications and services that can leave the node.
-
-    After ``most`` tried nodes, the other applications are left for another drain.
-    """
+    """Return ``request`` with the moves that are possible, after ``most`` tried nodes no more."""
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
     room, tried, last = Room(world, usage), 0, request.after
     node = request.id
@@ -259,11 +238,7 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
 def _moved(
     world: World, claims: tuple[Claim, ...], room: Room, names: Names, service: Service | None
 ) -> tuple[_Moved | str, int]:
-    """Return the move of an application, or only of its ``service``, to the best other node.
-
-    If no move is possible, the result is the reason as a text. The second value is how many nodes
-    were tried.
-    """
+    """Return the move to the best other node, or why there is none, and how many were tried."""
     places = (claim.application.place or Requirement() for claim in claims)
     required = requirement_of(service) if service else reduce(Requirement.united, places)
     inputs: dict[str, dict[InputTopic, None]] = {}
@@ -276,7 +251,13 @@ def _moved(
     choice = Choice(demanded, required, world, room, claims, service)
     reasons: list[str] = []
     # On the sender's own node, no connection would rename the topic.
-    renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
+    renamed = {
+        flow.sender: route
+        for claim in claims
+        for flow in flows(world.config, claim.application)
+        for _, route in _carrying(world.ledger, claim.demand, flow)
+        if flow.delivery is None and route.read_topic != route.written_topic
+    }
     for chosen in islice(choice.candidates(), MOST_TRIED):
         if route := renamed.get(chosen.node):
             problem = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
@@ -354,10 +335,7 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return the restoration with its claims adapted to the overrides that move services now.
-
-    A service whose move would cause a fault among these claims is not adapted.
-    """
+    """Return the restoration with its claims adapted to the overrides that move services."""
     if not any(override.node for override in world.overrides) and not any(
         claim.is_on_application and claim.application.moved for claim in request.claims
     ):
@@ -397,10 +375,7 @@ def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
 def _faults(
     before: World, after: World, changes: tuple[ClaimChange, ...], names: Names
 ) -> Iterator[Fault]:
-    """Yield the faults of moved claims; each claim is checked as if it were demanded now.
-
-    ``names`` are those of all releases in ``after``.
-    """
+    """Yield the faults of moved claims; each claim is checked as if it were demanded now."""
     for change in changes:
         claim = change.after
         if claim is None:

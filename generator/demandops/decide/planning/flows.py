@@ -72,10 +72,7 @@ def usual_topic(config: Config, source: str, role: str) -> str | None:
 
 
 def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
-    """Return the request in which ``further`` says for each input whether it is a further topic.
-
-    Only inputs that may have a service instance of their own are marked.
-    """
+    """Return the request with ``further`` set for inputs that may have an instance."""
     if not request.adds_claims:
         return request
     # The claims of the put's own demand do not count, because the put may release their topics.
@@ -187,11 +184,7 @@ class Flow:
 
 
 def node_of(app: Application, service: Service, source: str) -> str:
-    """Return the node where a service of an application runs for inputs from ``source``.
-
-    The result is empty if no node is chosen for the service yet, or if the service runs once for
-    each cluster and has no node in the application's cluster.
-    """
+    """Return the service's node for inputs from ``source``; empty if there is none yet."""
     if service.nodes:
         return service.runs_at.get(app.node, "")
     if service.at_source:
@@ -235,10 +228,7 @@ def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicK
 
 
 def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[PublishedTopic]:
-    """Yield the topics of an application that ``origin`` names.
-
-    ``origin`` is an input role of the application, or ``<service>.<output>`` of its definition.
-    """
+    """Yield the topics that ``origin`` names: an input role, or ``<service>.<output>``."""
     name, _, output = origin.partition(".")
     if not output:
         for topic in app.inputs.get(origin, ()):

@@ -204,10 +204,7 @@ def with_kept_claims(
 def update_kept_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger in which ``subjects`` have exactly the kept claims that overrides want.
-
-    The second value has the keys of all kept claims on ``subjects``, before and after the update.
-    """
+    """Give ``subjects`` the kept claims that overrides want; return all old and new keys."""
     keys, ledger = list[ClaimKey](), after.ledger
     for subject in subjects:
         existing = [*ledger.kept_claims(subject), *before.kept_claims(subject)]
@@ -229,11 +226,7 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
 def _kept_claim(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the claim by which an override keeps a subject that no demand holds, or ``None``.
-
-    It is one of ``existing``, the kept claims before the update, or a copy of the last of the
-    claims that were on the subject ``before`` the change.
-    """
+    """Return one of the ``existing`` kept claims, or a copy of the last claim ``before``."""
     for claim in existing:
         keeping = keeping_overrides(claim, world)
         if any(override.name == claim.keeping_override for override in keeping):

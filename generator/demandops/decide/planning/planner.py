@@ -138,10 +138,7 @@ def _as_claimed(world: World, app: Application) -> Application:
 def _parts(
     world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
 ) -> Iterator[Application]:
-    """Yield each application with only those inputs that the instance at ``key`` depends on.
-
-    Several claims on one application give one application with the inputs of all these claims.
-    """
+    """Yield each application once, with only the inputs that the instance depends on."""
     claimed: dict[str, list[Application]] = {}
     for app in apps:
         claimed.setdefault(app.id, []).append(app)
@@ -178,11 +175,7 @@ def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str
 def demanded_inputs(
     world: World, release: ServiceRelease, app: Application
 ) -> Iterator[tuple[str, str, TopicKey]]:
-    """Yield (role, topic, root) for each topic that a service reads because of an application.
-
-    ``role`` is the service's input that reads the topic. ``root`` is the key of the demanded topic
-    from which this topic comes, or empty (:class:`.flows.PublishedTopic`).
-    """
+    """Yield (role, topic, root) for each topic that a service reads for an application."""
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
     if service.roots:
@@ -314,10 +307,7 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
 def with_kept_replicas(
     before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
 ) -> tuple[Ledger, tuple[Instance, ...]]:
-    """Return the updated ledger, and the service instances whose kept replicas changed.
-
-    ``keys`` are the keys of the releases that the demand may change.
-    """
+    """Return the updated ledger, and the instances whose kept replicas changed."""
     kept, changed = after.ledger.kept, list[Instance]()
     for key in keys:
         if not isinstance(key, ServiceKey):

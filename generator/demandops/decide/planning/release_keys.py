@@ -149,10 +149,7 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
 
 
 def is_needed(world: World, key: ReleaseKey) -> bool:
-    """Return whether a claim needs a service instance or a client.
-
-    Callers pass a world without suspended claims if these must not count.
-    """
+    """Return whether a claim needs a release; suspended claims in ``world`` count."""
     if isinstance(key, ClientKey):
         if key.side is None:
             return bool(world.ledger.connections_at(key.type, key.id))
@@ -175,10 +172,7 @@ def takes(app: Application, service: Service, key: ServiceKey) -> bool:
 
 
 def _service(world: World, application: str, key: ServiceKey) -> Service | None:
-    """Return the application's service to which the instance at ``key`` may belong, or ``None``.
-
-    For example, no instance on a node belongs to an application that moved to another node.
-    """
+    """Return the service of an application to which the instance may belong, or ``None``."""
     first = world.ledger.application(application)
     services = world.config.services.get(first.appdef, {}) if first else {}
     service = services.get(key.service)
