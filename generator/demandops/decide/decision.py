@@ -123,14 +123,11 @@ def decide(
 ) -> Decision:
     """Return the decision on a goal, or on a request that the generator makes itself.
 
+    Of the generator's own requests, only a :class:`Restoration` is checked against the
+    configuration and its policy.
+
     Args:
-        state: the configuration and ledger to decide on.
-        goal: the goal as plain data (:mod:`.deployment_request_goal`,
-            :mod:`.demand_goal`, :class:`Decommission`), or the generator's own
-            request. Of own requests, only a :class:`Restoration` is checked against the
-            configuration and its policy.
         now: when the demand was received, with time zone.
-        read: returns the current text of a file in the state repo, or ``None``.
         on_stage: called when the demand is admitted and when it is booked, each at most once.
             Later checks may still refuse an admitted demand.
         throttle: called if all other checks of admission find no fault, perhaps twice for one goal.

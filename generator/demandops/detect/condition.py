@@ -57,7 +57,8 @@ class Area:
 
 # ---- schedules: the days and hours at which a rule's demand is wanted ----
 
-DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
+DAYS: tuple[Day, ...] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 
 
 @dataclass(frozen=True, slots=True)
@@ -271,10 +272,7 @@ def _zone(text: str) -> ZoneInfo:
 class Hours(CamelModel):
     """A condition that holds from one time of day to another, on certain days of the week."""
 
-    days: Annotated[
-        tuple[Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"], ...],
-        Field(strict=False, min_length=1),
-    ] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+    days: Annotated[tuple[Day, ...], Field(strict=False, min_length=1)] = DAYS
     start: Annotated[str, readable_by(_clock)]
     stop: Annotated[str, readable_by(_clock)]
     zone: Annotated[str, readable_by(_zone)] = "UTC"

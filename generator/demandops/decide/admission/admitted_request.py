@@ -36,12 +36,10 @@ from demandops.model.ledger.records import Wait, WaitingDemand
 # In each further domain the node has the name ``<node>@<domain>``, which a demand may give wherever
 # it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
 #
-# A demand may name a node without a domain: as the node of an application or of a service, or as an
-# end of a connection. If the application or connection is booked already, its domain stays. If it
-# is not booked yet, the domain is the only one in which the rules let the requesters use the node.
-# If there is no such domain, the node's first domain is meant. If there are several, the demand is
+# A demand may name a node without a domain. If its application or connection is booked already, the
+# domain stays. If not, it is the only domain in which the rules let the requesters use the node. If
+# there is no such domain, the node's first domain is meant. If there are several, the demand is
 # refused.
-
 
 Held = Application | Connection
 
@@ -60,16 +58,15 @@ def with_chosen_domains(
     demanded = []
     for item in request.demanded:
         held = _with_short_names(item.held, config)
-        first = ledger.held(held.subject)
-        booked_nodes = dict(_named(first)) if first else {}
-        chosen = dict(_chosen(item, booked_nodes, config, request.adds_claims, faults))
+        booked = ledger.held(held.subject)
+        booked_nodes = _named(booked) if booked else {}
+        chosen = _chosen(item, booked_nodes, config, request.adds_claims, faults)
+        nodes = {**_named(held), **dict(chosen)}
         if isinstance(held, Application):
-            services = {name: chosen.get(_field(name), n) for name, n in held.services.items()}
-            node = chosen.get("node", held.node)
-            held = replace(held, node=node, services=MappingProxyType(services))
+            services = {name: nodes[f"services.{name}"] for name in held.services}
+            held = replace(held, node=nodes["node"], services=MappingProxyType(services))
         else:
-            source, target = chosen.get("source", held.source), chosen.get("target", held.target)
-            held = replace(held, source=source, target=target)
+            held = replace(held, source=nodes["source"], target=nodes["target"])
         demanded.append(replace(item, held=held))
     return replace(request, demanded=tuple(demanded)), faults
 
@@ -94,17 +91,12 @@ def _with_short_names(held: Held, config: Config) -> Held:
     return held.with_inputs(inputs)
 
 
-def _named(held: Held) -> Iterator[tuple[str, str]]:
-    """Yield (field, node) for both ends of a connection, or for an application and its services."""
+def _named(held: Held) -> dict[str, str]:
+    """Return the ends of a connection, or the nodes of an application and services, by field."""
     if isinstance(held, Connection):
-        yield from (("source", held.source), ("target", held.target))
-    else:
-        yield "node", held.node
-        yield from ((_field(name), node) for name, node in held.services.items())
-
-
-def _field(service: str) -> str:
-    return f"services.{service}"
+        return {"source": held.source, "target": held.target}
+    services = {f"services.{name}": node for name, node in held.services.items()}
+    return {"node": held.node, **services}
 
 
 def _chosen(
@@ -112,7 +104,7 @@ def _chosen(
 ) -> Iterator[tuple[str, str]]:
     """Yield (field, the node's name in the chosen domain) for each node in several domains."""
     held = item.held
-    for field, node in _named(held):
+    for field, node in _named(held).items():
         choices = config.nodes_of(node)
         if len(choices) < 2:
             continue
@@ -192,11 +184,7 @@ Checkpoint = Callable[[], None]
 def admitted(
     state: State, goal: object, now: datetime, throttle: Throttle, checkpoint: Checkpoint
 ) -> DemandRequest:
-    """Return the request that a goal becomes: to wait, if it lacks only room and may wait.
-
-    Raises:
-        Refused: if the goal does not pass all checks of :func:`admit` and the demand cannot wait.
-    """
+    """Return the request that a goal becomes: to wait, if it lacks only room and may wait."""
     try:
         return admit(state, goal, throttle, None, checkpoint)
     except Refused as refused:

@@ -151,17 +151,13 @@ class Room:
             self._world, grown = self._after(claims, give_back=give_back)
             self._usage = self._usage.plus(grown)
 
-    def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:
+    def lacks(self, claims: Sequence[Claim], node: str, service: str) -> list[str]:
         """Return, in words, the resources of which a node has too little for an application.
 
         ``claims`` are those to book for the application on ``node``. If ``service`` is not empty,
-        only the service of this name is placed there. The result is empty if the node has room, or
-        if the application cannot be planned.
+        only this service is placed there. An application that cannot be planned lacks nothing.
         """
-        entry = self._world.config.nodes.get(node)
-        if entry is None or entry.capacity is None:
-            return []
-        claims, host = list(claims), self._world.config.host_of(node)
+        host = self._world.config.host_of(node)
         least = {(host, resource): most for resource, most in self.least(claims, service).items()}
         short = [excess for _, excess in excesses(self._usage, least, self._world.config)]
         if short:

@@ -42,9 +42,8 @@ def plan(world: World, key: ReleaseKey) -> Release | None:
     """Return the release at ``key``, or ``None`` if no claim needs it or an override denies it.
 
     Raises:
-        Refused: if claims contradict each other in a parameter; if the value of a parameter cannot
-            be used; if application definitions that share a service pin different images of one
-            chart version; or if the configuration no longer has what a claim needs.
+        Refused: if claims contradict each other, if a value of a parameter cannot be used, or if
+            the configuration no longer has what a claim needs.
     """
     world = without_suspended(world)
     release = _unshaped(world, key)
@@ -259,12 +258,6 @@ class _ClaimedConnections:
         return self.world.ledger.connections_at(self.type, node)
 
     def get(self, id: str) -> Connection | None:
-        """Return the connection with an id, or ``None`` if no connection of :attr:`type` has it.
-
-        Raises:
-            Refused: if a person wrote a claim with a route that this type cannot carry, or
-                removed from the inventory what the connection needs.
-        """
         first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)
         if first is None or first.type is not self.type:
             return None
@@ -273,6 +266,8 @@ class _ClaimedConnections:
             for route in connection_topics(claims)
             if not is_bridged(route, *first.nodes, self.world.config)
         )
+        # A person may have written a claim with a route that this type cannot carry, or have
+        # removed from the inventory what the connection needs.
         problems = list(route_faults(self.type, topics, first.nodes, self.world.config))
         if problems:
             raise Refused(
