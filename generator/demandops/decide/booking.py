@@ -403,7 +403,6 @@ def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes
 
 
 def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
-    """Return the claims on applications and connections that need a node, in no order."""
     subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.applications_at(node)]
     subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connections_needing(node)]
     return [

@@ -263,7 +263,6 @@ _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return the services that a trial demand gives, for each appdef, without overrides."""
     if not config.domain_of:
         return {}
     plain = replace(config, overrides={})
@@ -301,7 +300,6 @@ def _services(
 def overridden_releases(
     override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield the trial releases that an override may select, changed by the override."""
     for release in trials:
         # ``hold`` would keep a file that no trial has
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")

@@ -196,8 +196,6 @@ MOST_TRIALS = 64
 
 
 class _Trials:
-    """The bookings that are tried, in memory only, while nodes are looked for."""
-
     def __init__(self, state: State, now: datetime, checkpoint: Checkpoint) -> None:
         self._state, self._now, self._checkpoint = state, now, checkpoint
         self._tried = self._items = 0
@@ -261,7 +259,7 @@ def _decided(
         version_difference.differences(request, state, after, changes.claims, rendered.plans)
     )
     refused = [difference.fault for difference in differing if difference.is_refused]
-    grown = _growth(config, rendered)
+    grown = capacity.growth(rendered.former, rendered.plans, config)
     # a drain was tried on its nodes already, and what releases claims makes room
     if request.adds_claims or isinstance(request, Restoration):
         refused = refused or list(capacity.faults(state.usage(), grown, config))
@@ -299,7 +297,6 @@ def _decided(
 def _booked(
     state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
 ) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
-    """Return the state with a request booked, the changes, and the releases that may change."""
     checkpoint()
     subjects = request.subjects()
     # Claims of the request replace those that overrides kept. Else a kept claim, which nobody
@@ -334,23 +331,16 @@ def _booked(
     return after, changes, keys
 
 
-def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    if not config.limits_capacity:
-        return {}
-    return capacity.growth(rendered.former, rendered.plans, config)
-
-
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    """Return the state after a step of a service's kept replicas has ended, and its changeset."""
     after = replace(state, ledger=planner.without_ended(state, instance, now))
     changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
     change = changeset.build_changeset(
         state, after, changes, keys, state.evaluate, read, state.plans
     )
-    usage = state.usage().plus(_growth(state.config, change))
-    return state.followed_by(after.ledger, change, usage), change
+    grown = capacity.growth(change.former, change.plans, state.config)
+    return state.followed_by(after.ledger, change, state.usage().plus(grown)), change
 
 
 # ---- notes for the requester, in addition to the outcome ----
@@ -410,7 +400,6 @@ def _connection_notes(request: DemandRequest, world: World) -> Iterator[str]:
 def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return the changes to rendered files after a person edited claims on ``subjects``."""
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
     # a template that takes too long is no fault of the claim, so its release keeps its file

@@ -55,8 +55,6 @@ class FileChange:
 
 @dataclass(frozen=True, slots=True)
 class MergePreview:
-    """The releases that start, change or stop, and the files that change."""
-
     releases: tuple[ReleaseChange, ...]
     files: tuple[FileChange, ...]
     # the paths of the changed files that belong to no release
@@ -153,7 +151,6 @@ def preview(
 
 
 def _facts(before: str, after: str) -> Iterator[str]:
-    """Yield texts for the first differences between two manifests, and then a count of the rest."""
     try:
         differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
     except InvalidInput:

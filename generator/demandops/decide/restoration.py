@@ -75,7 +75,6 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    """Return the changes of claims that restore the earlier commit, sorted by path."""
     earlier = {claim.key: claim for claim in request.claims}
     changes = [ClaimChange(claim, None) for claim in ledger if claim.key not in earlier]
     for key, claim in earlier.items():
@@ -92,7 +91,6 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
 
 
 def faults(request: Restoration, world: World) -> Iterator[Fault]:
-    """Yield a fault for each claim to restore that the current configuration does not allow."""
     for change in _changes(world.ledger, request):
         after = change.after
         if after is None or after.keeping_override is not None:

@@ -23,8 +23,6 @@ from demandops.templating.values import Evaluate
 
 @dataclass(frozen=True, slots=True)
 class State(World):
-    """The world at one commit, and what computes the values of services in it."""
-
     evaluate: Evaluate
     # The releases that earlier decisions on this configuration planned, so that a decision need not
     # plan them again to tell what it changes. A copy made with ``replace`` has none; followed_by
@@ -50,7 +48,6 @@ class State(World):
         return self._names
 
     def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
-        """Return the state after a decision, with the releases that the decision planned."""
         plans = self.plans
         for key, release in rendered.plans.items():
             plans = plans.insert(key, release) if release else plans.discard(key)
@@ -61,7 +58,6 @@ class State(World):
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
-        """Return the state with another ledger, whose claims differ by ``changes``."""
         state, changes = replace(self, ledger=ledger), tuple(changes)
         with suppress(Refused):  # if a definition is gone; then ``names`` looks at all releases
             state._follow_names(self, affected_keys(self, state, changes))
@@ -72,7 +68,6 @@ class State(World):
         return state
 
     def _follow_names(self, before: State, keys: Collection[ReleaseKey]) -> None:
-        """Take over the names of ``before``, from which only the releases at ``keys`` differ."""
         if before._names is not None:
             names = collisions.followed(before._names, before, self, keys)
             object.__setattr__(self, "_names", names)
@@ -86,5 +81,4 @@ def rendered_files(
 
 
 def try_configuration(state: State) -> None:
-    """Raise Refused or InvalidInput if an appdef or an override in effect does not work."""
     changeset.render_trial_demands(state, state.evaluate)

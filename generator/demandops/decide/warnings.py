@@ -112,8 +112,6 @@ def misspelled_topic_warnings(world: World) -> Iterator[Fault]:
 
 
 class _KnownTopics:
-    """The known topics of each node: those of the inventory, and the booked usual topics."""
-
     def __init__(self, world: World) -> None:
         self._world = world
         self._listed: dict[str, frozenset[str]] = {}

@@ -75,7 +75,6 @@ class Schedule:
     zone: tzinfo
 
     def is_on(self, now: float) -> bool:
-        """Return whether ``now``, in seconds since 1970 UTC, is in the span of hours."""
         local = datetime.fromtimestamp(now, self.zone)
         clock, today = local.time(), local.weekday()
         if self.start < self.end:

@@ -84,7 +84,6 @@ class Detector:
         return [self._want(key, goal if key in lasting else None) for key, goal in booked.items()]
 
     def step(self, observations: Iterable[Observation], now: float) -> list[tuple[Event, Want]]:
-        """Return the events that start or stop by now, each with what it wants."""
         self._state, events = self._engine.step(self._state, observations, now)
         wants = []
         for event in events:
@@ -303,7 +302,6 @@ class WantedDemands:
         return sum(entry.wanted != entry.held or not entry.is_sure for entry in entries)
 
     def refusals(self) -> Iterator[tuple[Key, str]]:
-        """Yield the events whose last goal failed, and why."""
         for key, entry in self._entries.items():
             if entry.refusal:
                 yield key, entry.refusal

@@ -140,8 +140,6 @@ _NO_RULES: frozenset[str] = frozenset()
 
 
 class EngineStep:
-    """The work of one step: call its methods, then take ``events`` and :meth:`result`."""
-
     def __init__(self, engine: EventEngine, state: State) -> None:
         # The copies cost little: one step takes many observations, and the values in the mappings
         # are immutable, so they are not copied.
@@ -184,7 +182,6 @@ class EngineStep:
     # ---- time ----
 
     def pass_time(self, until: float) -> None:
-        """Advance the time to ``until``, and apply all changes that are due by then."""
         while until >= self._due:
             self._due = inf
             # In the order of their times, so a long silence gives the same events as short ones.
@@ -197,7 +194,6 @@ class EngineStep:
         self._now = max(self._now, until)
 
     def _all_due(self) -> Iterator[tuple[float, Callable[[], None]]]:
-        """Yield (when, action) for each change that passing time alone may cause."""
         for key, phase in self._phases.items():
             if not phase.lasts:
                 at = phase.since + self._engine.rules[key[0]].dwell
@@ -238,7 +234,6 @@ class EngineStep:
             self._lose(who, f"{who[1]} has not been seen since the start")
 
     def _lose(self, who: Who, why: str) -> None:
-        """Forget an entity, and end all events that it takes part in."""
         last = self._seen.pop(who, None)
         for key in sorted(self._engaged.get(who, _NONE)):
             self._leave(key, self._engine.rules[key[0]], why)

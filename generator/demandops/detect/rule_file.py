@@ -452,7 +452,6 @@ class Rule(CamelModel):
         return RuleDemand("deployment_request", self.deployment_request or {})
 
     def is_for(self, *entities: str) -> bool:
-        """Return whether the rule is for an event about these entities."""
         # The patterns of a rule for pairs from two sources limit only the entity of the first.
         limited = entities[:1] if self.together and self.together.other else entities
         return all(matches(entity, self.entities) for entity in limited)

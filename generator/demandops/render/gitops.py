@@ -55,7 +55,6 @@ def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
 
 
 def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return the access domains that have nodes in a cluster, for each cluster that has any."""
     domains: dict[str, list[AccessDomain]] = {}
     for cluster, domain in domains_in_use(config):
         domains.setdefault(cluster, []).append(domain)
@@ -186,7 +185,6 @@ def chart_object(name: str, chart: ChartSource) -> str:
 
 
 def flux_base_files(config: Config) -> dict[str, str]:
-    """Return the files that do not depend on demands, by path."""
     # without the URL of the repo, there is nothing that a bootstrap file could make Flux follow
     flux = config.repo_settings.flux
     files = {
@@ -244,7 +242,6 @@ def argocd_manifests(
 
 
 def argocd_base_files(config: Config) -> dict[str, str]:
-    """Return the bootstrap files and a placeholder for each access domain of a cluster, by path."""
     section = config.repo_settings.argocd
     assert section is not None  # noqa: S101 - required when gitops is "argocd"
     # Applications may fetch only from these: the state repo and the charts' repositories

@@ -185,7 +185,6 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
 
 
 def base_files(config: Config) -> dict[str, str]:
-    """Return the files that exist even without demands, by path."""
     # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
     # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
     if config.repo_settings.gitops == "argocd":

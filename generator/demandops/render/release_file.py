@@ -72,7 +72,6 @@ def check_files(
 
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
-    """Yield a file's valid documents, and append the faults of the others to ``faults``."""
     for part in text.split("\n---\n"):
         # The spec of a document for Flux or Argo CD is not parsed, because nothing reads it here. A
         # template of the program writes it, and Helm values were checked when they were computed.
@@ -144,7 +143,6 @@ _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
 def release_text(release: Release, config: Config, evaluate: Evaluate, current: str | None) -> str:
-    """Return the text of a release's file, whose text in the state repo is ``current``."""
     shaping = release.shaping
     if not shaping.held:
         comments = [override_comment(override, effects) for override, effects in shaping.by]

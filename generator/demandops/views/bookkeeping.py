@@ -52,8 +52,6 @@ class ServiceEntry:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEntry:
-    """One connection and its requesters, also those of each source topic."""
-
     type: str
     source: str
     target: str

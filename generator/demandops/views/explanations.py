@@ -39,7 +39,6 @@ class Entry:
 
 
 def override_report(world: World, now: datetime) -> list[Entry]:
-    """Return an entry for every override, sorted by name."""
     if not world.config.overrides:
         return []
     releases = defaultdict[str, list[Release]](list)
@@ -144,7 +143,6 @@ def override_state(entry: Entry, world: World, not_rendered: Collection[str]) ->
 
 
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
-    """Yield the releases that run, or only those that claims on ``subject`` need."""
     keys = keys_of(world, subject) if subject else all_keys(world)
     yield from filter(None, (plan(world, key) for key in keys))
 
@@ -163,7 +161,6 @@ def by_booking(claims: Iterable[Claim]) -> list[Claim]:
 
 
 def needs(claim: Claim, release: Release) -> bool:
-    """Return whether a claim on an application or connection of a release needs the release."""
     if not isinstance(release, ServiceRelease):
         return True
     return takes(claim.application, release.service, release.key)

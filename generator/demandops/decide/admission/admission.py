@@ -356,7 +356,6 @@ def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
 def with_chosen_types(
     request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
 ) -> AnyRequest:
-    """Return the request with a type for each connection, if any type can carry it."""
     if not request.adds_claims:
         return request
 

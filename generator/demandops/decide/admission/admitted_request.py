@@ -92,7 +92,6 @@ def _with_short_names(held: Held, config: Config) -> Held:
 
 
 def _named(held: Held) -> dict[str, str]:
-    """Return the ends of a connection, or the nodes of an application and services, by field."""
     if isinstance(held, Connection):
         return {"source": held.source, "target": held.target}
     services = {f"services.{name}": node for name, node in held.services.items()}
@@ -163,7 +162,6 @@ def _separated(app: Application, config: Config) -> Application:
 
 
 def notes(request: DemandRequest) -> Iterator[str]:
-    """Yield a note for each separate instance that a request lists."""
     for item in request.demanded:
         if isinstance(item.held, Application) and item.held.separate:
             id, _, version = item.held.id.rpartition("@")
@@ -303,7 +301,6 @@ def completed(request: DemandRequest, state: State) -> DemandRequest:
 
 
 def leaves_nodes_open(state: State, goal: object) -> bool:
-    """Return whether the generator chooses or checks nodes for the applications of a goal."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request: DemandRequest | None = demand_goal.parse(goal)[0]
     else:

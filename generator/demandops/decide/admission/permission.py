@@ -29,7 +29,6 @@ _NO_RULES = (Rule(name="everything"),)
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
-    """Yield a fault for everything that the access domains do not allow the requesters."""
     if not request.adds_claims:  # everybody may release what is theirs
         return
     lease_s = _wanted_lease(request)
@@ -84,7 +83,6 @@ def may_place(item: Demanded, appdef: str, node: str, config: Config) -> bool:
 
 
 def _not_allowed(item: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
-    """Yield a fault for each requester to whom no rule of the domain grants the access."""
     rules = domain.rules or _NO_RULES
     for index, requester in enumerate(item.requesters):
         own = [rule for rule in rules if matches(requester, rule.requesters)]
@@ -124,8 +122,6 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
 
 
 def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with the lease term that its access domain sets for each item."""
-
     def with_term(item: Demanded) -> Demanded:
         domain = config.domain_of.get(item.held.home)
         return replace(item, term=term(request, domain) if domain else None)

@@ -111,7 +111,6 @@ def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -
 
 
 def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterator[Fault]:
-    """Yield a fault for each output that the receiving node already gets from another source."""
     has_outputs_elsewhere = app.deliver or app.services or app.moved
     for flow in flows(after.config, app) if has_outputs_elsewhere else ():
         # Of an input that the demand lists, the demand names the source, so it is no fault.
@@ -120,22 +119,17 @@ def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterato
         for id in after.ledger.connections_bringing(flow.receiver, flow.target):
             other = after.ledger.connection(id)
             elsewhere = other is not None and {*other.nodes} != {flow.sender, flow.receiver}
-            if flow.delivery is None:
-                if elsewhere:
-                    message = (
-                        f"{flow.target} already comes to '{flow.receiver}' by connection '{id}', "
-                        f"and would also come from '{flow.sender}'; choose another node for the "
-                        "service that reads this topic"
-                    )
-                    yield item.fault("id", message, code="conflict")
-                continue
-            if elsewhere:
-                yield item.fault(
-                    f"deliver[{flow.delivery}].output",
-                    f"{flow.target} already comes to '{flow.receiver}' by connection '{id}'; leave "
-                    "this delivery out",
-                    code="conflict",
+            brought = f"{flow.target} already comes to '{flow.receiver}' by connection '{id}'"
+            if elsewhere and flow.delivery is None:
+                message = (
+                    f"{brought}, and would also come from '{flow.sender}'; choose another node for "
+                    "the service that reads this topic"
                 )
+                yield item.fault("id", message, code="conflict")
+            elif elsewhere:
+                place, message = f"deliver[{flow.delivery}].output", "leave this delivery out"
+                yield item.fault(place, f"{brought}; {message}", code="conflict")
+            if elsewhere or flow.delivery is None:
                 continue
             claims = after.ledger.connection_claims(id)
             routes = (route for claim in claims for route in claim.connection.topics)
@@ -273,7 +267,6 @@ _REMEDY = "use another id, or wait until the other is released"
 
 
 def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
-    """Yield the names that only the release at ``key`` may have."""
     if isinstance(key, ClientKey):
         yield from key.type.names(key)
         return
@@ -340,7 +333,6 @@ def name_faults(
 def faults_in_files(
     request: DemandRequest, changes: Changes, text_at: Callable[[str], str | None]
 ) -> Iterator[Fault]:
-    """Yield a fault for each new claim or waiting demand whose file belongs to another."""
     owners: dict[str, ClaimKey] = {}
     for change in changes.claims:
         path = claim_file.path_of(change.key)

@@ -66,7 +66,6 @@ def denial_faults(request: DemandRequest, after: World, changes: Changes) -> Ite
 
 
 def _matched_field(selector: Selector, item: Demanded, config: Config) -> str:
-    """Return the most specific field of a demanded item that a selector matches."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:

@@ -76,7 +76,6 @@ class Difference:
         return f"application definition '{self.appdef}', for {change}"
 
     def warning(self) -> str:
-        """Return a warning that a newer version than the demanded one is deployed, or ``""``."""
         others = f"{self.what} runs version {self.others}, which others ask for"
         return "" if self.newer else f"{others}, not {self.demanded}"
 

@@ -62,13 +62,14 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
+    if not config.limits_capacity:
+        return {}
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return the growth of the services' requests when claims change."""
     if not after.config.limits_capacity:
         return {}
     keys = affected_keys(before, after, changes)
@@ -142,7 +143,6 @@ class Room:
         self.book((claim for claim in given_back if claim.is_on_application), give_back=True)
 
     def take(self, claim: Claim) -> None:
-        """Book a claim on an application, and count the application in :attr:`newly_placed`."""
         self.newly_placed[claim.application.node] += 1
         self.book([claim])
 

@@ -113,7 +113,6 @@ def _path(flow: Flow) -> tuple[str, str, str, str]:
 
 
 def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
-    """Yield (the demand's claim, route) for each connection of a demand that carries a flow."""
     for id in ledger.connections_bringing(flow.receiver, flow.target):
         claim = ledger.get(ClaimKey(Subject(SubjectKind.CONNECTION, id), demand))
         if claim is not None:
@@ -200,7 +199,6 @@ _Moved = tuple[World, Chosen, list[ClaimKey], Names]
 
 
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
-    """Return the ids of the applications that must move together with ``id``, including ``id``."""
     app = world.ledger.application(id)
     if service is None or service.scope != "topic" or app is None:
         return [id]
@@ -215,7 +213,6 @@ def _moving_with(id: str, service: Service | None, node: str, world: World) -> l
 
 
 def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
-    """Return why a claim's application or service must stay on its node, or an empty text."""
     app = claim.application
     if service is not None:
         return f"demand '{claim.demand}' names the node" if service.name in app.named else ""
@@ -335,7 +332,6 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return the restoration with its claims adapted to the overrides that move services."""
     if not any(override.node for override in world.overrides) and not any(
         claim.is_on_application and claim.application.moved for claim in request.claims
     ):
@@ -476,7 +472,6 @@ def update_ledger(
 def update_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> LedgerUpdate:
-    """Update the kept claims and the moved services on subjects whose claims changed."""
     subjects = tuple(subjects)
     ledger, kept = update_kept_claims(before, after, subjects, now)
     moved = following_overrides(replace(after, ledger=ledger), subjects)
@@ -486,7 +481,6 @@ def update_claims(
 
 
 def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    """Return the ledger after the end of an override, and the files to write with the marker."""
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     ended = {**world.ledger.ended, override.name: format_time(override.end)}
@@ -519,7 +513,6 @@ def expired_overrides(world: World, now: datetime) -> list[Override]:
 
 
 def changed_override_files(before: World, after: World) -> list[str]:
-    """Return, sorted, the paths of the overrides that come into effect, change or end."""
     old = {override.name: override for override in before.overrides}
     new = {override.name: override for override in after.overrides}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]

@@ -283,7 +283,6 @@ def flows(config: Config, app: Application) -> list[Flow]:
 
 
 def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
-    """Yield (node, application with only the inputs of this instance) for each instance."""
     if service.root is not None:
         for topic in app.inputs.get(service.root, ()):
             yield node_of(app, service, topic.source), app.with_inputs({service.root: (topic,)})

@@ -49,7 +49,6 @@ class Traits:
 
 
 def with_overridden_nodes(app: Application, world: World) -> Application:
-    """Return an application with its services moved to the nodes that overrides name."""
     moving = [override for override in world.overrides if override.node]
     nodes: dict[str, str] = {}
     for service in world.config.services.get(app.appdef, {}).values() if moving else ():
@@ -100,8 +99,6 @@ def selects(override: Override, traits: Traits, config: Config) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class UnsuspendedClaims(Ledger):
-    """A read-only view of a ledger, in which suspended claims are missing."""
-
     # A claim is checked when it is read, so there is no second ledger to keep up to date.
     world: World | None = field(default=None, compare=False)
 
@@ -147,7 +144,6 @@ class UnsuspendedClaims(Ledger):
 
 
 def without_suspended(world: World) -> World:
-    """Return the world with a view of its ledger that leaves out suspended claims."""
     ledger = world.ledger
     if isinstance(ledger, UnsuspendedClaims) or not any(each.deny for each in world.overrides):
         return world
@@ -176,7 +172,6 @@ def denied_by(traits: Traits, world: World) -> Override | None:
 
 
 def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
-    """Yield (claim, suspending override) for each suspended claim, sorted by subject."""
     if not any(override.deny for override in world.overrides):
         return
     for claim in sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand)):

@@ -283,7 +283,6 @@ def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
 
 
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
-    """Return whether the initial deployment already carries a route between two nodes."""
     sender, receiver = route.sender_and_receiver(source, target)
     node = config.nodes.get(sender)
     # The initial deployment keeps topic names, so it carries no route that renames a topic.
@@ -302,7 +301,6 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
 def with_kept_replicas(
     before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
 ) -> tuple[Ledger, tuple[Instance, ...]]:
-    """Return the updated ledger, and the instances whose kept replicas changed."""
     kept, changed = after.ledger.kept, list[Instance]()
     for key in keys:
         if not isinstance(key, ServiceKey):
@@ -414,8 +412,6 @@ class TracedPlan:
 
 
 class _Recording:
-    """Wraps one of the ledger's mappings, and records which keys are read."""
-
     def __init__(self, map: Any, reads: set[_Read]) -> None:  # noqa: ANN401 - either map
         self._map, self._reads = map, reads
 

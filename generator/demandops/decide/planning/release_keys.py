@@ -77,7 +77,6 @@ def version_of_service(
 
 
 def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...]:
-    """Return what a version pins for a service: the version of the chart, and the images."""
     pins = (version.images.get(name) for name in service.images)
     return version.charts[service.chart].version, *pins
 
