@@ -266,24 +266,18 @@ def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
     if not config.domain_of:
         return {}
     plain = replace(config, overrides={})
-    return {
-        name: list(_services(appdef, _trial_node(name, config), plain))
-        for name, appdef in config.appdefs.items()
-    }
+    return {name: list(_trial_services(appdef, plain)) for name, appdef in config.appdefs.items()}
 
 
-def _trial_node(appdef: str, config: Config) -> str:
-    """Return the first node that can run all services of an appdef, else the first of all."""
-    services = config.services.get(appdef, {}).values()
-    nodes = sorted(config.domain_of)
-    # a service that runs once for a cluster has no node in other clusters
-    fitting = (node for node in nodes if all(node in s.runs_at for s in services if s.nodes))
-    return next(fitting, nodes[0])
-
-
-def _services(
-    appdef: ApplicationDefinition, node: str, config: Config, version: str = ""
+def _trial_services(
+    appdef: ApplicationDefinition, config: Config, version: str = ""
 ) -> Iterator[ServiceRelease]:
+    services = config.services.get(appdef.name, {}).values()
+    nodes = sorted(config.domain_of)
+    # A service that runs once for a cluster has no node in other clusters. So this is the first
+    # node that can run all services, else the first of all.
+    fitting = (node for node in nodes if all(node in s.runs_at for s in services if s.nodes))
+    node = next(fitting, nodes[0])
     inputs = {
         role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),) for role in appdef.inputs
     }
@@ -331,9 +325,7 @@ def render_trial_demands(world: World, evaluate: Evaluate) -> None:
         for appdef, listed in (config.versions.items() if trials else ())
         for version in listed.versions
         if version != listed.default
-        for release in _services(
-            config.appdefs[appdef], _trial_node(appdef, config), plain, version
-        )
+        for release in _trial_services(config.appdefs[appdef], plain, version)
     )
     errors = [
         error

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -64,12 +65,10 @@ class MergePreview:
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
-        try:
+        with suppress(InvalidInput):
             release = plan(world, key)
-        except InvalidInput:
-            continue
-        if release is not None:
-            releases[key] = release
+            if release is not None:
+                releases[key] = release
     return releases
 
 

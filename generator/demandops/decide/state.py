@@ -35,17 +35,15 @@ class State(World):
 
     def usage(self) -> Usage:
         """Return how much the services request; the first call counts all services."""
-        if self._usage is None:
-            object.__setattr__(self, "_usage", capacity.whole_usage(self))
-        assert self._usage is not None  # noqa: S101 - set above
-        return self._usage
+        usage = capacity.whole_usage(self) if self._usage is None else self._usage
+        object.__setattr__(self, "_usage", usage)
+        return usage
 
     def names(self) -> Names:
         """Return the names of all releases; only the first call looks at all releases."""
-        if self._names is None:
-            object.__setattr__(self, "_names", collisions.all_names(self))
-        assert self._names is not None  # noqa: S101 - set above
-        return self._names
+        names = collisions.all_names(self) if self._names is None else self._names
+        object.__setattr__(self, "_names", names)
+        return names
 
     def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
         plans = self.plans

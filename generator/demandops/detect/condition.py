@@ -19,7 +19,6 @@ from demandops.model.config.inventory import Position
 
 # ---- areas of the map: a point or a polygon, and how far a position is from it ----
 
-
 # x and y in metres, in the map frame of the positions.
 Point = tuple[float, float]
 

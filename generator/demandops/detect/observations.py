@@ -13,7 +13,6 @@ from demandops.detect.rule_file import RuleFile, is_entity
 
 # ---- the engine's state between two steps: who was seen where, which events have not ended ----
 
-
 # The identity of an event: its rule, and the entities that it is about.
 Key: TypeAlias = tuple[str, tuple[str, ...]]
 

@@ -42,7 +42,6 @@ from demandops.model.demand import demand_goal, deployment_request_goal
 # A text that is only a name in braces becomes the value itself, for example a number for ``{x}``.
 # ``{{`` and ``}}`` stand for single braces. A template has no expressions, attributes or formats.
 
-
 # The values of the names in a template.
 Values = Mapping[str, str | float]
 

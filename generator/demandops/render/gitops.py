@@ -24,7 +24,6 @@ from demandops.templating import engine
 #
 # Other programs rely on these paths. There is one folder for each access domain of each cluster.
 
-
 CLUSTERS_ROOT = "clusters"
 BOOTSTRAP_ROOT = "bootstrap"
 

@@ -29,7 +29,6 @@ from demandops.templating.values import Evaluate
 # a folder that the generator owns. No two objects of a cluster may have the same kind, namespace
 # and name.
 
-
 # whose schemas check the objects of built-in kinds
 KUBERNETES_VERSION = "1.36.0"
 

@@ -172,7 +172,6 @@ def notes(request: DemandRequest) -> Iterator[str]:
 
 _ITEM = re.compile(r"(apps|applications|connections)\[(\d+)\]")
 
-
 # yields faults if a request comes too soon after others of its requesters
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
 # is called often during a decision, and raises OverBudget to end it

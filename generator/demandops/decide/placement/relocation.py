@@ -52,7 +52,6 @@ from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, c
 
 # ---- when an application moves, the connections of its demands follow, with type and options ----
 
-
 # Returns the given application on its new nodes.
 Move = Callable[[Application], Application]
 
@@ -417,7 +416,7 @@ def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
             for from_node, to_node in [other.sender_and_receiver(*connection.nodes)]
             if (to_node, other.written_topic) == target
         }
-        for other_sender in senders - {sender}:
+        for other_sender in sorted(senders - {sender}):
             topic = quoted(route.written_topic)
             words = f"{topic} would come from {quoted(sender)} and from {quoted(other_sender)}"
             yield Fault("conflict", "", words)
