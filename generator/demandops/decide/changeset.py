@@ -127,7 +127,10 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
         # the path has the node, so a release that moves to another node leaves a file behind
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
-        blocked += _blocked(old, new) if current is not None else ()
+        is_held = new is not None and new.shaping.held and current is not None
+        if new and is_held and (old and old.facts()) != new.facts():
+            by = " and ".join(each.path for each, effects in new.shaping.by if "hold" in effects)
+            blocked.append(f"{new.name} will not change until the 'hold' of {by} ends")
         if new_path and text != current:
             files[new_path] = text
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
@@ -227,12 +230,6 @@ class _Texts:
         except OverLimit as error:
             self._late[template] = error
             raise
-
-
-def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
-    if new is not None and new.shaping.held and (old and old.facts()) != new.facts():
-        by = " and ".join(each.path for each, effects in new.shaping.by if "hold" in effects)
-        yield f"{new.name} will not change until the 'hold' of {by} ends"
 
 
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:

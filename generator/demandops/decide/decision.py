@@ -350,7 +350,27 @@ def notes_on(
     request: DemandRequest, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
     yield from admitted_request.notes(request)
-    yield from _connection_notes(request, after)
+    # a connection that an override denies carries nothing
+    ledger = without_suspended(after).ledger
+    for item in request.demanded if request.adds_claims else ():
+        held = item.held
+        if isinstance(held, Application):
+            for flow in flows(after.config, held):
+                if not ledger.is_carried_to(flow.receiver, flow.target):
+                    yield (
+                        f"application '{held.id}': no connection carries {flow.topic} "
+                        f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
+                    )
+            continue
+        if item.note:
+            yield f"connection '{held.id}' {item.note}"
+        for route in held.topics:
+            if is_bridged(route, *held.nodes, after.config):
+                yield (
+                    f"connection '{held.id}': the initial deployment already carries "
+                    f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
+                    "the inventory), so no client of this connection carries it"
+                )
     yield from warnings.notes(request, after)
     yield from rendered.blocked
     if changes.repeats is not None:
@@ -368,30 +388,6 @@ def notes_on(
                 f"{release.name} keeps {release.replicas} replicas until {until} (downAfter in its "
                 "definition), although its demands need fewer"
             )
-
-
-def _connection_notes(request: DemandRequest, world: World) -> Iterator[str]:
-    # a connection that an override denies carries nothing
-    ledger = without_suspended(world).ledger
-    for item in request.demanded if request.adds_claims else ():
-        held = item.held
-        if isinstance(held, Application):
-            for flow in flows(world.config, held):
-                if not ledger.is_carried_to(flow.receiver, flow.target):
-                    yield (
-                        f"application '{held.id}': no connection carries {flow.topic} "
-                        f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
-                    )
-            continue
-        if item.note:
-            yield f"connection '{held.id}' {item.note}"
-        for route in held.topics:
-            if is_bridged(route, *held.nodes, world.config):
-                yield (
-                    f"connection '{held.id}': the initial deployment already carries "
-                    f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
-                    "the inventory), so no client of this connection carries it"
-                )
 
 
 # ---- claims that a person edits in the ledger ----
