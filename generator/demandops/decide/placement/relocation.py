@@ -98,12 +98,25 @@ def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[Clai
                 reduced = replace(held, held=remaining) if remaining else None
                 ledger = ledger.replace(held.key, reduced)
                 keys.append(held.key)
-    for flow in new:
-        if _path(flow) not in before and derives:
-            carrier = carried.get((flow.topic, flow.target))
-            booked = _carried_by(flow, carrier, claim, replace(world, ledger=ledger))
-            ledger = ledger.replace(booked.key, booked)
-            keys.append(booked.key)
+    for flow in new if derives else ():
+        if _path(flow) in before:
+            continue
+        carrier = carried.get((flow.topic, flow.target))
+        former = carrier.topics[0] if carrier else None
+        brought = replace(flow, topic=former.read_topic) if former else flow
+        connection = connection_for(brought, carrier.known_type.word if carrier else "auto", ledger)
+        # If no claim brings the topic to the receiver yet, the connection gets the options of the
+        # one that carried the topic before.
+        if former and not ledger.is_carried_to(flow.receiver, flow.target):
+            same = replace(former, source=brought.topic, target=flow.target, reverse=False)
+            connection = replace(connection, topics=(same,))
+        put = Put("", (Demanded(connection, claim.requesters, str),))
+        (item,) = admission.with_chosen_types(put, config, ledger.connection).demanded
+        booked = replace(claim, held=item.held.booked(), partial={})
+        if current := ledger.get(booked.key):
+            booked = replace(current, held=current.connection.extended(booked.connection).booked())
+        ledger = ledger.replace(booked.key, booked)
+        keys.append(booked.key)
     return ledger, keys
 
 
@@ -119,23 +132,6 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
                 ends = route.sender_and_receiver(*claim.connection.nodes)
                 if (*ends, route.written_topic) == (flow.sender, flow.receiver, flow.target):
                     yield claim, route
-
-
-def _carried_by(flow: Flow, carrier: Connection | None, claim: Claim, world: World) -> Claim:
-    """Return a demand's claim on the connection that carries a flow after a move."""
-    route = carrier.topics[0] if carrier else None
-    flow = replace(flow, topic=route.read_topic) if route else flow
-    connection = connection_for(flow, carrier.known_type.word if carrier else "auto", world.ledger)
-    if route and not world.ledger.is_carried_to(flow.receiver, flow.target):
-        route = replace(route, source=flow.topic, target=flow.target, reverse=False)
-        connection = replace(connection, topics=(route,))
-    put = Put("", (Demanded(connection, claim.requesters, str),))
-    (item,) = admission.with_chosen_types(put, world.config, world.ledger.connection).demanded
-    booked = replace(claim, held=item.held.booked(), partial={})
-    current = world.ledger.get(booked.key)
-    if current is None:
-        return booked
-    return replace(current, held=current.connection.extended(booked.connection).booked())
 
 
 # ---- relocation: applications and services leave a drained node, and overrides move services ----
@@ -326,7 +322,20 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
             world, names = after, moved_names
             keys += [each.key for own in changes.values() for each in own]
         else:
-            stays += _unmoved(ids[0], world, fault)
+            app = world.ledger.application(ids[0])
+            assert app is not None  # noqa: S101 - it is claimed
+            nodes = change(app).moved
+            changed = {
+                name for name in {*nodes, *app.moved} if nodes.get(name) != app.moved.get(name)
+            }
+            for override in world.overrides:
+                services = sorted(name for name in changed if nodes.get(name) == override.node)
+                if override.node and services:
+                    message = (
+                        f"does not move {' and '.join(services)} of application '{app.id}' to "
+                        f"'{override.node}': {fault.message}"
+                    )
+                    stays.append((override.path, message))
     return LedgerUpdate(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
 
 
@@ -349,22 +358,6 @@ def _all_moved(
         world, changes[id] = with_moved(world, world.ledger.application_claims(id), move)
     keys = affected_keys(before, world, [each for own in changes.values() for each in own])
     return world, changes, collisions.followed(names, before, world, keys)
-
-
-def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
-    app = world.ledger.application(id)
-    assert app is not None  # noqa: S101 - it is claimed
-    moved = with_overridden_nodes(app, world).moved
-    changed = {name for name in {*moved, *app.moved} if moved.get(name) != app.moved.get(name)}
-    nodes = {moved[name] for name in changed if name in moved}
-    for override in world.overrides:
-        if override.node in nodes:
-            services = " and ".join(sorted(n for n in changed if moved.get(n) == override.node))
-            yield (
-                override.path,
-                f"does not move {services} of application '{app.id}' to '{override.node}': "
-                f"{fault.message}",
-            )
 
 
 def _faults(
