@@ -436,13 +436,8 @@ class Drain(DemandRequest):
 def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger after an admitted request is carried out, and the changes.
 
-    If the same request is booked already, at most the leases of its claims change. ``now`` is when
-    the request was received, with time zone. ``docs/demand.md``, "How a demand is booked", says
-    what each operation means.
-
-    Raises:
-        Refused: if the request contradicts existing claims or itself, changes a demand of other
-            requesters, releases or renews what is not held, or undoes newer claims unasked.
+    If the same request is booked already, at most the leases of its claims change.
+    ``docs/demand.md``, "How a demand is booked", says what each operation means.
     """
     match request:
         case Join():

@@ -92,10 +92,6 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
     that the caller has planned already. With ``keeps_late``, a release whose values take too long
     to compute keeps its file, instead of OverLimit. ``checkpoint`` is called for each file and
     release; it may raise an exception to end the work.
-
-    Raises:
-        Refused, InvalidInput: if a release cannot be planned or rendered, or if a file would not be
-            valid or would be too large.
     """
     most = after.config.repo_settings.limits.file_bytes
     files = _ledger_files(after.ledger, changes, checkpoint)
@@ -187,11 +183,7 @@ def render_all(
 ) -> dict[str, str]:
     """Return all generated files except those of the ledger, by path.
 
-    ``current`` are the generated files in the state repo. With ``keeps_late``, a release whose
-    values take too long to compute keeps its file.
-
-    Raises:
-        Refused, InvalidInput: if a release cannot be planned or rendered, or if two need one name.
+    With ``keeps_late``, a release whose values take too long to compute keeps its file.
     """
     config, keys = world.config, all_keys(world)
     files = manifests.base_files(config)

@@ -77,9 +77,6 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
 
     A fault's file is the first of these that exists: a file in ``edited`` with a claim that needs
     the release; the file that the fault names; the file of the first claim that needs the release.
-
-    Raises:
-        Refused: if the definition of a claimed application is missing.
     """
     errors: list[tuple[ReleaseKey, InvalidInput]] = []
     for key in all_keys(world):
@@ -111,10 +108,7 @@ def preview(
     current: Mapping[str, str],
     files: Mapping[str, str],
 ) -> MergePreview:
-    """Return what a merge changes: from ``old`` and ``current`` to ``new`` and ``files``.
-
-    ``current`` and ``files`` have the texts of the generated files, by path.
-    """
+    """Return what a merge changes; ``current`` and ``files`` are the texts before and after it."""
     file_changes = tuple(
         FileChange(path, current.get(path), files.get(path))
         for path in sorted({*current, *files})

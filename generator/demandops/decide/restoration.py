@@ -36,12 +36,7 @@ class Restoration(DemandRequest):
 
 
 def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger with the claims of the earlier commit, and the changes.
-
-    Raises:
-        Refused: if the restoration drops or changes a claim of the present ledger, and
-            ``drop_newer`` is not set. Renewals do not count.
-    """
+    """Restore the claims; raise Refused if newer ones would change without ``drop_newer``."""
     changes = _changes(ledger, request)
     # claims that overrides keep do not count, because they are made again
     newer = [(c, c.before) for c in changes if c.before and c.before.keeping_override is None]

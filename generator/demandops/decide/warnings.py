@@ -318,10 +318,7 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
 
 
 def _kinds_of_charts(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each kind in a chart of the state repo that an access domain refuses.
-
-    There is also a warning for each kind that cannot be read from the chart's files.
-    """
+    """Yield a warning for each kind that a domain refuses, or that cannot be read."""
     # A chart may run in an access domain that has no rules, or in which a rule allows an
     # application that uses the chart.
     domains_of: dict[str, list[AccessDomain]] = {}

@@ -140,14 +140,7 @@ class MessageReader:
         self._fields = {field: _getter(field) for field in sorted(fields)}
 
     def observation(self, message: Any, entity: str, at: float) -> Observation:  # noqa: ANN401
-        """Return what a message, which arrived at the time ``at``, reports.
-
-        ``entity`` is the entity that the topic names; it is empty if a field of the message does.
-
-        Raises:
-            Unreadable: if a field is missing, a number is missing or not finite, a position is too
-                far from the origin, or the entity's name has characters that are not allowed.
-        """
+        """Return what a message reports; ``entity`` is from the topic, empty if a field has it."""
         if self._entity:
             entity = str(self._entity(message)).strip("/")
             if not is_entity(entity):

@@ -55,11 +55,7 @@ def is_entity(name: str) -> bool:
 
 
 def filled(template: Any, values: Values) -> Any:  # noqa: ANN401 - plain data
-    """Return a copy of a template in which values replace the names in braces.
-
-    Raises:
-        KeyError: if a name has no value; :func:`faults` reports such names.
-    """
+    """Return the template with values for names in braces; raise KeyError for a name without."""
     # The template is parsed already, so a value cannot change the structure of the demand.
     if isinstance(template, str):
         alone = _TOKEN.fullmatch(template)
@@ -199,10 +195,7 @@ class RuleDemand:
     def subjects_of(
         self, held: BookedDemand, subjects: tuple[str, ...], rule: str
     ) -> Values | None:
-        """Return the entities of the event for which the rule made a booked demand, or ``None``.
-
-        ``subjects`` are the names by which the template refers to the event's entities.
-        """
+        """Return the entities of the event for which the rule made a booked demand, or ``None``."""
         named = {*requesters_in(self.action, self.data)}
         is_own, held_id = self.action == "demand", held.demand or held.request
         if len(held.requesters) > len(named) or is_own != bool(held.demand):

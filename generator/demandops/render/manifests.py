@@ -29,10 +29,7 @@ from demandops.templating.values import Evaluate, ValuesTask
 def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> dict[str, Any]:
     """Return the Helm values of a service, with the patches of overrides merged in.
 
-    Raises:
-        InvalidInput: if the template fails, the values do not match the chart's schema, the schema
-            is not valid, or an override sets the replicas of an autoscaled service to 0. The error
-            names the template, the schema or the override.
+    InvalidInput names the template, the schema or the override at fault.
     """
     template = config.values_template(release.service)
     if release.autoscaler and release.autoscaler.max == 0:

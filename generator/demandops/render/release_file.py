@@ -49,12 +49,7 @@ _API = re.compile(r"^apiVersion: (\S+)$", re.MULTILINE)
 def check_files(
     files: Mapping[str, str | None], checkpoint: Callable[[], None] = lambda: None
 ) -> None:
-    """Check files that are about to be committed. A file with the text ``None`` is removed.
-
-    Raises:
-        InvalidInput: if a file is not valid, or if an object of a cluster appears twice. The cause
-            is a mistake in DemandOps or in a template, not in a demand.
-    """
+    """Raise InvalidInput for a mistake in DemandOps or a template; ``None`` removes a file."""
     faults: list[Fault] = []
     seen: dict[tuple[str, str, str, str], str] = {}
     for path, text in sorted(files.items()):

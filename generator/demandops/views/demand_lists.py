@@ -110,11 +110,7 @@ def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> Iterator[str]:
 
 @dataclass(frozen=True, slots=True)
 class UsedNode:
-    """A node of the inventory or of a claim, and what uses the node.
-
-    ``applications``, ``connections`` and ``requesters`` come from the claims that need the node.
-    These include claims on applications that only read an input from the node.
-    """
+    """A node of the inventory or of a claim, and what uses it, if only as a source of inputs."""
 
     name: str
     type: str | None

@@ -87,10 +87,7 @@ def affected_releases(entry: Entry, world: World) -> list[Release]:
 
 
 def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
-    """Yield (file, warning) for each override that has no effect.
-
-    There is also a warning if several replicas publish the same outputs because of an override.
-    """
+    """Yield (file, warning) for each override without effect, or whose replicas repeat outputs."""
     for entry in entries:
         override = entry.override
         if entry.state == "expired" and override.end:

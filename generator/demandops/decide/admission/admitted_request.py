@@ -47,11 +47,7 @@ Held = Application | Connection
 def with_chosen_domains(
     request: AnyRequest, config: Config, ledger: Ledger
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with a chosen access domain for each node.
-
-    There is a fault for each node for which several are possible. In a request that adds no claims,
-    such a node stays as it is named.
-    """
+    """Choose a domain for each node; there is a fault for each node with several domains."""
     if not config.hosts:
         return request, []
     faults: list[Fault] = []
@@ -216,14 +212,9 @@ def admit(
     trial: placement.Trial | None = None,
     checkpoint: Checkpoint = lambda: None,
 ) -> DemandRequest:
-    """Return the request that a goal becomes, if the goal passes all checks.
+    """Return the request that a goal becomes, or raise Refused with all faults of the goal.
 
     If ``trial`` is given, a node is chosen only if ``trial`` accepts the request with this node.
-
-    Raises:
-        Refused: with the limits that the goal exceeds, if it is too large. Otherwise with every
-            fault in the form and in the content of the goal. If there is none, with every fault
-            that ``throttle`` yields.
     """
     config, ledger = state.config, state.ledger
     limits = config.repo_settings.limits

@@ -43,11 +43,7 @@ from demandops.model.release import ServiceKey
 def topic_faults(
     request: DemandRequest, before: World, after: World, keys: Iterable[ReleaseKey]
 ) -> Iterator[Fault]:
-    """Yield a fault for each new service, route or delivery that clashes with another source.
-
-    Of a service's outputs, only the first that clashes is reported. ``keys`` are the keys of the
-    releases that the demand may change.
-    """
+    """Yield a fault for each new service, route or delivery that clashes with another source."""
     if not request.adds_claims:
         return
     for key in keys:

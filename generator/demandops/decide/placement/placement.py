@@ -176,8 +176,7 @@ def _placed(
 def may_wait(request: DemandRequest, world: World, checkpoint: Callable[[], None]) -> bool:
     """Return whether a demand that lacks only room may wait.
 
-    For each application and service to place, there must be a node that would fit if it had room.
-    The node's access domain must let demands wait, and must ask for no approval.
+    Each application and service needs a node that would fit, in a domain that lets demands wait.
     """
     for item in request.demanded:
         app = item.held

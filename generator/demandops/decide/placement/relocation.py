@@ -283,9 +283,8 @@ class LedgerUpdate:
 def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> LedgerUpdate:
     """Return the ledger after services have moved to the nodes that overrides name; no files.
 
-    The connections follow the services. A service also moves back when no override moves it any
-    longer. A service stays if the move would cause a fault. ``subjects`` are the subjects whose
-    claims changed; ``None`` means all applications.
+    A service moves back when no override moves it any longer, and stays if the move would cause a
+    fault. ``subjects`` are those whose claims changed; ``None`` means all applications.
     """
     ids = [subject.id for subject in subjects or () if subject.kind is SubjectKind.APPLICATION]
     if subjects is None:

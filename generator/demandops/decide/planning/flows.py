@@ -34,10 +34,7 @@ from demandops.model.release import ServiceKey
 def outputs(
     config: Config, service: Service, key: ServiceKey, *, further: bool = False
 ) -> dict[str, str]:
-    """Return the topics that a service instance publishes, by the name of the output.
-
-    ``further`` is ignored if the inventory names the usual topic of the source.
-    """
+    """Return the topics by output; ``further`` is ignored if the inventory names the usual one."""
     if service.root is None:
         instance = naming.topic_part(key.application or key.node)
     else:
@@ -254,10 +251,7 @@ def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
-    """Return the flows that an application needs between nodes, sorted by ``name``.
-
-    There are none if the definition is missing. A node that is not chosen yet is an empty text.
-    """
+    """Return the flows between nodes by ``name``; a node that is not chosen yet is empty."""
     services = config.services.get(app.appdef, {})
     # Several services of one node may read a topic, but it must come to the node only once.
     needed: dict[tuple[str, str, str, str], Flow] = {}
@@ -406,10 +400,7 @@ def without_idle_deliveries(
 
 
 def connection_for(flow: Flow, type: str, ledger: Ledger) -> Connection:
-    """Return the claimed connection that carries a flow, or a derived one; only with its topic.
-
-    With the ``type`` ``auto``, a derived connection has no type yet.
-    """
+    """Return the claimed connection that carries a flow, or a derived one, only with its topic."""
     ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
     for id in ledger.connections_bringing(flow.receiver, flow.target):
         for claim in ledger.connection_claims(id):

@@ -157,11 +157,8 @@ def suspended_by(claim: Claim, world: World) -> Override | None:
 
 
 def denied_by(traits: Traits, world: World) -> Override | None:
-    """Return the override that denies a claim, demand or release with these traits, or ``None``.
-
-    For the release of a service, only selectors that name services count. For a claim or a demand,
-    only the others count.
-    """
+    # For the release of a service, only selectors that name services count. For claims and
+    # demands, only the others count.
     for override in reversed(world.overrides):
         if override.deny and any(
             bool(selector.services) is bool(traits.service) and fits(selector, traits, world.config)
@@ -319,10 +316,7 @@ def apply_effects(
 
 
 def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
-    """Return the names of an override's effects on a release that it selects.
-
-    ``deny`` and ``keep`` are never among them, because they are not effects on a release.
-    """
+    """Return the effects that an override has on a release; never ``deny`` and ``keep``."""
     possible = {"hold"}
     if isinstance(release, ServiceRelease):
         versions = config.charts[release.service.chart].versions()
