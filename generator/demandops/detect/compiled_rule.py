@@ -110,15 +110,15 @@ class PairRule(CompiledRule):
         # The patterns of the rule limit only the entities of the first source.
         return who[0] != self._first or self.is_for(who[1])
 
-    def key(self, one: Who, other: Who) -> Key:
+    def key(self, who: Who, other: Who) -> Key:
         # A pair is one event, in whatever order its entities report.
         if self._first == self._second:
-            return self.name, (min(one[1], other[1]), max(one[1], other[1]))
-        return self.name, (one[1], other[1]) if one[0] == self._first else (other[1], one[1])
+            return self.name, (min(who[1], other[1]), max(who[1], other[1]))
+        return self.name, (who[1], other[1]) if who[0] == self._first else (other[1], who[1])
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        one, other = (seen[who] for who in self.entities_of(subjects))
-        (x, y), away = one.position or (0.0, 0.0), distance(one, other)
+        last, other = (seen[who] for who in self.entities_of(subjects))
+        (x, y), away = last.position or (0.0, 0.0), distance(last, other)
         text = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
         return Facts({**self._named(subjects), "x": x, "y": y, "distance": away}, text)
 
@@ -160,9 +160,9 @@ class PairRule(CompiledRule):
                         yield source, entity
 
 
-def distance(one: Observation, other: Observation) -> float:
-    assert one.position is not None and other.position is not None  # noqa: S101 - rules need them
-    return hypot(one.position[0] - other.position[0], one.position[1] - other.position[1])
+def distance(last: Observation, other: Observation) -> float:
+    assert last.position is not None and other.position is not None  # noqa: S101 - rules need them
+    return hypot(last.position[0] - other.position[0], last.position[1] - other.position[1])
 
 
 def compiled(rule: Rule) -> CompiledRule:

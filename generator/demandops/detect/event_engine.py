@@ -135,9 +135,6 @@ class EventEngine:
 
 # ---- one step of the engine, which changes a copy of the state ----
 
-_NONE: frozenset[Key] = frozenset()
-_NO_RULES: frozenset[str] = frozenset()
-
 
 class EngineStep:
     def __init__(self, engine: EventEngine, state: State) -> None:
@@ -235,9 +232,9 @@ class EngineStep:
 
     def _lose(self, who: Who, why: str) -> None:
         last = self._seen.pop(who, None)
-        for key in sorted(self._engaged.get(who, _NONE)):
+        for key in sorted(self._engaged.get(who, ())):
             self._leave(key, self._engine.rules[key[0]], why)
-        for name in sorted(self._counted.pop(who, _NO_RULES)):
+        for name in sorted(self._counted.pop(who, ())):
             self._count(name, -1)
         for pair in self._engine.pairs[who[0]]:
             if pair.takes(who):
@@ -279,11 +276,11 @@ class EngineStep:
             elif away <= rule.start:
                 counted.add(rule.name)
         # The index does not yield the areas that the entity has left, so their events end here.
-        for key in sorted(self._engaged.get(who, _NONE)):
+        for key in sorted(self._engaged.get(who, ())):
             left = self._engine.rules[key[0]]
             if isinstance(left, AreaRule) and key[0] not in compared:
                 self._latch(key, left, False, True)
-        before = self._counted.get(who, _NO_RULES)
+        before = self._counted.get(who, frozenset())
         if counted != before:
             self._counted[who] = frozenset(counted)
             for name in sorted(counted ^ before):
@@ -297,7 +294,7 @@ class EngineStep:
             self._latch(key, rule, away <= rule.start, away > rule.stop)
         # The squares around do not have the partners that are far away, so their events end here. A
         # partner that is still awaited after a restart has no position yet.
-        for key in sorted(self._engaged.get(who, _NONE)):
+        for key in sorted(self._engaged.get(who, ())):
             is_left = key[0] == rule.name and key not in compared
             if is_left and all(entity in self._seen for entity in rule.entities_of(key[1])):
                 self._latch(key, rule, False, True)
@@ -334,7 +331,7 @@ class EngineStep:
     def _enter(self, key: Key, rule: CompiledRule, phase: Phase) -> None:
         self._phases[key] = phase
         for who in rule.entities_of(key[1]):
-            self._engaged[who] = self._engaged.get(who, _NONE) | {key}
+            self._engaged[who] = self._engaged.get(who, frozenset()) | {key}
 
     def _leave(self, key: Key, rule: CompiledRule, why: str) -> None:
         phase = self._phases.pop(key)

@@ -65,10 +65,10 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
     return with_overridden_nodes(app, world)
 
 
-def shares(service: Service, one: Application, other: Application) -> bool:
+def shares(service: Service, app: Application, other: Application) -> bool:
     # A separate instance of an application shares only with separate instances of its version.
-    identities = {(app.appdef, app.node, app.own_version) for app in (one, other)}
-    return service.scope == "topic" and len(identities) == 1
+    identity = (app.appdef, app.node, app.own_version)
+    return service.scope == "topic" and identity == (other.appdef, other.node, other.own_version)
 
 
 @dataclass(frozen=True, slots=True)

@@ -41,8 +41,8 @@ def newest_asked(
     return max((versions[word] for word in asked or ("",)), key=lambda version: version.rank)
 
 
-def same_version(one: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
-    return (one and one.rank) == (other and other.rank)
+def same_version(version: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
+    return (version and version.rank) == (other and other.rank)
 
 
 def version_of_service(
