@@ -88,11 +88,11 @@ class Schedule:
         local = datetime.fromtimestamp(now, self.zone)
         # The result of :meth:`is_on` changes at a start, at an end, and if summer time begins or
         # ends. To notice the latter soon, an hour is the longest time.
-        ahead = [now + 3600.0]
-        for day in (0, 1):
-            date = local.date() + timedelta(days=day)
-            for at in (self.start, self.end):
-                ahead.append(datetime.combine(date, at, self.zone).timestamp())
+        dates = (local.date(), local.date() + timedelta(days=1))
+        moments = [
+            datetime.combine(day, at, self.zone) for day in dates for at in (self.start, self.end)
+        ]
+        ahead = (now + 3600.0, *(moment.timestamp() for moment in moments))
         return min(moment for moment in ahead if moment > now)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from importlib.util import find_spec
 from itertools import dropwhile
@@ -60,7 +60,20 @@ def check_files(
         if text is None or path.startswith("ledger/"):
             continue
         for document in _documents(path, text, faults):
-            faults += _check_object(path, document, seen)
+            metadata = document.get("metadata") or {}
+            api, kind = str(document.get("apiVersion")), str(document.get("kind"))
+            name = str(metadata.get("name"))
+            cluster = path.split("/")[1].removesuffix(".yaml")
+            identity = (cluster, kind, str(metadata.get("namespace")), name)
+            other = seen.get(identity)
+            if other is not None:
+                where = "twice in this file" if other == path else f"in {other} too"
+                faults.append(fault("metadata.name", f"{kind} {name} is {where}").within(path))
+            seen[identity] = path
+            errors = _kind_validator(api, kind).iter_errors(document) if api in _BUILT_IN else ()
+            for error in errors:
+                place = field_path(tuple(error.instance_path))
+                faults.append(fault(place, error.message).within(path))
     if faults:
         raise InvalidInput(faults)
 
@@ -82,24 +95,6 @@ def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, 
             faults.append(
                 fault("", "has a document that is not a mapping; fix its template").within(path)
             )
-
-
-def _check_object(
-    path: str, document: dict[str, Any], seen: dict[tuple[str, str, str, str], str]
-) -> Iterable[Fault]:
-    metadata = document.get("metadata") or {}
-    api, kind = str(document.get("apiVersion")), str(document.get("kind"))
-    name = str(metadata.get("name"))
-    cluster = path.split("/")[1].removesuffix(".yaml")
-    identity = (cluster, kind, str(metadata.get("namespace")), name)
-    other = seen.get(identity)
-    if other is not None:
-        where = "twice in this file" if other == path else f"in {other} too"
-        yield fault("metadata.name", f"{kind} {name} is {where}").within(path)
-    seen[identity] = path
-    if api in _BUILT_IN:
-        for error in _kind_validator(api, kind).iter_errors(document):
-            yield fault(field_path(tuple(error.instance_path)), error.message).within(path)
 
 
 @lru_cache(maxsize=64)

@@ -216,16 +216,13 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
         return [unique[text] for text in sorted(unique)]
     if parameter.merge in ("max", "min"):
         numbers = [value for value in values if _is_number(value)]
-        if len(numbers) != len(values):
-            odd, claim = next(
-                (value, claim)
-                for value, claim in zip(values, claims, strict=True)
-                if not _is_number(value)
-            )
+        for value, claim in zip(values, claims, strict=True):
+            if _is_number(value):
+                continue
             message = (
-                f"{strict_yaml.short_repr(odd)} for {', '.join(claim.requesters)} is not a number, "
-                f"but the application definition merges the values by {parameter.merge}; give a "
-                "number"
+                f"{strict_yaml.short_repr(value)} for {', '.join(claim.requesters)} is not a "
+                f"number, but the application definition merges the values by {parameter.merge}; "
+                "give a number"
             )
             raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)
