@@ -34,11 +34,7 @@ from demandops.decide.checks import collisions, quotas, version_difference
 from demandops.decide.placement import capacity, relocation
 from demandops.decide.planning import planner
 from demandops.decide.planning.flows import flows, without_idle_deliveries
-from demandops.decide.planning.overrides import (
-    with_kept_claims,
-    without_kept_claims,
-    without_suspended,
-)
+from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.planner import is_bridged
 from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, keys_of_claims
 from demandops.decide.restoration import Restoration
@@ -49,7 +45,14 @@ from demandops.model.demand import demand_goal
 from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Decommission, DemandRequest
 from demandops.model.ledger import claim_file
-from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, changes_on
+from demandops.model.ledger.ledger import (
+    Changes,
+    ClaimChange,
+    Ledger,
+    World,
+    changes_on,
+    claim_changes,
+)
 from demandops.model.ledger.records import Instance, Wait
 from demandops.model.release import ServiceKey, ServiceRelease
 
@@ -301,7 +304,10 @@ def _booked(
     subjects = request.subjects()
     # Claims of the request replace those that overrides kept. Else a kept claim, which nobody
     # demands any longer, would contradict the request.
-    ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
+    ledger = state.ledger
+    for subject in subjects:
+        ledger = ledger.without(ledger.kept_claims(subject))
+    ledger, changes = apply(ledger, request, now)
     if isinstance(request, Decommission):
         ledger, changes = without_idle_deliveries(
             state.ledger, replace(state, ledger=ledger), changes
@@ -314,7 +320,10 @@ def _booked(
     if refusals:
         raise Refused(refusals)
     # overrides may keep what the request releases
-    ledger, changes = with_kept_claims(state.ledger, after, changes, subjects, now)
+    changed = [change.key for change in changes.claims]
+    touched = dict.fromkeys((*changes.subjects(), *subjects))
+    ledger, kept_keys = update_kept_claims(state.ledger, after, touched, now)
+    changes = replace(changes, claims=claim_changes(state.ledger, ledger, [*changed, *kept_keys]))
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
@@ -334,7 +343,9 @@ def _booked(
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    after = replace(state, ledger=planner.without_ended(state, instance, now))
+    kept = state.ledger.kept
+    steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
+    after = replace(state, ledger=replace(state.ledger, kept=kept.replace(instance, steps)))
     changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
     change = changeset.build_changeset(
         state, after, changes, keys, state.evaluate, read, state.plans

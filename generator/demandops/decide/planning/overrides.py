@@ -19,7 +19,7 @@ from demandops.model.demand.claim import (
     requesters_of,
 )
 from demandops.model.demand.demand_request import Demanded
-from demandops.model.ledger.ledger import Changes, Ledger, World, claim_changes
+from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.release import Release, ServiceRelease, claims_of, overridden
 
 # ---- effects on claims: ``deny`` suspends claims, ``keep`` books further claims ----
@@ -175,22 +175,6 @@ def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
         override = suspended_by(claim, world)
         if override is not None:
             yield claim, override
-
-
-def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
-    for subject in subjects:
-        ledger = ledger.without(ledger.kept_claims(subject))
-    return ledger
-
-
-def with_kept_claims(
-    before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
-) -> tuple[Ledger, Changes]:
-    # ``subjects`` are updated even if the booking did not change them.
-    keys = [change.key for change in changes.claims]
-    touched = dict.fromkeys((*changes.subjects(), *subjects))
-    ledger, kept = update_kept_claims(before, after, touched, now)
-    return ledger, replace(changes, claims=claim_changes(before, ledger, [*keys, *kept]))
 
 
 def update_kept_claims(

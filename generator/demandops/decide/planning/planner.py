@@ -328,12 +328,6 @@ def _number(release: ServiceRelease | None) -> int:
     return release.replicas if release and isinstance(release.replicas, int) else 0
 
 
-def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
-    kept = world.ledger.kept
-    steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
-    return replace(world.ledger, kept=kept.replace(instance, steps))
-
-
 # ---- a plan that follows a sequence of ledgers, to verify commits ----
 #
 # The plan records which parts of the ledger were read for each release. Only if one of these parts
