@@ -135,24 +135,20 @@ def preview(
             moved = (f"- {old_path}", f"+ {new_path}")
             change = replace(change, details=(*moved, *change.details))
         elif change.change == "change" and not change.details:
-            facts = _facts(text or "", files.get(new_path, ""))
-            change = replace(change, details=tuple(facts))
+            with suppress(InvalidInput):
+                was, now = list(load_all(text or "")), list(load_all(files.get(new_path, "")))
+                differing = list(leaf_differences(was, now))
+                facts = []
+                for path, *sides in differing[:_MOST_FACTS]:
+                    shown = ("none" if side is ABSENT else short_repr(side) for side in sides)
+                    facts.append(f"{path.removeprefix('[0].')}: {' → '.join(shown)}")
+                if len(differing) > _MOST_FACTS:
+                    facts.append(f"and {len(differing) - _MOST_FACTS} more")
+                change = replace(change, details=tuple(facts))
         releases.append(change)
     releases.sort(key=lambda change: change.order)
     others = tuple(sorted(changed - of_releases))
     return MergePreview(tuple(releases), file_changes, others)
-
-
-def _facts(before: str, after: str) -> Iterator[str]:
-    try:
-        differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
-    except InvalidInput:
-        return
-    for path, old, new in differing[:_MOST_FACTS]:
-        was, now = ("none" if side is ABSENT else short_repr(side) for side in (old, new))
-        yield f"{path.removeprefix('[0].')}: {was} → {now}"
-    if len(differing) > _MOST_FACTS:
-        yield f"and {len(differing) - _MOST_FACTS} more"
 
 
 def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401

@@ -73,11 +73,10 @@ class Detector:
         return len(self._state.seen)
 
     def resume(self, booked: Mapping[Key, Goal], now: float, settle_s: float) -> list[Want]:
-        """Continue the events whose demands were booked before the detector started.
+        """Continue the events whose demands were booked before, perhaps with outlines as goals.
 
-        Call this before the first step, because it forgets what steps have found. ``booked`` has a
-        goal for each event, which may lack everything except the demand's id and requesters. An
-        event that no rule is for any longer wants the end of its demand.
+        Call this before the first step, because it forgets what steps have found. An event that no
+        rule is for any longer wants the end of its demand.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting
@@ -258,11 +257,7 @@ class WantedDemands:
         return self._queue[0][0] if self._queue else inf
 
     def answered(self, sending: Sending, outcome: Outcome, now: float) -> str:
-        """Record the outcome of a goal; return the reason of a failure, for the log.
-
-        The text is empty if the goal succeeded, if the previous attempt failed for the same reason,
-        or if the demand to end or renew is not held any longer.
-        """
+        """Record the outcome of a goal; return the reason of a failure if it is to be logged."""
         entry, text, is_start = self._entries[sending.key], "", sending.purpose == "start"
         entry.is_under_way = False
         is_over = outcome.code == "not-held" and not is_start

@@ -246,9 +246,7 @@ def faults_of_demand(
 ) -> list[Fault]:
     """Return the faults of a rule's demand: of its names, else of its form, else of its ids.
 
-    ``field`` is the path of the demand in the file. ``subjects`` are the names by which the
-    template refers to an event's entities, ``momentary`` those of values that are known only when
-    an event starts.
+    ``momentary`` are the names of values that are known only when an event starts.
     """
     # A ``DeploymentRequest`` is sent again to renew it and with ``shutdown`` to end it. It must be
     # the same then, also after a restart, when momentary values are not known.
@@ -279,11 +277,7 @@ def faults_of_demand(
 
 
 def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
-    """Yield a fault for each id that is missing, that may change, or that two entities would share.
-
-    ``needed`` are names in braces, such as ``{entity}``. They must be in the id of a ``Demand``, or
-    in the requesters of each application and connection of a ``DeploymentRequest``.
-    """
+    """Yield a fault for each id that is missing, may change, or would be that of two events."""
     data: Any = template.data
     if template.action == "demand":
         yield from _missing(data, field, "demand", "requesters")

@@ -32,9 +32,7 @@ class ServiceEntry:
     """One running service and its requesters.
 
     ``inputs`` maps each input role to its topics, and each topic to its requesters. ``version`` is
-    the version of the service's chart. ``application_version`` is the version of the application in
-    ``registry/versions.yaml``, or ``None``. ``versions_asked`` maps each version that a demand
-    names to the requesters of such demands.
+    that of the chart, ``application_version`` that in ``registry/versions.yaml``, or ``None``.
     """
 
     applications: list[str]
@@ -218,11 +216,9 @@ def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class EntryChange:
-    """One service or connection that was added, changed or removed.
+    """A service or connection that was added, changed or removed, and its last requesters.
 
-    ``requesters`` are the requesters after the change. If the entry was removed, they are those
-    before the change. If the entry was changed, ``lost`` has the facts that no longer hold, and
-    ``gained`` has the new facts.
+    If it was changed, ``lost`` has the facts that no longer hold, and ``gained`` the new facts.
     """
 
     kind: Literal["service", "connection"]

@@ -38,10 +38,9 @@ _REFUSING = ("refuse", "separate")
 class Difference:
     """A difference: demands ask for different versions of one application or service.
 
-    ``what`` describes this application or service. ``demanded`` is the version that the new demand
-    asks for. ``others`` is the newest version that the other demands ask for; ``newer`` tells
-    whether ``demanded`` is newer. ``policy`` is the value of ``versions`` in the application
-    definition ``appdef``. If two definitions share the service, it is the stricter of their values.
+    ``others`` is the newest version that the other demands ask for; ``newer`` tells whether
+    ``demanded`` is newer. ``policy`` is the value of ``versions`` in the definition ``appdef``. If
+    two definitions share the service, it is the stricter of their values.
     """
 
     what: str

@@ -176,10 +176,9 @@ class Room:
         )
 
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
-        """Return what an application requests at least of its node, as resource → amount.
+        """Return what an application, or its ``service``, requests at least of its node.
 
-        Services that it shares do not count, nor do services with a node of their own. If
-        ``service`` is not empty, only this service counts.
+        Services that it shares do not count, nor do services with a node of their own.
         """
         subject, world = claims[0].subject, self._world
         # Planning for each node takes long. This amount is the same on all nodes, so it is planned

@@ -75,10 +75,8 @@ def shares(service: Service, app: Application, other: Application) -> bool:
 class Choice:
     """The choice of a node for one application, or for one of its services.
 
-    ``service`` is ``None`` if the node is for the whole application. ``claims`` are the claims that
-    the application would get; the chosen node replaces the node in them. ``suits`` returns whether
-    the demand can be booked with the given application; without it, a node is chosen without this
-    check.
+    ``claims`` are those that the application would get; the chosen node replaces the node in them.
+    ``suits`` returns whether the demand can be booked with the given application.
     """
 
     item: Demanded

@@ -310,9 +310,7 @@ def _needing_field(field: str, path: str) -> str:
 def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
     """Return the request with a connection for each flow that no listed connection brings.
 
-    If a claimed connection carries the flow, the demand claims this connection too. Otherwise the
-    demand gets a derived connection between the two nodes. An application with ``connect: none``
-    gets no connection.
+    It is the claimed connection that carries the flow, or else a derived one.
     """
     first: dict[_Ends, Demanded] = {}
     routes: dict[_Ends, dict[tuple[str, str], Route]] = {}

@@ -358,9 +358,8 @@ class TracedPlan:
     ) -> dict[ReleaseKey, Release | None]:
         """Plan the releases that the changes may affect; the first call plans all releases.
 
-        ``kept`` are the service instances whose kept replicas changed. A release that does not run
-        any longer is ``None``. If this raises ``Refused``, the plan is out of date and must not be
-        used again.
+        A release that does not run any longer is ``None``. If this raises ``Refused``, the plan is
+        out of date and must not be used again.
         """
         # The reads whose result may differ now.
         reads: set[_Read] = {_ALL, *kept}
