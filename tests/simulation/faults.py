@@ -60,7 +60,6 @@ def keep_former_requesters(patch: Patch) -> None:
 
 def let_strangers_change_a_demand(patch: Patch) -> None:
     patch(booking, "refuse_other_owners", lambda *_: None)
-    patch(booking, "refuse_other_owners", lambda *_: None)
 
 
 def release_only_the_first_claim(patch: Patch) -> None:
@@ -142,7 +141,7 @@ def forget_what_is_booked_in_a_domain(patch: Patch) -> None:
     patch(
         admitted_request,
         "_chosen",
-        lambda one, booked, *more: chosen(one, None, *more),
+        lambda one, booked, *more: chosen(one, {}, *more),
     )
 
 

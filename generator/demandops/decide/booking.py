@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 
@@ -11,7 +11,15 @@ from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection
 from demandops.decide.restoration import Restoration, restore
-from demandops.model.demand.claim import Application, Claim, ClaimKey, Term, demand_id, renewed
+from demandops.model.demand.claim import (
+    Application,
+    Claim,
+    ClaimKey,
+    Term,
+    demand_id,
+    renewed,
+    requesters_of,
+)
 from demandops.model.demand.demand_request import (
     Decommission,
     Demanded,
@@ -33,12 +41,10 @@ from demandops.model.ledger.records import RecentShutdown, Wait
 
 
 def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
-    """Return whether the request's demand waits; raise :class:`Refused` if it is of other
-    requesters.
-    """
+    """Return whether the request's demand waits; raise Refused if it is of others."""
     waiting = ledger.waiting.get(request.demand)
     if waiting is not None:
-        _refuse_others(waiting.requesters, request)
+        refuse_other_owners(waiting.requesters, request)
     return waiting is not None
 
 
@@ -59,82 +65,50 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
             hint = f"the requesters of this request hold, for example, {', '.join(demands[:5])}"
         message = f"'{request.demand}' holds nothing; {hint}"
         raise Refused.at("demand", message, code="not-held")
-    refuse_other_owners(held, request)
+    refuse_other_owners(requesters_of(held), request)
     return held
 
 
-def refuse_other_owners(held: Iterable[Claim], request: DemandRequest) -> None:
-    """Raise :class:`Refused` if the claims belong to none of the request's requesters."""
-    _refuse_others({requester for claim in held for requester in claim.requesters}, request)
-
-
-def _refuse_others(owners: Iterable[str], request: DemandRequest) -> None:
-    owners = sorted(owners)
+def refuse_other_owners(owners: Sequence[str], request: DemandRequest) -> None:
     if owners and not set(owners) & set(request.requesters()):
         message = (
-            f"'{request.demand}' is a demand of {', '.join(owners)}; name one of them, or choose "
-            "another demand id"
+            f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; name one of them, or "
+            "choose another demand id"
         )
         raise Refused.at("demand", message, code="not-yours")
 
 
-# ---- conflicts ----
-#
-# Contradictions between a demand and existing claims on the same application or connection.
+# ---- conflicts: a demand contradicts existing claims on the same application or connection ----
 
 
 def conflicts(item: Demanded, ledger: Ledger, *, above: bool = False) -> Iterator[Fault]:
-    """Yield the faults of a demanded application or connection that contradicts claims on it.
-
-    With ``above``, the messages say that ``item`` contradicts an earlier item of the same request.
-    """
-    if isinstance(item.held, Application):
-        yield from _application_conflicts(item, item.held, ledger, above)
-    else:
-        yield from _connection_conflicts(item, item.held, ledger, above)
-
-
-def _contradicts(above: bool) -> str:
-    return f"contradicts {'an item above' if above else 'an existing claim'}"
-
-
-def _held(claim: Claim, above: bool) -> str:
-    holders = ", ".join(claim.requesters)
-    return f"'{claim.held.id}' is {'listed for' if above else 'held by'} {holders}"
-
-
-def _application_conflicts(
-    item: Demanded, app: Application, ledger: Ledger, above: bool
-) -> Iterator[Fault]:
-    # all claims on an application agree about its node and type, so the first speaks for all
-    claim = ledger.first_claim(app.subject)
-    if claim is None:
-        return
-    booked = claim.application
-    wait = "" if above else ", or wait until the application is released"
-    for name, new, current, holding, remedy in (
-        ("node", app.node, booked.node, "on", f"request node '{booked.node}'{wait}"),
-        ("appdef", app.appdef, booked.appdef, "as", "use another application id"),
-    ):
-        if new != current:
-            message = (
-                f"'{new}' {_contradicts(above)}: {_held(claim, above)} {holding} '{current}'; "
-                f"{remedy}"
-            )
-            yield item.fault(name, message, code="conflict")
+    """Yield the faults of an item that contradicts claims, or with ``above`` earlier items."""
+    held = item.held
+    if isinstance(held, Application):
+        # all claims on an application agree about its node and type, so the first speaks for all
+        first = ledger.first_claim(held.subject)
+        if first is None:
             return
-
-
-def _connection_conflicts(
-    item: Demanded, demanded: Connection, ledger: Ledger, above: bool
-) -> Iterator[Fault]:
-    for claim in ledger.connection_claims(demanded.id):
-        booked = claim.connection
+        booked = first.application
+        wait = "" if above else ", or wait until the application is released"
+        for name, new, current, holding, remedy in (
+            ("node", held.node, booked.node, "on", f"request node '{booked.node}'{wait}"),
+            ("appdef", held.appdef, booked.appdef, "as", "use another application id"),
+        ):
+            if new != current:
+                message = (
+                    f"'{new}' {_contradicts(above)}: {_held(first, above)} {holding} '{current}'; "
+                    f"{remedy}"
+                )
+                yield item.fault(name, message, code="conflict")
+                return
+        return
+    for claim in ledger.connection_claims(held.id):
         for name, new, current in (
-            ("type", str(demanded.type), str(booked.type)),
-            ("source", demanded.source, booked.source),
-            ("target", demanded.target, booked.target),
-            ("broker", demanded.broker, booked.broker),
+            ("type", str(held.type), str(claim.connection.type)),
+            ("source", held.source, claim.connection.source),
+            ("target", held.target, claim.connection.target),
+            ("broker", held.broker, claim.connection.broker),
         ):
             # a broker that only one of the two names is no contradiction
             if new == current or (name == "broker" and not (new and current)):
@@ -145,7 +119,16 @@ def _connection_conflicts(
             )
             yield item.fault(name, message, code="conflict")
             return
-        yield from _route_conflicts(item, demanded, claim, above)
+        yield from _route_conflicts(item, held, claim, above)
+
+
+def _contradicts(above: bool) -> str:
+    return f"contradicts {'an item above' if above else 'an existing claim'}"
+
+
+def _held(claim: Claim, above: bool) -> str:
+    holders = ", ".join(claim.requesters)
+    return f"'{claim.held.id}' is {'listed for' if above else 'held by'} {holders}"
 
 
 def _route_conflicts(
@@ -180,7 +163,7 @@ def _route_conflicts(
             yield item.fault(f"{where}.{name}", message, code="conflict")
 
 
-# ---- the booking of one demanded application or connection ----
+# ---- the operations: what each kind of request changes in the ledger ----
 
 
 def book(
@@ -193,10 +176,7 @@ def book(
     *,
     joined: bool = False,
 ) -> Ledger:
-    """Return the ledger with a claim on a demanded application or connection.
-
-    ``current`` is the demand's claim on the same subject so far. A join keeps what it holds.
-    """
+    """Book an item; ``current`` is the demand's claim on the same subject so far."""
     claim = Claim(
         held=item.held.booked(),
         demand=key.demand,
@@ -211,11 +191,8 @@ def book(
     return ledger.replace(key, claim.after_booking(current))
 
 
-# ---- a join: a goal of the reference's action adds to what its demand already holds ----
-
-
 def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger with the request's items added to what is held, and the changes."""
+    # A goal of the reference's action adds to what its demand already holds.
     faults: list[Fault] = []
     start = ledger
     keys: list[ClaimKey] = []
@@ -251,14 +228,11 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)
 
 
-# ---- a put: a demand with an id holds exactly the applications and connections that it lists ----
-
-
 def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger in which the demand holds only what ``request`` lists, and the changes."""
+    # After a put, a demand with an id holds exactly what the put lists.
     start, demand = ledger, request.demand
     held = ledger.claims_of_demand(demand)
-    refuse_other_owners(held, request)
+    refuse_other_owners(requesters_of(held), request)
     waited = (demand,) * is_waiting(ledger, request)
     # the demand's own claims are no contradiction, because a put may move its own applications
     ledger = others = ledger.without(held)
@@ -278,21 +252,15 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
     return ledger.without_waiting(waited), changes
 
 
-# ---- a shutdown takes one hold from each requester that it names, on each topic that it lists ----
-#
-# If several claims hold the topic for the requester, the hold is taken from the first of:
-#
-# 1. the claim with the shutdown's request id and requesters
-# 2. the oldest other claim with this request id
-# 3. the oldest claim with another request id
-#
-# If the shutdown lists no topic of an application or a connection, it takes all holds that the
-# requester has in the first of these claims. A shutdown never takes holds from the claims of a
-# demand that has an id.
-
-
 def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger without the holds that a shutdown lists, and the changes."""
+    """Take one hold from each requester that a shutdown names, on each topic that it lists.
+
+    If several claims hold the topic for the requester, the hold is taken from the claim with the
+    shutdown's request id and requesters, else from the oldest other claim with this request id,
+    else from the oldest claim. If the shutdown lists no topic of an application or a connection, it
+    takes all holds that the requester has in the first of these claims. It never takes holds from
+    the claims of a demand that has an id.
+    """
     record = RecentShutdown.of(request, now)
     repeats = ledger.shutdowns.earlier(record)
     if repeats is not None:
@@ -321,7 +289,24 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
         assert left is not None  # noqa: S101 - the requester's holds are in the claim until now
         ledger = ledger.replace(key, left.without_holds(requester, topics))
     if not taken:
-        raise Refused([_nothing_held(start, request)])
+        similar = [
+            f"{claim.subject} for {', '.join(claim.requesters)} ("
+            + (
+                f"request '{claim.request}')"
+                if claim.joined
+                else f"demand '{claim.demand}', which a shutdown cannot end)"
+            )
+            for subject in request.subjects()
+            for claim in start.claims_on(subject)
+        ] or [
+            f"{claim.subject} for {', '.join(claim.requesters)}"
+            for requester in sorted(request.requesters())
+            for claim in start.claims_of_requester(requester)
+        ]
+        shown = "; ".join(dict.fromkeys(similar[:5])) or "none"
+        message = f"nothing that the shutdown lists is held; similar claims: {shown}"
+        place = request.demanded[0].fault if request.demanded else fault
+        raise Refused([place("id", message, code="not-held")])
     shutdowns, forgotten = ledger.shutdowns.forget(now)
     ledger = replace(ledger, shutdowns=shutdowns.replace(record.digest, record))
     return ledger, Changes(
@@ -334,10 +319,7 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
 def _holds(
     item: Demanded, requester: str, claims: list[Claim]
 ) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
-    """Yield (text, claim, keys) for each topic that a shutdown lists.
-
-    ``claim`` is the first in which the requester holds matching topics, whose keys are ``keys``.
-    """
+    """Yield (text, first claim with matching holds, their keys) for each topic that is listed."""
     subject = item.held.subject
     listed = [words for words, _ in item.held.listed_topics(item.held)]
     # who lists no topic means all of the first claim
@@ -356,33 +338,7 @@ def _holds(
             yield f"{subject}: {words} for {requester}", None, []
 
 
-def _nothing_held(ledger: Ledger, request: Shutdown) -> Fault:
-    def origin(claim: Claim) -> str:
-        if claim.joined:
-            return f"request '{claim.request}'"
-        return f"demand '{claim.demand}', which a shutdown cannot end"
-
-    near = [
-        f"{claim.subject} for {', '.join(claim.requesters)} ({origin(claim)})"
-        for subject in request.subjects()
-        for claim in ledger.claims_on(subject)
-    ] or [
-        f"{claim.subject} for {', '.join(claim.requesters)}"
-        for requester in sorted(request.requesters())
-        for claim in ledger.claims_of_requester(requester)
-    ]
-    shown = "; ".join(dict.fromkeys(near[:5])) or "none"
-    message = f"nothing that the shutdown lists is held; similar claims: {shown}"
-    if not request.demanded:
-        return fault("id", message, code="not-held")
-    return request.demanded[0].fault("id", message, code="not-held")
-
-
-# ---- a release ends a demand that has an id: the demand gives up everything that it holds ----
-
-
 def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
-    """Return the ledger in which a demand holds nothing and does not wait, and the changes."""
     waited = (request.demand,) * is_waiting(ledger, request)
     held = ledger.claims_of_demand(request.demand) if waited else owned_claims(ledger, request)
     after = ledger.without(held).without_waiting(waited)
@@ -390,25 +346,16 @@ def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
     return after, Changes(claims=claims, waiting=waited)
 
 
-# ---- the renewal of the leases of a demand ----
-
-
 def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger with each lease of a demand renewed for its term, and the changes."""
     # a demand that waits has no lease yet, but its client may renew it already
     if is_waiting(ledger, request) and not ledger.claims_of_demand(request.demand):
         return ledger, Changes()
-    start = ledger
-    held = owned_claims(ledger, request)
+    start, held = ledger, owned_claims(ledger, request)
     for claim in held:
-        if claim.lease is None:
-            continue
-        term = Term(claim.lease.seconds, claim.lease.slack)
-        ledger = ledger.replace(claim.key, replace(claim, lease=claim.lease.renewed(term, now)))
+        if claim.lease is not None:
+            term = Term(claim.lease.seconds, claim.lease.slack)
+            ledger = ledger.replace(claim.key, replace(claim, lease=claim.lease.renewed(term, now)))
     return ledger, Changes(claims=claim_changes(start, ledger, [claim.key for claim in held]))
-
-
-# ---- an expiry releases the claims whose lease has ended. The generator requests the expiry ----
 
 
 def expire(ledger: Ledger, request: Expire, now: datetime) -> tuple[Ledger, Changes]:
@@ -418,19 +365,14 @@ def expire(ledger: Ledger, request: Expire, now: datetime) -> tuple[Ledger, Chan
     return after, Changes(claims=claim_changes(ledger, after, [claim.key for claim in ended]))
 
 
-# ---- decommission ----
-#
-# Decommissioning: a node or a requester leaves for good, so claims are released or reduced.
-#
-# If a node is decommissioned, these are released for all requesters: the applications that run on
-# the node, the inputs from it, the deliveries to it, and the connections from or to it. A
-# connection that names the node's broker loses the broker. If a requester is decommissioned, all
-# its claims are released. These include claims that also name other requesters, because the others
-# might never release the claims.
+def decommission(ledger: Ledger, request: Decommission) -> tuple[Ledger, Changes]:
+    """Release or reduce claims, because a node or a requester leaves for good.
 
-
-def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger after a node or requester is decommissioned, and the changes."""
+    If a node is decommissioned, these are released for all requesters: the applications that run on
+    the node, the inputs from it, the deliveries to it, and the connections from or to it. A
+    connection that names the node's broker loses the broker. If a requester is decommissioned, all
+    its claims are released, also those that name others, who might never release them.
+    """
     start, claims, waiting = ledger, dict[str, Claim](), tuple[str, ...]()
     nodes = request.nodes or (request.id,)
     if "node" in request.kinds:
@@ -461,7 +403,6 @@ def decommission(ledger: Ledger, request: Decommission, now: datetime) -> tuple[
 
 
 def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
-    """Return the claims on applications and connections that need a node, in no order."""
     subjects = [Subject(SubjectKind.APPLICATION, id) for id in ledger.applications_at(node)]
     subjects += [Subject(SubjectKind.CONNECTION, id) for id in ledger.connections_needing(node)]
     return [
@@ -472,18 +413,12 @@ def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
     ]
 
 
-# ---- drain ----
-#
-# A drain moves placed applications and services, with their connections, off a drained node.
-#
-# The generator requests the drain. :mod:`.relocation` determines which claims change.
-
-
 @dataclass(frozen=True, slots=True)
 class Drain(DemandRequest):
     """The generator's request to move what it placed on the drained node ``id``.
 
-    ``moved`` and ``stays`` have a text about each application or service that moves or cannot move.
+    :mod:`.relocation` determines which claims change. ``moved`` and ``stays`` have a text about
+    each application or service that moves or cannot move.
     """
 
     # One drain looks only for so many nodes, because demands wait meanwhile. It begins with the
@@ -498,27 +433,11 @@ class Drain(DemandRequest):
     operation = "drain"
 
 
-def drain(ledger: Ledger, request: Drain) -> tuple[Ledger, Changes]:
-    start = ledger
-    for move in request.moves:
-        ledger = ledger.replace(move.key, move.after)
-    return ledger, Changes(claims=claim_changes(start, ledger, [m.key for m in request.moves]))
-
-
-# ---- the one way to change the ledger: :func:`apply` carries out a request ----
-#
-# ``docs/demand.md``, "How a demand is booked", says what each operation means.
-
-
 def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger after an admitted request is carried out, and the changes.
 
-    If the same request is booked already, at most the leases of its claims change. ``now`` is when
-    the request was received, with time zone.
-
-    Raises:
-        Refused: if the request contradicts existing claims or itself, changes a demand of other
-            requesters, releases or renews what is not held, or undoes newer claims unasked.
+    If the same request is booked already, at most the leases of its claims change.
+    ``docs/demand.md``, "How a demand is booked", says what each operation means.
     """
     match request:
         case Join():
@@ -534,7 +453,7 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
         case Expire():
             return expire(ledger, request, now)
         case Decommission():
-            return decommission(ledger, request, now)
+            return decommission(ledger, request)
         case Wait():
             assert request.waiting is not None  # noqa: S101 - the decision sets it
             waiting = ledger.waiting.insert(request.demand, request.waiting)
@@ -542,7 +461,11 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
             changes = Changes(waiting=(request.demand,) * is_new)
             return replace(ledger, waiting=waiting), changes
         case Drain():
-            return drain(ledger, request)
+            after = ledger
+            for move in request.moves:
+                after = after.replace(move.key, move.after)
+            moved = [move.key for move in request.moves]
+            return after, Changes(claims=claim_changes(ledger, after, moved))
         case Restoration():
             return restore(ledger, request, now)
     raise TypeError(f"{type(request).__name__} cannot be applied")

@@ -34,7 +34,6 @@ from demandops.templating.values import Evaluate
 #
 # A file whose text stays the same is not in the changeset, so an unchanged release needs no commit.
 
-
 Change = Literal["start", "change", "stop"]
 
 # the order in which lists of changes show them
@@ -89,20 +88,10 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
 ) -> Changeset:
     """Return the changes in the state repo that follow from a change of the ledger.
 
-    Args:
-        before, after: the world before and after the change, with the same configuration.
-        changes: the differences between both ledgers.
-        keys: the keys of the releases that may differ.
-        evaluate: computes the values of services.
-        read: returns the text of a file of the state repo before the change.
-        plans: releases of ``before`` that the caller has planned already.
-        keeps_late: whether a release whose values take too long to compute keeps its file, instead
-            of OverLimit.
-        checkpoint: called for each file and release; it may raise an exception to end the work.
-
-    Raises:
-        Refused, InvalidInput: if a release cannot be planned or rendered, or if a file would not be
-            valid or would be too large.
+    ``keys`` are those of the releases that may differ, and ``plans`` are releases of ``before``
+    that the caller has planned already. With ``keeps_late``, a release whose values take too long
+    to compute keeps its file, instead of OverLimit. ``checkpoint`` is called for each file and
+    release; it may raise an exception to end the work.
     """
     most = after.config.repo_settings.limits.file_bytes
     files = _ledger_files(after.ledger, changes, checkpoint)
@@ -134,7 +123,10 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
         # the path has the node, so a release that moves to another node leaves a file behind
         if old_path and old_path != new_path and read(old_path) is not None:
             files[old_path] = None
-        blocked += _blocked(old, new) if current is not None else ()
+        is_held = new is not None and new.shaping.held and current is not None
+        if new and is_held and (old and old.facts()) != new.facts():
+            by = " and ".join(each.path for each, effects in new.shaping.by if "hold" in effects)
+            blocked.append(f"{new.name} will not change until the 'hold' of {by} ends")
         if new_path and text != current:
             files[new_path] = text
             shaped |= {override.path for override, _ in new.shaping.by} if new else set()
@@ -187,19 +179,11 @@ def _refuse_large(files: Mapping[str, str | None], most: int, read: FileReader) 
 
 
 def render_all(
-    world: World,
-    evaluate: Evaluate,
-    current: Mapping[str, str],
-    *,
-    keeps_late: bool,
+    world: World, evaluate: Evaluate, current: Mapping[str, str], *, keeps_late: bool
 ) -> dict[str, str]:
     """Return all generated files except those of the ledger, by path.
 
-    ``current`` are the generated files in the state repo. With ``keeps_late``, a release whose
-    values take too long to compute keeps its file.
-
-    Raises:
-        Refused, InvalidInput: if a release cannot be planned or rendered, or if two need one name.
+    With ``keeps_late``, a release whose values take too long to compute keeps its file.
     """
     config, keys = world.config, all_keys(world)
     files = manifests.base_files(config)
@@ -240,12 +224,6 @@ class _Texts:
             raise
 
 
-def _blocked(old: Release | None, new: Release | None) -> Iterator[str]:
-    if new is not None and new.shaping.held and (old and old.facts()) != new.facts():
-        by = " and ".join(each.path for each, effects in new.shaping.by if "hold" in effects)
-        yield f"{new.name} will not change until the 'hold' of {by} ends"
-
-
 def describe_change(old: Release | None, new: Release | None, existed: bool) -> ReleaseChange:
     """Return how a release changes; ``existed`` says that it had a file before."""
     release = new or old
@@ -268,37 +246,27 @@ def _overrides(release: Release | None) -> list[str]:
     return [f"{override.path}: {', '.join(effects)}" for override, effects in by]
 
 
-# ---- checks a new configuration by rendering invented demands, before real demands arrive ----
+# ---- trial demands: a new configuration must render before real demands arrive ----
 
 _NEVER = datetime.fromtimestamp(0, timezone.utc)
 
 
 def trial_releases(config: Config) -> dict[str, list[ServiceRelease]]:
-    """Return the services' releases that a trial demand gives, for each appdef.
-
-    Overrides do not apply. If no node is in an access domain, the map is empty.
-    """
     if not config.domain_of:
         return {}
     plain = replace(config, overrides={})
-    return {
-        name: list(_services(appdef, _trial_node(name, config), plain))
-        for name, appdef in config.appdefs.items()
-    }
+    return {name: list(_trial_services(appdef, plain)) for name, appdef in config.appdefs.items()}
 
 
-def _trial_node(appdef: str, config: Config) -> str:
-    """Return the first node that can run all services of an appdef, else the first of all."""
-    services = config.services.get(appdef, {}).values()
-    nodes = sorted(config.domain_of)
-    # a service that runs once for a cluster has no node in other clusters
-    fitting = (node for node in nodes if all(node in s.runs_at for s in services if s.nodes))
-    return next(fitting, nodes[0])
-
-
-def _services(
-    appdef: ApplicationDefinition, node: str, config: Config, version: str = ""
+def _trial_services(
+    appdef: ApplicationDefinition, config: Config, version: str = ""
 ) -> Iterator[ServiceRelease]:
+    services = config.services.get(appdef.name, {}).values()
+    nodes = sorted(config.domain_of)
+    # A service that runs once for a cluster has no node in other clusters. So this is the first
+    # node that can run all services, else the first of all.
+    fitting = (node for node in nodes if all(node in s.runs_at for s in services if s.nodes))
+    node = next(fitting, nodes[0])
     inputs = {
         role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),) for role in appdef.inputs
     }
@@ -315,7 +283,6 @@ def _services(
 def overridden_releases(
     override: Override, trials: Iterable[ServiceRelease], appdef: str, config: Config
 ) -> Iterator[ServiceRelease]:
-    """Yield the trial releases that an override may select, changed by the override."""
     for release in trials:
         # ``hold`` would keep a file that no trial has
         effects = tuple(e for e in effects_on(release, override, config) if e != "hold")
@@ -331,8 +298,8 @@ def overridden_releases(
 def render_trial_demands(world: World, evaluate: Evaluate) -> None:
     """Render every service of every appdef, with invented claims on a real node.
 
-    A service is rendered for each version that ``registry/versions.yaml`` lists, and with each
-    override that is in effect. If no node is in an access domain, nothing is checked.
+    This renders each version that ``registry/versions.yaml`` lists, and each override in effect. If
+    no node is in an access domain, nothing is checked.
 
     Raises:
         Refused, InvalidInput: if a service cannot be planned or rendered. The error names the
@@ -347,9 +314,7 @@ def render_trial_demands(world: World, evaluate: Evaluate) -> None:
         for appdef, listed in (config.versions.items() if trials else ())
         for version in listed.versions
         if version != listed.default
-        for release in _services(
-            config.appdefs[appdef], _trial_node(appdef, config), plain, version
-        )
+        for release in _trial_services(config.appdefs[appdef], plain, version)
     )
     errors = [
         error

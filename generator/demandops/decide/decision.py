@@ -34,11 +34,7 @@ from demandops.decide.checks import collisions, quotas, version_difference
 from demandops.decide.placement import capacity, relocation
 from demandops.decide.planning import planner
 from demandops.decide.planning.flows import flows, without_idle_deliveries
-from demandops.decide.planning.overrides import (
-    with_kept_claims,
-    without_kept_claims,
-    without_suspended,
-)
+from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.planner import is_bridged
 from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, keys_of_claims
 from demandops.decide.restoration import Restoration
@@ -49,7 +45,14 @@ from demandops.model.demand import demand_goal
 from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Decommission, DemandRequest
 from demandops.model.ledger import claim_file
-from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, changes_on
+from demandops.model.ledger.ledger import (
+    Changes,
+    ClaimChange,
+    Ledger,
+    World,
+    changes_on,
+    claim_changes,
+)
 from demandops.model.ledger.records import Instance, Wait
 from demandops.model.release import ServiceKey, ServiceRelease
 
@@ -123,14 +126,11 @@ def decide(
 ) -> Decision:
     """Return the decision on a goal, or on a request that the generator makes itself.
 
+    Of the generator's own requests, only a :class:`Restoration` is checked against the
+    configuration and its policy.
+
     Args:
-        state: the configuration and ledger to decide on.
-        goal: the goal as plain data (:mod:`.deployment_request_goal`,
-            :mod:`.demand_goal`, :class:`Decommission`), or the generator's own
-            request. Of own requests, only a :class:`Restoration` is checked against the
-            configuration and its policy.
         now: when the demand was received, with time zone.
-        read: returns the current text of a file in the state repo, or ``None``.
         on_stage: called when the demand is admitted and when it is booked, each at most once.
             Later checks may still refuse an admitted demand.
         throttle: called if all other checks of admission find no fault, perhaps twice for one goal.
@@ -146,26 +146,6 @@ def decide(
     """
     if isinstance(goal, DemandRequest):
         return _decided(state, goal, now, read, on_stage)
-    try:
-        return _decide_goal(state, goal, now, read, on_stage, throttle, checkpoint)
-    except OverBudget as spent:
-        raise Refused([_too_large(spent)]) from None
-
-
-def _too_large(spent: OverBudget) -> Fault:
-    return fault("", str(spent), code="too-large")
-
-
-def _decide_goal(
-    state: State,
-    goal: object,
-    now: datetime,
-    read: FileReader,
-    on_stage: Callable[[Stage], None],
-    throttle: Throttle,
-    checkpoint: Checkpoint,
-) -> Decision:
-    """Decide a goal; if it is refused on the nodes chosen first, look for others."""
     throttled, told = list[Fault](), set[Stage]()
 
     # who was throttled must not get another try on other nodes
@@ -181,6 +161,8 @@ def _decide_goal(
     try:
         request = admitted(state, goal, now, noted, checkpoint)
         return _decided(state, request, now, read, once, checkpoint)
+    except OverBudget as spent:
+        raise Refused([_too_large(spent)]) from None
     except Refused as refused:
         if throttled or any(each.code not in _BY_NODE for each in refused.faults):
             raise
@@ -200,6 +182,10 @@ def _decide_goal(
         raise
 
 
+def _too_large(spent: OverBudget) -> Fault:
+    return fault("", str(spent), code="too-large")
+
+
 # The codes of faults that might not occur if other nodes were chosen for the demand
 _BY_NODE = frozenset(
     ("not-allowed", "quota", "denied", "conflict", "unsupported-connection-type", "no-broker")
@@ -213,8 +199,6 @@ MOST_TRIALS = 64
 
 
 class _Trials:
-    """The bookings that are tried, in memory only, while nodes are looked for."""
-
     def __init__(self, state: State, now: datetime, checkpoint: Checkpoint) -> None:
         self._state, self._now, self._checkpoint = state, now, checkpoint
         self._tried = self._items = 0
@@ -278,7 +262,7 @@ def _decided(
         version_difference.differences(request, state, after, changes.claims, rendered.plans)
     )
     refused = [difference.fault for difference in differing if difference.is_refused]
-    grown = _growth(config, rendered)
+    grown = capacity.growth(rendered.former, rendered.plans, config)
     # a drain was tried on its nodes already, and what releases claims makes room
     if request.adds_claims or isinstance(request, Restoration):
         refused = refused or list(capacity.faults(state.usage(), grown, config))
@@ -316,12 +300,14 @@ def _decided(
 def _booked(
     state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
 ) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
-    """Return the state with a request booked, the changes, and the releases that may change."""
     checkpoint()
     subjects = request.subjects()
     # Claims of the request replace those that overrides kept. Else a kept claim, which nobody
     # demands any longer, would contradict the request.
-    ledger, changes = apply(without_kept_claims(state.ledger, subjects), request, now)
+    ledger = state.ledger
+    for subject in subjects:
+        ledger = ledger.without(ledger.kept_claims(subject))
+    ledger, changes = apply(ledger, request, now)
     if isinstance(request, Decommission):
         ledger, changes = without_idle_deliveries(
             state.ledger, replace(state, ledger=ledger), changes
@@ -334,7 +320,10 @@ def _booked(
     if refusals:
         raise Refused(refusals)
     # overrides may keep what the request releases
-    ledger, changes = with_kept_claims(state.ledger, after, changes, subjects, now)
+    changed = [change.key for change in changes.claims]
+    touched = dict.fromkeys((*changes.subjects(), *subjects))
+    ledger, kept_keys = update_kept_claims(state.ledger, after, touched, now)
+    changes = replace(changes, claims=claim_changes(state.ledger, ledger, [*changed, *kept_keys]))
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
@@ -351,34 +340,48 @@ def _booked(
     return after, changes, keys
 
 
-def _growth(config: Config, rendered: changeset.Changeset) -> Mapping[capacity.Need, int]:
-    if not config.limits_capacity:
-        return {}
-    return capacity.growth(rendered.former, rendered.plans, config)
-
-
 def scale_down(
     state: State, instance: Instance, now: datetime, read: FileReader
 ) -> tuple[State, changeset.Changeset]:
-    """Return the state after a step of a service's kept replicas has ended, and its changeset."""
-    after = replace(state, ledger=planner.without_ended(state, instance, now))
+    kept = state.ledger.kept
+    steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
+    after = replace(state, ledger=replace(state.ledger, kept=kept.replace(instance, steps)))
     changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
     change = changeset.build_changeset(
         state, after, changes, keys, state.evaluate, read, state.plans
     )
-    usage = state.usage().plus(_growth(state.config, change))
-    return state.followed_by(after.ledger, change, usage), change
+    grown = capacity.growth(change.former, change.plans, state.config)
+    return state.followed_by(after.ledger, change, state.usage().plus(grown)), change
 
 
-# ---- notes that the requester gets about a decision, in addition to the outcome ----
+# ---- notes for the requester, in addition to the outcome ----
 
 
 def notes_on(
     request: DemandRequest, after: World, changes: Changes, rendered: Changeset
 ) -> Iterator[str]:
-    """Yield notes for the requester of a demand that is booked and rendered, or that waits."""
     yield from admitted_request.notes(request)
-    yield from _connection_warnings(request, after)
+    # a connection that an override denies carries nothing
+    ledger = without_suspended(after).ledger
+    for item in request.demanded if request.adds_claims else ():
+        held = item.held
+        if isinstance(held, Application):
+            for flow in flows(after.config, held):
+                if not ledger.is_carried_to(flow.receiver, flow.target):
+                    yield (
+                        f"application '{held.id}': no connection carries {flow.topic} "
+                        f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
+                    )
+            continue
+        if item.note:
+            yield f"connection '{held.id}' {item.note}"
+        for route in held.topics:
+            if is_bridged(route, *held.nodes, after.config):
+                yield (
+                    f"connection '{held.id}': the initial deployment already carries "
+                    f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
+                    "the inventory), so no client of this connection carries it"
+                )
     yield from warnings.notes(request, after)
     yield from rendered.blocked
     if changes.repeats is not None:
@@ -398,37 +401,12 @@ def notes_on(
             )
 
 
-def _connection_warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    # a connection that an override denies carries nothing
-    ledger = without_suspended(world).ledger
-    for item in request.demanded if request.adds_claims else ():
-        held = item.held
-        if isinstance(held, Application):
-            for flow in flows(world.config, held):
-                if not ledger.is_carried_to(flow.receiver, flow.target):
-                    yield (
-                        f"application '{held.id}': no connection carries {flow.topic} "
-                        f"({flow.name}) of '{flow.sender}' to '{flow.receiver}'"
-                    )
-            continue
-        if item.note:
-            yield f"connection '{held.id}' {item.note}"
-        for route in held.topics:
-            if is_bridged(route, *held.nodes, world.config):
-                yield (
-                    f"connection '{held.id}': the initial deployment already carries "
-                    f"{route.read_topic} between '{held.source}' and '{held.target}' (bridged in "
-                    "the inventory), so no client of this connection carries it"
-                )
-
-
-# ---- claims that a person edits in the ledger: the effect of the edit, and the faults in it ----
+# ---- claims that a person edits in the ledger ----
 
 
 def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
-    """Return the changes to rendered files after a person edited claims on ``subjects``."""
     old = replace(state, ledger=before)
     keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
     # a template that takes too long is no fault of the claim, so its release keeps its file
@@ -441,8 +419,14 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
     """Yield the faults of claims that a person wrote, each located in the claim's file."""
     for change in changes:
         claim = change.after
+        if claim is None:
+            continue
         # an edit that only takes requesters away has the effect of a release, which is allowed
-        if claim is None or _only_reduces(change):
+        if (
+            (old := change.before)
+            and replace(claim, requesters=old.requesters, partial=old.partial) == old
+            and {*claim.requesters} <= {*old.requesters}
+        ):
             continue
         wanted, config = restoration.request_for(claim), after.config
         malformed = list(admission.faults(wanted, config))
@@ -463,11 +447,3 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
             faults += capacity.faults(usage, grown, config)
         for each in faults:
             yield each.within(claim_file.path_of(claim.key))
-
-
-def _only_reduces(change: ClaimChange) -> bool:
-    before, after = change.before, change.after
-    if before is None or after is None:
-        return False
-    as_before = replace(after, requesters=before.requesters, partial=before.partial)
-    return as_before == before and {*after.requesters} <= {*before.requesters}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Collection, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -55,8 +56,6 @@ class FileChange:
 
 @dataclass(frozen=True, slots=True)
 class MergePreview:
-    """The releases that start, change or stop, and the files that change."""
-
     releases: tuple[ReleaseChange, ...]
     files: tuple[FileChange, ...]
     # the paths of the changed files that belong to no release
@@ -64,15 +63,12 @@ class MergePreview:
 
 
 def planned_releases(world: World) -> dict[ReleaseKey, Release]:
-    """Return all releases that can be planned, by key."""
     releases: dict[ReleaseKey, Release] = {}
     for key in all_keys(world):
-        try:
+        with suppress(InvalidInput):
             release = plan(world, key)
-        except InvalidInput:
-            continue
-        if release is not None:
-            releases[key] = release
+            if release is not None:
+                releases[key] = release
     return releases
 
 
@@ -81,9 +77,6 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
 
     A fault's file is the first of these that exists: a file in ``edited`` with a claim that needs
     the release; the file that the fault names; the file of the first claim that needs the release.
-
-    Raises:
-        Refused: if the definition of a claimed application is missing.
     """
     errors: list[tuple[ReleaseKey, InvalidInput]] = []
     for key in all_keys(world):
@@ -104,8 +97,8 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
     for key, failure in errors:
         claims = files.get(key, [])
         edited_claim = next((path for path in claims if path in edited), "")
-        for fault in failure.faults:
-            faults.append(fault.within(edited_claim or fault.file or (claims or [""])[0]))
+        first = next(iter(claims), "")
+        faults += [fault.within(edited_claim or fault.file or first) for fault in failure.faults]
     return list(dict.fromkeys(faults))
 
 
@@ -115,12 +108,7 @@ def preview(
     current: Mapping[str, str],
     files: Mapping[str, str],
 ) -> MergePreview:
-    """Return the releases and the files that a merge changes.
-
-    Args:
-        old, new: the releases before and after the merge.
-        current, files: path → text of the generated files before and after the merge.
-    """
+    """Return what a merge changes; ``current`` and ``files`` are the texts before and after it."""
     file_changes = tuple(
         FileChange(path, current.get(path), files.get(path))
         for path in sorted({*current, *files})
@@ -147,32 +135,24 @@ def preview(
             moved = (f"- {old_path}", f"+ {new_path}")
             change = replace(change, details=(*moved, *change.details))
         elif change.change == "change" and not change.details:
-            facts = _facts(text or "", files.get(new_path, ""))
-            change = replace(change, details=tuple(facts))
+            with suppress(InvalidInput):
+                was, now = list(load_all(text or "")), list(load_all(files.get(new_path, "")))
+                differing = list(leaf_differences(was, now))
+                facts = []
+                for path, *sides in differing[:_MOST_FACTS]:
+                    shown = ("none" if side is ABSENT else short_repr(side) for side in sides)
+                    facts.append(f"{path.removeprefix('[0].')}: {' → '.join(shown)}")
+                if len(differing) > _MOST_FACTS:
+                    facts.append(f"and {len(differing) - _MOST_FACTS} more")
+                change = replace(change, details=tuple(facts))
         releases.append(change)
     releases.sort(key=lambda change: change.order)
     others = tuple(sorted(changed - of_releases))
     return MergePreview(tuple(releases), file_changes, others)
 
 
-def _facts(before: str, after: str) -> Iterator[str]:
-    """Yield texts for the first differences between two manifests, and then a count of the rest."""
-    try:
-        differing = list(leaf_differences(list(load_all(before)), list(load_all(after))))
-    except InvalidInput:
-        return
-    for path, old, new in differing[:_MOST_FACTS]:
-        was, now = ("none" if side is ABSENT else short_repr(side) for side in (old, new))
-        yield f"{path.removeprefix('[0].')}: {was} → {now}"
-    if len(differing) > _MOST_FACTS:
-        yield f"and {len(differing) - _MOST_FACTS} more"
-
-
 def leaf_differences(old: Any, new: Any, path: str = "") -> Iterator[tuple[str, Any, Any]]:  # noqa: ANN401
-    """Yield (path, old, new) for each smallest part that differs between two values.
-
-    A path looks like ``spec.values.image.tag``. A missing value is :data:`ABSENT`.
-    """
+    """Yield (path, old, new) for each smallest part that differs; :data:`ABSENT` if missing."""
     if isinstance(old, dict) and isinstance(new, dict):
         for key in dict.fromkeys([*old, *new]):
             inner = f"{path}.{key}" if path else str(key)

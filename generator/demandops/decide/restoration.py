@@ -36,34 +36,40 @@ class Restoration(DemandRequest):
 
 
 def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
-    """Return the ledger with the claims of the earlier commit, and the changes.
-
-    Raises:
-        Refused: if the restoration drops or changes a claim of the present ledger, and
-            ``drop_newer`` is not set. Claims that overrides keep, and renewals, do not count.
-    """
+    """Restore the claims; raise Refused if newer ones would change without ``drop_newer``."""
     changes = _changes(ledger, request)
     # claims that overrides keep do not count, because they are made again
-    newer = [c for c in changes if c.before is not None and c.before.keeping_override is None]
+    newer = [(c, c.before) for c in changes if c.before and c.before.keeping_override is None]
     if newer and not request.drop_newer:
-        raise Refused(_newer_faults(newer))
+        refusals: list[Fault] = []
+        for change, claim in newer[:_SHOWN]:
+            effect = "drop" if change.after is None else "undo a change of"
+            message = (
+                f"would {effect} the claim of {', '.join(claim.requesters)} on {claim.subject}, "
+                f"booked {claim.booked:%Y-%m-%d %H:%M:%S} UTC (request '{claim.request}')"
+            )
+            refusals.append(fault("", message, code="newer").within(path_of(claim.key)))
+        more = len(newer) - _SHOWN
+        what = f"{more} more {'claims' if more > 1 else 'claim'} would change; " if more > 0 else ""
+        message = (
+            f"{what}claims that were booked or changed since are undone only with --drop-newer"
+        )
+        raise Refused([*refusals, fault("", message, code="newer")])
     start = ledger
     for change in changes:
-        claim = change.after
-        if claim and claim.lease:  # from now on, because its old end may have passed
-            lease = Term(claim.lease.seconds, claim.lease.slack).lease_from(now)
-            claim = replace(claim, lease=lease)
-        ledger = ledger.replace(change.key, claim)
+        restored = change.after
+        if restored and restored.lease:  # from now on, because its old end may have passed
+            lease = Term(restored.lease.seconds, restored.lease.slack).lease_from(now)
+            restored = replace(restored, lease=lease)
+        ledger = ledger.replace(change.key, restored)
     booked = {who for change in changes if change.after for who in change.after.requesters}
     shutdowns, forgotten = start.shutdowns.forget(now, booked)
     return replace(ledger, shutdowns=shutdowns), Changes(
-        claims=claim_changes(start, ledger, [change.key for change in changes]),
-        shutdowns=forgotten,
+        claims=claim_changes(start, ledger, [change.key for change in changes]), shutdowns=forgotten
     )
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
-    """Return the changes of claims that restore the earlier commit, sorted by path."""
     earlier = {claim.key: claim for claim in request.claims}
     changes = [ClaimChange(claim, None) for claim in ledger if claim.key not in earlier]
     for key, claim in earlier.items():
@@ -79,24 +85,7 @@ def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
     return sorted(changes, key=lambda change: path_of(change.key))
 
 
-def _newer_faults(changes: list[ClaimChange]) -> Iterator[Fault]:
-    for change in changes[:_SHOWN]:
-        claim = change.before
-        assert claim is not None  # noqa: S101 - the caller passes existing claims
-        effect = "drop" if change.after is None else "undo a change of"
-        message = (
-            f"would {effect} the claim of {', '.join(claim.requesters)} on {claim.subject}, booked "
-            f"{claim.booked:%Y-%m-%d %H:%M:%S} UTC (request '{claim.request}')"
-        )
-        yield fault("", message, code="newer").within(path_of(claim.key))
-    more = len(changes) - _SHOWN
-    others = f"{more} more {'claims' if more > 1 else 'claim'} would change; " if more > 0 else ""
-    message = f"{others}claims that were booked or changed since are undone only with --drop-newer"
-    yield fault("", message, code="newer")
-
-
 def faults(request: Restoration, world: World) -> Iterator[Fault]:
-    """Yield a fault for each claim to restore that the current configuration does not allow."""
     for change in _changes(world.ledger, request):
         after = change.after
         if after is None or after.keeping_override is not None:

@@ -23,8 +23,6 @@ from demandops.templating.values import Evaluate
 
 @dataclass(frozen=True, slots=True)
 class State(World):
-    """The world at one commit, and what computes the values of services in it."""
-
     evaluate: Evaluate
     # The releases that earlier decisions on this configuration planned, so that a decision need not
     # plan them again to tell what it changes. A copy made with ``replace`` has none; followed_by
@@ -37,20 +35,17 @@ class State(World):
 
     def usage(self) -> Usage:
         """Return how much the services request; the first call counts all services."""
-        if self._usage is None:
-            object.__setattr__(self, "_usage", capacity.whole_usage(self))
-        assert self._usage is not None  # noqa: S101 - set above
-        return self._usage
+        usage = capacity.whole_usage(self) if self._usage is None else self._usage
+        object.__setattr__(self, "_usage", usage)
+        return usage
 
     def names(self) -> Names:
         """Return the names of all releases; only the first call looks at all releases."""
-        if self._names is None:
-            object.__setattr__(self, "_names", collisions.all_names(self))
-        assert self._names is not None  # noqa: S101 - set above
-        return self._names
+        names = collisions.all_names(self) if self._names is None else self._names
+        object.__setattr__(self, "_names", names)
+        return names
 
     def followed_by(self, ledger: Ledger, rendered: changeset.Changeset, usage: Usage) -> State:
-        """Return the state after a decision, with the releases that the decision planned."""
         plans = self.plans
         for key, release in rendered.plans.items():
             plans = plans.insert(key, release) if release else plans.discard(key)
@@ -61,7 +56,6 @@ class State(World):
         return state
 
     def with_ledger(self, ledger: Ledger, changes: Iterable[ClaimChange]) -> State:
-        """Return the state with another ledger, whose claims differ by ``changes``."""
         state, changes = replace(self, ledger=ledger), tuple(changes)
         with suppress(Refused):  # if a definition is gone; then ``names`` looks at all releases
             state._follow_names(self, affected_keys(self, state, changes))
@@ -72,26 +66,17 @@ class State(World):
         return state
 
     def _follow_names(self, before: State, keys: Collection[ReleaseKey]) -> None:
-        """Take over the names of ``before``, from which only the releases at ``keys`` differ."""
         if before._names is not None:
             names = collisions.followed(before._names, before, self, keys)
             object.__setattr__(self, "_names", names)
 
 
 def rendered_files(
-    state: State,
-    current: Mapping[str, str] = MappingProxyType({}),
-    *,
-    keeps_late: bool = False,
+    state: State, current: Mapping[str, str] = MappingProxyType({}), *, keeps_late: bool = False
 ) -> dict[str, str]:
-    """Return every generated file that the state requires, as a map from path to text.
-
-    ``current`` are the current generated files, which ``hold`` overrides and ``keeps_late`` may
-    preserve (:func:`.changeset.render_all`).
-    """
+    # ``hold`` overrides and ``keeps_late`` may keep files of ``current``.
     return changeset.render_all(state, state.evaluate, current, keeps_late=keeps_late)
 
 
 def try_configuration(state: State) -> None:
-    """Raise Refused or InvalidInput if an appdef or an override in effect does not work."""
     changeset.render_trial_demands(state, state.evaluate)

@@ -48,7 +48,6 @@ class MissingInput:
 
 
 def missing_inputs(world: World) -> list[MissingInput]:
-    """Return the topics that do not arrive, sorted by application."""
     # Suspended claims need no topics, and suspended connections carry none.
     active = without_suspended(world)
     missing = {
@@ -88,9 +87,7 @@ def _reasons(app: Application, active: World) -> Iterator[str]:
             )
 
 
-# ---- misspelled topics ----
-#
-# Warnings about misspelled topics, which differ by a letter from a known topic of the node.
+# ---- misspelled topics, which differ by a letter from a known topic of the node ----
 #
 # Nobody lists all topics of a node, so an unknown topic alone is no mistake. Names that differ in a
 # digit, or in a letter of a short word (``lidar_fl``, ``lidar_fr``), count as two correct topics.
@@ -115,8 +112,6 @@ def misspelled_topic_warnings(world: World) -> Iterator[Fault]:
 
 
 class _KnownTopics:
-    """The known topics of each node: those of the inventory, and the booked usual topics."""
-
     def __init__(self, world: World) -> None:
         self._world = world
         self._listed: dict[str, frozenset[str]] = {}
@@ -124,7 +119,6 @@ class _KnownTopics:
         self._told: set[tuple[str, str]] = set()
 
     def notes_on(self, held: Application | Connection) -> Iterator[str]:
-        """Yield a warning for each misspelled topic that an earlier call did not report."""
         if isinstance(held, Application):
             what = f"application '{held.id}'"
             for role, input in held.all_inputs():
@@ -160,10 +154,9 @@ class _KnownTopics:
 
 
 def _is_misspelling(topic: str, other: str) -> bool:
-    """Return whether ``topic`` may be a misspelling of ``other``.
+    """Return whether ``topic`` differs from ``other`` by one mistake in a word of some length.
 
-    It is one if both differ only in a word of at least four letters. In this word, ``topic`` must
-    have one wrong, missing or additional letter, or two letters in the wrong order.
+    The mistake is one wrong, missing or additional letter, or two letters in the wrong order.
     """
     if abs(len(topic) - len(other)) > 1:
         return False
@@ -178,8 +171,9 @@ def _is_misspelling(topic: str, other: str) -> bool:
     return len(word[0]) >= _SHORT and word.start() <= start
 
 
-def _common(one: str, other: str) -> int:
-    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], zip(one, other, strict=False)))
+def _common(text: str, other: str) -> int:
+    pairs = zip(text, other, strict=False)
+    return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
 
 
 # ---- warnings about patterns of the policy that match nothing now ----
@@ -213,9 +207,7 @@ def unmatched_pattern_warnings(config: Config) -> Iterator[Fault]:
                     yield fault(f"access domain '{name}', {field}", message).within(file)
 
 
-# ---- policy warnings ----
-#
-# Warnings about access domains, nodes and requirements on nodes, which ``demandops check`` shows.
+# ---- warnings about access domains, nodes and requirements, which ``demandops check`` shows ----
 #
 # Some warnings report what the cluster will refuse or what demands cannot get. Others report an
 # access that the cluster cannot prevent. None is a fault, because the check may not know enough.
@@ -292,7 +284,6 @@ def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:
 
 
 def _open_by_host_network(config: Config) -> Iterator[Fault]:
-    """Yield warnings of access domains that are open because pods use the host's network."""
     nodes = [
         (config.domain_of[node.id].name, node)
         for node in config.nodes.values()
@@ -327,11 +318,7 @@ def _open_by_host_network(config: Config) -> Iterator[Fault]:
 
 
 def _kinds_of_charts(config: Config) -> Iterator[Fault]:
-    """Yield a warning for each Kubernetes kind in a chart that an access domain does not allow.
-
-    There is also a warning for each kind that cannot be read from the chart's files. Only charts
-    and libraries in the state repo are read.
-    """
+    """Yield a warning for each kind that a domain refuses, or that cannot be read."""
     # A chart may run in an access domain that has no rules, or in which a rule allows an
     # application that uses the chart.
     domains_of: dict[str, list[AccessDomain]] = {}

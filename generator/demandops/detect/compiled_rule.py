@@ -35,7 +35,6 @@ class CompiledRule:
         return self._names is None or self._names.match(entity) is not None
 
     def takes(self, who: Who) -> bool:
-        """Return whether the rule is for ``who``, an entity of one of the rule's sources."""
         return self.is_for(who[1])
 
     def entities_of(self, subjects: tuple[str, ...]) -> tuple[Who, ...]:
@@ -43,11 +42,6 @@ class CompiledRule:
         return tuple(zip((*self.sources, *self.sources), subjects, strict=False))
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        """Return the current facts of an event.
-
-        ``seen`` has the last observation of each of the event's entities. ``count`` is how many
-        entities the rule counts.
-        """
         raise NotImplementedError
 
     def _named(self, subjects: tuple[str, ...]) -> dict[str, str | float]:
@@ -116,15 +110,15 @@ class PairRule(CompiledRule):
         # The patterns of the rule limit only the entities of the first source.
         return who[0] != self._first or self.is_for(who[1])
 
-    def key(self, one: Who, other: Who) -> Key:
+    def key(self, who: Who, other: Who) -> Key:
         # A pair is one event, in whatever order its entities report.
         if self._first == self._second:
-            return self.name, (min(one[1], other[1]), max(one[1], other[1]))
-        return self.name, (one[1], other[1]) if one[0] == self._first else (other[1], one[1])
+            return self.name, (min(who[1], other[1]), max(who[1], other[1]))
+        return self.name, (who[1], other[1]) if who[0] == self._first else (other[1], who[1])
 
     def facts(self, subjects: tuple[str, ...], seen: Seen, count: int) -> Facts:
-        one, other = (seen[who] for who in self.entities_of(subjects))
-        (x, y), away = one.position or (0.0, 0.0), distance(one, other)
+        last, other = (seen[who] for who in self.entities_of(subjects))
+        (x, y), away = last.position or (0.0, 0.0), distance(last, other)
         text = f"{subjects[0]} and {subjects[1]} are {away:.1f} m apart"
         return Facts({**self._named(subjects), "x": x, "y": y, "distance": away}, text)
 
@@ -141,10 +135,7 @@ class PairRule(CompiledRule):
         before: Observation | None,
         after: Observation | None,
     ) -> None:
-        """Move an entity in ``cells`` from the square where it was to the square where it is now.
-
-        An entity without an observation or without a position is in no square.
-        """
+        # An entity without an observation or without a position is in no square.
         left, entered = self._cell(before), self._cell(after)
         if left == entered:
             return
@@ -169,9 +160,9 @@ class PairRule(CompiledRule):
                         yield source, entity
 
 
-def distance(one: Observation, other: Observation) -> float:
-    assert one.position is not None and other.position is not None  # noqa: S101 - rules need them
-    return hypot(one.position[0] - other.position[0], one.position[1] - other.position[1])
+def distance(last: Observation, other: Observation) -> float:
+    assert last.position is not None and other.position is not None  # noqa: S101 - rules need them
+    return hypot(last.position[0] - other.position[0], last.position[1] - other.position[1])
 
 
 def compiled(rule: Rule) -> CompiledRule:

@@ -19,7 +19,6 @@ from demandops.model.config.inventory import Position
 
 # ---- areas of the map: a point or a polygon, and how far a position is from it ----
 
-
 # x and y in metres, in the map frame of the positions.
 Point = tuple[float, float]
 
@@ -43,24 +42,22 @@ class Area:
         edges = zip(self.corners, (*self.corners[1:], self.corners[0]), strict=True)
         nearest, inside = math.inf, False
         for (x1, y1), (x2, y2) in edges:
-            nearest = min(nearest, _to_edge(x, y, x1, y1, x2, y2))
+            along_x, along_y = x2 - x1, y2 - y1
+            length = along_x * along_x + along_y * along_y
+            share = ((x - x1) * along_x + (y - y1) * along_y) / length if length else 0.0
+            share = min(1.0, max(0.0, share))
+            to_edge = math.hypot(x - x1 - share * along_x, y - y1 - share * along_y)
+            nearest = min(nearest, to_edge)
             # each edge that a ray to the right crosses swaps inside and outside
             if (y1 > y) != (y2 > y) and x < x1 + (y - y1) / (y2 - y1) * (x2 - x1):
                 inside = not inside
         return 0.0 if inside else nearest
 
 
-def _to_edge(x: float, y: float, x1: float, y1: float, x2: float, y2: float) -> float:
-    along_x, along_y = x2 - x1, y2 - y1
-    length = along_x * along_x + along_y * along_y
-    share = ((x - x1) * along_x + (y - y1) * along_y) / length if length else 0.0
-    share = min(1.0, max(0.0, share))
-    return math.hypot(x - x1 - share * along_x, y - y1 - share * along_y)
-
-
 # ---- schedules: the days and hours at which a rule's demand is wanted ----
 
-DAYS = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+Day = Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"]
+DAYS: tuple[Day, ...] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +74,6 @@ class Schedule:
     zone: tzinfo
 
     def is_on(self, now: float) -> bool:
-        """Return whether ``now``, in seconds since 1970 UTC, is in the span of hours."""
         local = datetime.fromtimestamp(now, self.zone)
         clock, today = local.time(), local.weekday()
         if self.start < self.end:
@@ -92,17 +88,15 @@ class Schedule:
         local = datetime.fromtimestamp(now, self.zone)
         # The result of :meth:`is_on` changes at a start, at an end, and if summer time begins or
         # ends. To notice the latter soon, an hour is the longest time.
-        ahead = [now + 3600.0]
-        for day in (0, 1):
-            date = local.date() + timedelta(days=day)
-            for at in (self.start, self.end):
-                ahead.append(datetime.combine(date, at, self.zone).timestamp())
+        dates = (local.date(), local.date() + timedelta(days=1))
+        moments = [
+            datetime.combine(day, at, self.zone) for day in dates for at in (self.start, self.end)
+        ]
+        ahead = (now + 3600.0, *(moment.timestamp() for moment in moments))
         return min(moment for moment in ahead if moment > now)
 
 
-# ---- topic pattern ----
-#
-# Patterns of topics, such as ``/vehicles/{entity}/pose``: ``{entity}`` stands for any entity.
+# ---- patterns of topics, such as ``/vehicles/{entity}/pose`` ----
 
 ENTITY = "{entity}"
 _PART = r"(?P<entity>[A-Za-z0-9_]+)"
@@ -116,10 +110,7 @@ def topic_pattern_problem(pattern: str) -> str:
 
 
 def entity_in(pattern: str, topic: str) -> str | None:
-    """Return the entity that ``topic`` names; ``None`` if ``topic`` does not match ``pattern``.
-
-    If the topic matches and the pattern has no ``{entity}``, the result is an empty text.
-    """
+    """Return the entity that ``topic`` names, ``""`` if none, ``None`` if it does not match."""
     before, entity, after = pattern.partition(ENTITY)
     if not entity:
         return "" if topic == pattern else None
@@ -279,10 +270,7 @@ def _zone(text: str) -> ZoneInfo:
 class Hours(CamelModel):
     """A condition that holds from one time of day to another, on certain days of the week."""
 
-    days: Annotated[
-        tuple[Literal["mon", "tue", "wed", "thu", "fri", "sat", "sun"], ...],
-        Field(strict=False, min_length=1),
-    ] = ("mon", "tue", "wed", "thu", "fri", "sat", "sun")
+    days: Annotated[tuple[Day, ...], Field(strict=False, min_length=1)] = DAYS
     start: Annotated[str, readable_by(_clock)]
     stop: Annotated[str, readable_by(_clock)]
     zone: Annotated[str, readable_by(_zone)] = "UTC"

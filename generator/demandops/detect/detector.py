@@ -17,10 +17,7 @@ from demandops.model.config.base_model import seconds_of
 
 
 def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, Goal]:
-    """Return each event whose demand is booked or waits for room, with a goal that can end it.
-
-    ``bookkeeping`` has the form that ``demandops bookkeeping --output json`` prints.
-    """
+    """Return each booked or waiting event, with a goal that can end its demand."""
     demands = []
     for id, entry in bookkeeping.get("demands", {}).items():
         own_id = id if entry["action"] == "Demand" else ""
@@ -40,10 +37,9 @@ def booked_events(file: RuleFile, bookkeeping: Mapping[str, Any]) -> dict[Key, G
     return goals
 
 
-# ---- the detector without ROS: it turns observations into the goals that its rules want ----
+# ---- the detector holds the rules in effect and the engine's state ----
 #
-# The detector holds the rules in effect and the engine's state. The caller reads files and clocks,
-# and sends the goals.
+# The caller reads files and clocks, and sends the goals.
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,26 +70,19 @@ class Detector:
 
     @property
     def entities(self) -> int:
-        """How many entities have been seen and do not count as gone."""
         return len(self._state.seen)
 
     def resume(self, booked: Mapping[Key, Goal], now: float, settle_s: float) -> list[Want]:
-        """Continue the events whose demands were booked before the detector started.
+        """Continue the events whose demands were booked before, perhaps with outlines as goals.
 
-        Call this before the first step, because it forgets what steps have found. ``booked`` has a
-        goal for each event, which may lack everything except the demand's id and requesters. The
-        events' entities count as gone if they stay unseen for ``settle_s`` seconds, or for the
-        timeout of their source if that is longer.
-
-        Return what each event wants: its demand or, if no rule is for the event any longer, the end
-        of its demand.
+        Call this before the first step, because it forgets what steps have found. An event that no
+        rule is for any longer wants the end of its demand.
         """
         self._state = self._engine.start(now, booked, settle_s)
         lasting = self._state.lasting
         return [self._want(key, goal if key in lasting else None) for key, goal in booked.items()]
 
     def step(self, observations: Iterable[Observation], now: float) -> list[tuple[Event, Want]]:
-        """Return the events that start or stop by now, each with what it wants."""
         self._state, events = self._engine.step(self._state, observations, now)
         wants = []
         for event in events:
@@ -107,7 +96,7 @@ class Detector:
         return wants
 
     def set_clock(self, seconds: float) -> None:
-        """Shift all recorded times, because the clock was set forward by ``seconds``, or back."""
+        # The clock was set forward by ``seconds``, or back, so all recorded times move with it.
         self._state = self._state.shifted(seconds)
 
     def replace_rules(self, file: RuleFile, now: float, settle_s: float) -> list[Want]:
@@ -147,9 +136,8 @@ class Detector:
 
 # ---- which demands are wanted, which are held, and which goal to send next ----
 #
-# This module sends nothing: the caller sends what :meth:`WantedDemands.next` returns and reports
-# the outcome. Each event has at most one goal under way. If an event ends before its demand was
-# sent, nothing is sent for it.
+# The caller sends what :meth:`WantedDemands.next` returns and reports the outcome. Each event has
+# at most one goal under way. If an event ends before its demand was sent, nothing is sent for it.
 
 Purpose = Literal["start", "renew", "end"]
 
@@ -175,10 +163,7 @@ class Sending:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """The answer to a goal.
-
-    ``code`` is empty if the goal succeeded. ``lease_s`` is 0 without a lease.
-    """
+    """The answer to a goal: ``code`` is empty if it succeeded, ``lease_s`` 0 without a lease."""
 
     code: str = ""
     message: str = ""
@@ -187,11 +172,7 @@ class Outcome:
 
 @dataclass(slots=True)
 class _Entry:
-    """The demand of one event: what is wanted, and what is held.
-
-    ``held`` is the goal that the node has booked. ``is_sure`` is false if it is not certain that
-    the node has booked it.
-    """
+    """One event's demand; ``held`` is booked, for certain only if ``is_sure``."""
 
     wanted: Goal | None = None
     held: Goal | None = None
@@ -204,7 +185,6 @@ class _Entry:
     refusal: str = ""
 
     def next(self, now: float) -> tuple[Purpose, Goal] | None:
-        """Return the goal to send at ``now`` and its purpose, or ``None``."""
         wanted, held = self.wanted, self.held
         if self.is_under_way or now < self.not_before:
             return None
@@ -223,10 +203,7 @@ class _Entry:
         return ("renew", wanted.renewed()) if now >= self.renew_at else None
 
     def due(self) -> float:
-        """Return the time from which :meth:`next` may have a goal to send.
-
-        It is infinite while a goal is under way, and if nothing remains to be sent.
-        """
+        """Return the time from which :meth:`next` may have a goal; infinite if nothing remains."""
         if self.is_under_way:
             return inf
         is_steady = self.wanted is not None and self.wanted == self.held and self.is_sure
@@ -247,10 +224,7 @@ class WantedDemands:
         self._enqueue(want.key, entry)
 
     def hold(self, key: Key, goal: Goal) -> None:
-        """Record that a demand was booked before the detector started.
-
-        The caller then calls :meth:`want` for the same event.
-        """
+        """Record a demand that was booked before; the caller then wants it or its end."""
         entry = self._entries.setdefault(key, _Entry())
         # Nobody knows how much time its lease has left, so it is renewed at once.
         entry.held, entry.renew_at = goal, -inf
@@ -258,10 +232,7 @@ class WantedDemands:
         self._enqueue(key, entry)
 
     def next(self, now: float) -> Sending | None:
-        """Return a goal to send now, or ``None`` if there is none.
-
-        The goal counts as under way until :meth:`answered` is called for it.
-        """
+        """Return a goal to send now; it is under way until :meth:`answered` is called for it."""
         while self._queue and self._queue[0][0] <= now:
             _, _, key = heappop(self._queue)
             entry = self._entries.get(key)
@@ -282,18 +253,11 @@ class WantedDemands:
         return goal.action != "demand" or self._owners.setdefault(goal.id, key) == key
 
     def next_at(self) -> float:
-        """Return the time at which to call :meth:`next` again; infinite if nothing is to be sent.
-
-        A call of :meth:`want`, :meth:`hold` or :meth:`answered` may make that time earlier.
-        """
+        """Return when to call :meth:`next` again, unless another call here comes first."""
         return self._queue[0][0] if self._queue else inf
 
     def answered(self, sending: Sending, outcome: Outcome, now: float) -> str:
-        """Record the outcome of a goal; return the reason of a failure, for the log.
-
-        The text is empty if the goal succeeded, if the previous attempt failed for the same reason,
-        or if the demand to end or renew is not held any longer.
-        """
+        """Record the outcome of a goal; return the reason of a failure if it is to be logged."""
         entry, text, is_start = self._entries[sending.key], "", sending.purpose == "start"
         entry.is_under_way = False
         is_over = outcome.code == "not-held" and not is_start
@@ -333,7 +297,6 @@ class WantedDemands:
         return sum(entry.wanted != entry.held or not entry.is_sure for entry in entries)
 
     def refusals(self) -> Iterator[tuple[Key, str]]:
-        """Yield the events whose last goal failed, and why."""
         for key, entry in self._entries.items():
             if entry.refusal:
                 yield key, entry.refusal

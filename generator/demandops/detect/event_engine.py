@@ -8,7 +8,7 @@ from dataclasses import replace
 from functools import partial
 from math import floor, inf
 from statistics import median
-from typing import TYPE_CHECKING, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from demandops.detect.compiled_rule import (
     AreaRule,
@@ -24,9 +24,6 @@ from demandops.detect.observations import Event, Key, Observation, Phase, State,
 from demandops.detect.rule_file import RuleFile
 from demandops.model.config.base_model import seconds_of
 
-if TYPE_CHECKING:
-    pass  # DROPPED
-
 # ---- an index of areas by position, so that an entity is compared only with those near it ----
 
 Item = TypeVar("Item")
@@ -40,7 +37,7 @@ class AreaGrid(Generic[Item]):
     """Items with areas, indexed by the squares of the map that each area and its margin touch."""
 
     def __init__(self, items: Iterable[tuple[Item, Area, float]]) -> None:
-        """Build the index of (item, area, margin around the area in metres)."""
+        # (item, area, margin around the area in metres)
         boxes: list[tuple[Item, tuple[float, float, float, float]]] = []
         for item, area, around in items:
             low_x, low_y, high_x, high_y = area.bounds
@@ -62,7 +59,7 @@ class AreaGrid(Generic[Item]):
         self._cells = {cell: (*large, *inside) for cell, inside in cells.items()}
 
     def at(self, x: float, y: float) -> Sequence[Item]:
-        """Return a superset of the items whose area or margin contains a position."""
+        # a superset of the items whose area or margin contains the position
         return self._cells.get((floor(x / self._size), floor(y / self._size)), self._large)
 
 
@@ -103,9 +100,9 @@ class EventEngine:
     def start(self, now: float, held: Iterable[Key] = (), settle_s: float = 0.0) -> State:
         """Return the state with which the engine starts.
 
-        ``held`` are the events whose demands are already booked. Events that no rule is for are
-        left out. Their entities count as gone if they stay unseen for ``settle_s`` seconds, or for
-        the timeout of their source if that is longer.
+        ``held`` are the events whose demands are already booked. Their entities count as gone if
+        they stay unseen for ``settle_s`` seconds, or for the timeout of their source if that is
+        longer.
         """
         keys, settle = tuple(held), settle_s
         # A count is complete only when each of its entities had the time to report.
@@ -136,19 +133,10 @@ class EventEngine:
         return step.result(), tuple(step.events)
 
 
-# ---- engine step ----
-#
-# One step of the engine, which collects the events that observations and passing time cause.
-#
-# A step changes a copy of the state, not the state itself.
-
-_NONE: frozenset[Key] = frozenset()
-_NO_RULES: frozenset[str] = frozenset()
+# ---- one step of the engine, which changes a copy of the state ----
 
 
 class EngineStep:
-    """The work of one step: call its methods, then take ``events`` and :meth:`result`."""
-
     def __init__(self, engine: EventEngine, state: State) -> None:
         # The copies cost little: one step takes many observations, and the values in the mappings
         # are immutable, so they are not copied.
@@ -176,10 +164,7 @@ class EngineStep:
         )
 
     def resume(self, key: Key, settle_s: float) -> None:
-        """Continue an event that started before a restart, and wait for its entities.
-
-        An event that no rule is for is ignored.
-        """
+        # An event that started before a restart; one that no rule is for is ignored.
         rule = self._engine.rules.get(key[0])
         if rule is None or len(rule.subjects) != len(key[1]):
             return
@@ -194,7 +179,6 @@ class EngineStep:
     # ---- time ----
 
     def pass_time(self, until: float) -> None:
-        """Advance the time to ``until``, and apply all changes that are due by then."""
         while until >= self._due:
             self._due = inf
             # In the order of their times, so a long silence gives the same events as short ones.
@@ -207,7 +191,6 @@ class EngineStep:
         self._now = max(self._now, until)
 
     def _all_due(self) -> Iterator[tuple[float, Callable[[], None]]]:
-        """Yield (when, action) for each change that passing time alone may cause."""
         for key, phase in self._phases.items():
             if not phase.lasts:
                 at = phase.since + self._engine.rules[key[0]].dwell
@@ -220,7 +203,7 @@ class EngineStep:
         for who, last in self._seen.items():
             yield last.at + timeouts[last.source], partial(self._lose_silent, who, last)
         for who, until in self._awaited.items():
-            yield until, partial(self._give_up, who)
+            yield until, partial(self._lose_awaited, who)
 
     def _end_dwell(self, key: Key, phase: Phase) -> None:
         # An action before this one may have ended the phase, or begun another.
@@ -243,16 +226,15 @@ class EngineStep:
         if self._seen.get(who) is last:
             self._lose(who, f"{who[1]} has been silent for {self._engine.timeouts[who[0]]:g} s")
 
-    def _give_up(self, who: Who) -> None:
+    def _lose_awaited(self, who: Who) -> None:
         if self._awaited.pop(who, None) is not None:
             self._lose(who, f"{who[1]} has not been seen since the start")
 
     def _lose(self, who: Who, why: str) -> None:
-        """Forget an entity, and end all events that it takes part in."""
         last = self._seen.pop(who, None)
-        for key in sorted(self._engaged.get(who, _NONE)):
+        for key in sorted(self._engaged.get(who, ())):
             self._leave(key, self._engine.rules[key[0]], why)
-        for name in sorted(self._counted.pop(who, _NO_RULES)):
+        for name in sorted(self._counted.pop(who, ())):
             self._count(name, -1)
         for pair in self._engine.pairs[who[0]]:
             if pair.takes(who):
@@ -294,11 +276,11 @@ class EngineStep:
             elif away <= rule.start:
                 counted.add(rule.name)
         # The index does not yield the areas that the entity has left, so their events end here.
-        for key in sorted(self._engaged.get(who, _NONE)):
+        for key in sorted(self._engaged.get(who, ())):
             left = self._engine.rules[key[0]]
             if isinstance(left, AreaRule) and key[0] not in compared:
                 self._latch(key, left, False, True)
-        before = self._counted.get(who, _NO_RULES)
+        before = self._counted.get(who, frozenset())
         if counted != before:
             self._counted[who] = frozenset(counted)
             for name in sorted(counted ^ before):
@@ -312,7 +294,7 @@ class EngineStep:
             self._latch(key, rule, away <= rule.start, away > rule.stop)
         # The squares around do not have the partners that are far away, so their events end here. A
         # partner that is still awaited after a restart has no position yet.
-        for key in sorted(self._engaged.get(who, _NONE)):
+        for key in sorted(self._engaged.get(who, ())):
             is_left = key[0] == rule.name and key not in compared
             if is_left and all(entity in self._seen for entity in rule.entities_of(key[1])):
                 self._latch(key, rule, False, True)
@@ -349,7 +331,7 @@ class EngineStep:
     def _enter(self, key: Key, rule: CompiledRule, phase: Phase) -> None:
         self._phases[key] = phase
         for who in rule.entities_of(key[1]):
-            self._engaged[who] = self._engaged.get(who, _NONE) | {key}
+            self._engaged[who] = self._engaged.get(who, frozenset()) | {key}
 
     def _leave(self, key: Key, rule: CompiledRule, why: str) -> None:
         phase = self._phases.pop(key)

@@ -13,7 +13,6 @@ from demandops.detect.rule_file import RuleFile, is_entity
 
 # ---- the engine's state between two steps: who was seen where, which events have not ended ----
 
-
 # The identity of an event: its rule, and the entities that it is about.
 Key: TypeAlias = tuple[str, tuple[str, ...]]
 
@@ -41,10 +40,7 @@ class Observation(NamedTuple):
 
 
 class Event(NamedTuple):
-    """An event that starts or ends: from now on its demand is wanted, or no longer wanted.
-
-    ``values`` are for the rule's template. ``why`` explains to people what has happened.
-    """
+    """A demand is wanted from now on, or no longer; ``why`` is for people."""
 
     rule: str
     subjects: tuple[str, ...]
@@ -59,10 +55,7 @@ class Event(NamedTuple):
 
 
 class Phase(NamedTuple):
-    """The dwell time before an event, or the event itself if it ``lasts``.
-
-    ``since`` is the time at which the phase began.
-    """
+    """The dwell time before an event, or the event itself if it ``lasts``."""
 
     since: float
     lasts: bool
@@ -147,14 +140,7 @@ class MessageReader:
         self._fields = {field: _getter(field) for field in sorted(fields)}
 
     def observation(self, message: Any, entity: str, at: float) -> Observation:  # noqa: ANN401
-        """Return what a message, which arrived at the time ``at``, reports.
-
-        ``entity`` is the entity that the topic names; it is empty if a field of the message does.
-
-        Raises:
-            Unreadable: if a field is missing, a number is missing or not finite, a position is too
-                far from the origin, or the entity's name has characters that are not allowed.
-        """
+        """Return what a message reports; ``entity`` is from the topic, empty if a field has it."""
         if self._entity:
             entity = str(self._entity(message)).strip("/")
             if not is_entity(entity):

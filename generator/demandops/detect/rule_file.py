@@ -42,7 +42,6 @@ from demandops.model.demand import demand_goal, deployment_request_goal
 # A text that is only a name in braces becomes the value itself, for example a number for ``{x}``.
 # ``{{`` and ``}}`` stand for single braces. A template has no expressions, attributes or formats.
 
-
 # The values of the names in a template.
 Values = Mapping[str, str | float]
 
@@ -56,11 +55,7 @@ def is_entity(name: str) -> bool:
 
 
 def filled(template: Any, values: Values) -> Any:  # noqa: ANN401 - plain data
-    """Return a copy of a template in which values replace the names in braces.
-
-    Raises:
-        KeyError: if a name has no value; :func:`faults` reports such names.
-    """
+    """Return the template with values for names in braces; raise KeyError for a name without."""
     # The template is parsed already, so a value cannot change the structure of the demand.
     if isinstance(template, str):
         alone = _TOKEN.fullmatch(template)
@@ -94,10 +89,7 @@ def names(text: str) -> set[str]:
 
 
 def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: ANN401
-    """Return a fault for each name in braces that ``known`` lacks, and for each stray brace.
-
-    A brace is stray if it is neither doubled nor part of a pair around a name.
-    """
+    """Return a fault for each unknown name in braces, and for each single brace."""
     problems = []
     for path, text in texts(template, field):
         for token in _TOKEN.finditer(text):
@@ -111,11 +103,7 @@ def faults(template: Any, field: str, known: set[str]) -> list[Fault]:  # noqa: 
 
 
 def candidates(template: str, text: str) -> Mapping[str, str]:
-    """Return entities whose names turn the template into ``text``, by the names in braces.
-
-    If several combinations of entities give this text, the result is one of them. The result is
-    empty if none does, or if the template has no names in braces.
-    """
+    """Return entities that turn the template into ``text``, by name; empty if none do."""
     seen: set[str] = set()
     pattern, end = "", 0
     for token in _TOKEN.finditer(template):
@@ -130,12 +118,14 @@ def candidates(template: str, text: str) -> Mapping[str, str]:
     return matched.groupdict() if matched else {}
 
 
-# ---- what a rule demands: a template for goals of one of the two actions ----
+# ---- what a rule demands: a template for goals that start, renew and end a demand ----
 #
-# The template makes the goals that start, renew and end a demand. It also recognizes which demands
-# in the bookkeeping the rule has made, so that a restart of the detector changes nothing.
+# The template also recognizes which demands in the bookkeeping the rule has made, so that a restart
+# of the detector changes nothing.
 
 Action = Literal["demand", "deployment_request"]
+# What a goal of ``Demand`` also has in a file.
+_HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,7 +135,6 @@ class Goal:
 
     @property
     def id(self) -> str:
-        """The id by which people know the goal: the demand's, or the request's."""
         return str(self.data["demand" if self.action == "demand" else "id"])
 
     @property
@@ -154,35 +143,31 @@ class Goal:
 
     @property
     def action_name(self) -> str:
-        """The action's type in ROS: ``Demand`` or ``DeploymentRequest``."""
         return "Demand" if self.action == "demand" else "DeploymentRequest"
 
     @property
     def document(self) -> Mapping[str, Any]:
         """The goal in the form that a file for ``demandops request`` has."""
-        head = {"apiVersion": API_VERSION, "kind": "Demand"} if self.action == "demand" else {}
-        return {**head, **self.data}
+        return {**_HEAD, **self.data} if self.action == "demand" else self.data
 
     def ended(self) -> Goal:
         if self.action == "deployment_request":
             return Goal(self.action, {**self.data, "shutdown": True})
-        kept = {name: self.data[name] for name in ("demand", "requesters")}
-        return Goal(self.action, {**kept, "operation": "release"})
+        return Goal(self.action, {**_identity(self.data), "operation": "release"})
 
     def renewed(self) -> Goal:
         if self.action == "deployment_request":
             return self  # the same request again renews the leases of its claims
-        kept = {name: self.data[name] for name in ("demand", "requesters")}
-        return Goal(self.action, {**kept, "operation": "renew"})
+        return Goal(self.action, {**_identity(self.data), "operation": "renew"})
+
+
+def _identity(data: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: data[name] for name in ("demand", "requesters")}
 
 
 @dataclass(frozen=True, slots=True)
 class BookedDemand:
-    """A demand that the bookkeeping lists.
-
-    ``demand`` is the demand's id. It is empty for a demand by ``DeploymentRequest``, of which
-    ``request`` is the id.
-    """
+    """A demand in the bookkeeping; without an id, ``request`` is of a DeploymentRequest."""
 
     demand: str
     request: str
@@ -201,25 +186,16 @@ class RuleDemand:
         return {name for _, text in texts(self.data, "") for name in names(text)}
 
     def outline(self, values: Values) -> Goal:
-        """Return the goal that starts the demand, if ``values`` has all names of the template.
-
-        If ``values`` lacks a name, the template must be that of a ``Demand``. The goal then has
-        only the demand's id and its requesters, which suffice to end the demand.
-        """
+        """Return a goal that suffices to end the demand, and starts it if no value is missing."""
         if self.names() <= set(values):
             return self.goal(values)
-        kept = {name: self.data[name] for name in ("demand", "requesters")}
-        return Goal(self.action, filled(kept, values))
+        # Only the template of a ``Demand`` may have names whose values become unknown.
+        return Goal(self.action, filled(_identity(self.data), values))
 
     def subjects_of(
         self, held: BookedDemand, subjects: tuple[str, ...], rule: str
     ) -> Values | None:
-        """Return the entities of the event for which the rule made a booked demand.
-
-        ``subjects`` are the names by which the template refers to the event's entities. ``rule`` is
-        the name of the rule. Return ``None`` if the rule makes no demand with this id and these
-        requesters.
-        """
+        """Return the entities of the event for which the rule made a booked demand, or ``None``."""
         named = {*requesters_in(self.action, self.data)}
         is_own, held_id = self.action == "demand", held.demand or held.request
         if len(held.requesters) > len(named) or is_own != bool(held.demand):
@@ -250,9 +226,8 @@ def requesters_in(action: Action, data: Mapping[str, Any]) -> Iterator[str]:
         yield from connection.get("requester_ids", ())
 
 
-# ---- checks what a rule demands: the names in the template, the demand's form and its ids ----
+# ---- the checks of what a rule demands: the template's names, the demand's form and ids ----
 
-_HEAD = {"apiVersion": API_VERSION, "kind": "Demand"}
 # Values of the right types, with which the form of a demand is checked before any event.
 _SAMPLE: Values = {
     "rule": "rule",
@@ -271,9 +246,7 @@ def faults_of_demand(
 ) -> list[Fault]:
     """Return the faults of a rule's demand: of its names, else of its form, else of its ids.
 
-    ``field`` is the path of the demand in the file. ``subjects`` are the names by which the
-    template refers to an event's entities, ``momentary`` those of values that are known only when
-    an event starts.
+    ``momentary`` are the names of values that are known only when an event starts.
     """
     # A ``DeploymentRequest`` is sent again to renew it and with ``shutdown`` to end it. It must be
     # the same then, also after a restart, when momentary values are not known.
@@ -304,11 +277,7 @@ def faults_of_demand(
 
 
 def _faults_of_ids(template: RuleDemand, field: str, needed: set[str]) -> Iterator[Fault]:
-    """Yield a fault for each id that is missing, that may change, or that two entities would share.
-
-    ``needed`` are names in braces, such as ``{entity}``. They must be in the id of a ``Demand``, or
-    in the requesters of each application and connection of a ``DeploymentRequest``.
-    """
+    """Yield a fault for each id that is missing, may change, or would be that of two events."""
     data: Any = template.data
     if template.action == "demand":
         yield from _missing(data, field, "demand", "requesters")
@@ -346,7 +315,7 @@ def _missing(data: Any, field: str, *needed: str) -> Iterator[Fault]:  # noqa: A
             yield fault(f"{field}.{name}", "is missing; add it")
 
 
-# ---- the file of rules for the event detector, and the checks across its parts ----
+# ---- the file of rules, and the checks across its parts ----
 #
 # :func:`read` reports many faults of a file together, each with its line and field. But the parts
 # are compared only if the fields are valid, and a demand's form is checked only if its names are
@@ -469,7 +438,6 @@ class Rule(CamelModel):
         return RuleDemand("deployment_request", self.deployment_request or {})
 
     def is_for(self, *entities: str) -> bool:
-        """Return whether the rule is for an event about these entities."""
         # The patterns of a rule for pairs from two sources limit only the entity of the first.
         limited = entities[:1] if self.together and self.together.other else entities
         return all(matches(entity, self.entities) for entity in limited)
@@ -484,12 +452,6 @@ class RuleFile(FileModel):
 
 
 def read(text: str, file: str) -> RuleFile:
-    """Return the rules in the text of a file.
-
-    Raises:
-        InvalidInput: with the faults that were found together, each with its line. When they are
-            mended, further ones may appear.
-    """
     with located_in(text):
         rules = parse_file(RuleFile, text, file)
         if faults := list(_faults(rules)):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from functools import lru_cache
 from typing import Any
 
@@ -24,13 +24,12 @@ from demandops.templating import engine
 #
 # Other programs rely on these paths. There is one folder for each access domain of each cluster.
 
-
 CLUSTERS_ROOT = "clusters"
 BOOTSTRAP_ROOT = "bootstrap"
 
 
 def domain_folder(cluster: str, domain: AccessDomain) -> str:
-    """Return the folder of an access domain in a cluster. A controller applies the whole folder."""
+    # A controller applies the whole folder.
     return f"{CLUSTERS_ROOT}/{cluster}/{domain.name}"
 
 
@@ -55,52 +54,10 @@ def domains_in_use(config: Config) -> list[tuple[str, AccessDomain]]:
 
 
 def domains_by_cluster(config: Config) -> dict[str, list[AccessDomain]]:
-    """Return the access domains that have nodes in a cluster, for each cluster that has any."""
     domains: dict[str, list[AccessDomain]] = {}
     for cluster, domain in domains_in_use(config):
         domains.setdefault(cluster, []).append(domain)
     return domains
-
-
-# ---- the digest of a bootstrap file, which shows which version of the file a cluster has ----
-#
-# A person applies the file, so the cluster may have an older version of it. The object that applies
-# an access domain's folder has the digest of the applied file as an annotation. ``demandops
-# status`` compares this digest with that of the file in the state repo. The functions here are
-# pure.
-
-ANNOTATION = "demandops/bootstrap"
-_LENGTH = 16
-
-
-def with_digest(render: Callable[[str], str]) -> str:
-    """Return the text of a bootstrap file that contains its own digest.
-
-    ``render`` returns the text with a given digest. The digest covers neither itself nor comments.
-    """
-    return render(_digest(render("")))
-
-
-@lru_cache(maxsize=256)  # most changes of a configuration leave the bootstrap files as they are
-def _digest(text: str) -> str:
-    objects = json.dumps(list(strict_yaml.load_all(text)), sort_keys=True)
-    return hashlib.sha256(objects.encode()).hexdigest()[:_LENGTH]
-
-
-def digest_of(item: Mapping[str, Any]) -> str:
-    """Return the digest in an object's annotations; empty if there is none."""
-    annotations = (item.get("metadata") or {}).get("annotations") or {}
-    return str(annotations.get(ANNOTATION, ""))
-
-
-@lru_cache(maxsize=1024)  # the web page asks for the same files repeatedly
-def digest_in(text: str) -> str:
-    """Return the digest in the text of a bootstrap file; empty if there is none."""
-    try:
-        items = list(strict_yaml.load_all(text))
-    except InvalidInput:
-        return ""
-    return next(filter(None, (digest_of(item) for item in items if isinstance(item, dict))), "")
 
 
 # ---- the rule by which a cluster lets pods of an access domain run only on the domain's nodes ----
@@ -114,10 +71,7 @@ _SELECTOR = "variables.selector"
 
 
 def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
-    """Return the expression that is true if a pod's selector has all labels of a node's selector.
-
-    Only nodes of the domain count.
-    """
+    """Return the expression that is true for the selectors of the domain's nodes."""
     by_label: dict[str, set[str]] = {}
     selectors: set[tuple[tuple[str, str], ...]] = set()
     for node in config.nodes.values():
@@ -143,7 +97,7 @@ def node_rule(cluster: str, domain: AccessDomain, config: Config) -> str:
 
 
 def expression_of(pattern: str) -> str:
-    """Return a pattern of the policy as a regular expression of RE2, without ``^`` and ``$``."""
+    # a pattern of the policy as a regular expression of RE2
     return "".join({"*": ".*", "?": "."}.get(char, re.escape(char)) for char in pattern)
 
 
@@ -153,6 +107,57 @@ def _has(label: str, test: str) -> str:
 
 def _text(value: str) -> str:
     return json.dumps(value, ensure_ascii=False)  # a JSON string is also a CEL string
+
+
+# ---- the digest of a bootstrap file, which shows which version of the file a cluster has ----
+#
+# A person applies the file, so the cluster may have an older version of it. The object that applies
+# an access domain's folder has the digest of the applied file as an annotation. ``demandops
+# status`` compares this digest with that of the file in the state repo.
+
+ANNOTATION = "demandops/bootstrap"
+_LENGTH = 16
+
+
+def _bootstrap(
+    template: str, cluster: str, domains: list[AccessDomain], config: Config, **more: object
+) -> str:
+    """Return the text of a bootstrap file that contains its own digest."""
+
+    def render(digest: str) -> str:
+        return engine.text(
+            template,
+            digest=digest,
+            cluster=cluster,
+            domains=domains,
+            node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
+            folders={domain.name: domain_folder(cluster, domain) for domain in domains},
+            repository=config.repo_settings,
+            branch=MAIN_BRANCH,
+            **more,
+        )
+
+    return render(_digest(render("")))  # the digest covers neither itself nor comments
+
+
+@lru_cache(maxsize=256)  # most changes of a configuration leave the bootstrap files as they are
+def _digest(text: str) -> str:
+    objects = json.dumps(list(strict_yaml.load_all(text)), sort_keys=True)
+    return hashlib.sha256(objects.encode()).hexdigest()[:_LENGTH]
+
+
+def digest_of(item: Mapping[str, Any]) -> str:
+    annotations = (item.get("metadata") or {}).get("annotations") or {}
+    return str(annotations.get(ANNOTATION, ""))
+
+
+@lru_cache(maxsize=1024)  # the web page asks for the same files repeatedly
+def digest_in(text: str) -> str:
+    try:
+        items = list(strict_yaml.load_all(text))
+    except InvalidInput:
+        return ""
+    return next(filter(None, (digest_of(item) for item in items if isinstance(item, dict))), "")
 
 
 # ---- manifests for Flux: a HelmRelease for each service, and the chart sources of each domain ----
@@ -174,16 +179,15 @@ def flux_manifests(release: ServiceRelease, values: Mapping[str, Any]) -> str:
 
 
 def chart_object(name: str, chart: ChartSource) -> str:
-    """Return the name of the OCIRepository or HelmChart that fetches this version of a chart."""
+    # the OCIRepository or HelmChart that fetches this version of a chart
     return f"{name}-{chart.version}".lower()
 
 
 def flux_base_files(config: Config) -> dict[str, str]:
-    """Return the files that do not depend on demands, by path."""
     # without the URL of the repo, there is nothing that a bootstrap file could make Flux follow
     flux = config.repo_settings.flux
     files = {
-        bootstrap_path(cluster): _flux_bootstrap(cluster, domains, config)
+        bootstrap_path(cluster): _bootstrap("flux/bootstrap.yaml.j2", cluster, domains, config)
         for cluster, domains in domains_by_cluster(config).items()
         if flux is not None and flux.url is not None
     }
@@ -206,24 +210,7 @@ def flux_base_files(config: Config) -> dict[str, str]:
     return files
 
 
-def _flux_bootstrap(cluster: str, domains: list[AccessDomain], config: Config) -> str:
-    return with_digest(
-        lambda digest: engine.text(
-            "flux/bootstrap.yaml.j2",
-            digest=digest,
-            cluster=cluster,
-            domains=domains,
-            node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
-            folders={domain.name: domain_folder(cluster, domain) for domain in domains},
-            repository=config.repo_settings,
-            branch=MAIN_BRANCH,
-        )
-    )
-
-
-# ---- argocd ----
-#
-# Manifests for Argo CD: an Application for each service and for each access domain's folder.
+# ---- manifests for Argo CD: an Application for each service and for each domain's folder ----
 #
 # The fields are those of argoproj.io/v1alpha1 in Argo CD 3.2. Each cluster has its own Argo CD. The
 # Applications of services are in the access domain's namespace. If they were in Argo CD's own
@@ -234,7 +221,7 @@ IN_CLUSTER = "https://kubernetes.default.svc"
 
 
 def project_of(domain: AccessDomain, repository: RepoSettings) -> str:
-    """Return the name of a domain's AppProject, and of the Application of the domain's folder."""
+    # the domain's AppProject, and the Application of the domain's folder
     return f"{repository.source}-{domain.name}"
 
 
@@ -254,19 +241,6 @@ def argocd_manifests(
 
 
 def argocd_base_files(config: Config) -> dict[str, str]:
-    """Return the bootstrap files and a placeholder for each access domain of a cluster, by path."""
-    files = {
-        bootstrap_path(cluster): _argocd_bootstrap(cluster, domains, config)
-        for cluster, domains in domains_by_cluster(config).items()
-    }
-    for cluster, domain in domains_in_use(config):
-        files[f"{domain_folder(cluster, domain)}/_domain.yaml"] = engine.text(
-            "argocd/domain.yaml.j2", cluster=cluster, domain=domain
-        )
-    return files
-
-
-def _argocd_bootstrap(cluster: str, domains: list[AccessDomain], config: Config) -> str:
     section = config.repo_settings.argocd
     assert section is not None  # noqa: S101 - required when gitops is "argocd"
     # Applications may fetch only from these: the state repo and the charts' repositories
@@ -274,18 +248,20 @@ def _argocd_bootstrap(cluster: str, domains: list[AccessDomain], config: Config)
         source.oci or source.http for chart in config.charts.values() for source in chart.sources()
     }
     urls = [section.url, *sorted(url for url in charts if url and url != section.url)]
-    return with_digest(
-        lambda digest: engine.text(
+    files = {
+        bootstrap_path(cluster): _bootstrap(
             "argocd/bootstrap.yaml.j2",
-            digest=digest,
-            cluster=cluster,
-            domains=domains,
-            node_rules={domain.name: node_rule(cluster, domain, config) for domain in domains},
-            folders={domain.name: domain_folder(cluster, domain) for domain in domains},
+            cluster,
+            domains,
+            config,
             projects={domain.name: project_of(domain, config.repo_settings) for domain in domains},
             urls=urls,
-            repository=config.repo_settings,
-            branch=MAIN_BRANCH,
             server=IN_CLUSTER,
         )
-    )
+        for cluster, domains in domains_by_cluster(config).items()
+    }
+    for cluster, domain in domains_in_use(config):
+        files[f"{domain_folder(cluster, domain)}/_domain.yaml"] = engine.text(
+            "argocd/domain.yaml.j2", cluster=cluster, domain=domain
+        )
+    return files

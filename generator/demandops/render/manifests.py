@@ -29,10 +29,7 @@ from demandops.templating.values import Evaluate, ValuesTask
 def values_of(release: ServiceRelease, config: Config, evaluate: Evaluate) -> dict[str, Any]:
     """Return the Helm values of a service, with the patches of overrides merged in.
 
-    Raises:
-        InvalidInput: if the template fails, the values do not match the chart's schema, the schema
-            is not valid, or an override sets the replicas of an autoscaled service to 0. The error
-            names the template, the schema or the override.
+    InvalidInput names the template, the schema or the override at fault.
     """
     template = config.values_template(release.service)
     if release.autoscaler and release.autoscaler.max == 0:
@@ -175,12 +172,7 @@ def _validator(schema: Path) -> Any:  # noqa: ANN401
 
 
 def render(release: Release, config: Config, evaluate: Evaluate) -> str:
-    """Return the manifests of a release as the text of one file.
-
-    Raises:
-        Refused: if the registry has no image for a communication client.
-        InvalidInput: if the values of a service or the configuration of a client are not valid.
-    """
+    """Return the manifests of a release as text; raise Refused or InvalidInput if not possible."""
     if not isinstance(release, ServiceRelease):
         return render_connection(release, config)
     values = values_of(release, config, evaluate)
@@ -190,7 +182,6 @@ def render(release: Release, config: Config, evaluate: Evaluate) -> str:
 
 
 def base_files(config: Config) -> dict[str, str]:
-    """Return the files that exist even without demands, by path."""
     # Each access domain of a cluster has a placeholder file, because Git keeps no empty folder.
     # Without the folder, Flux and Argo CD would fail instead of removing what is not demanded.
     if config.repo_settings.gitops == "argocd":

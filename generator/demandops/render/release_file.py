@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import lru_cache
 from importlib.util import find_spec
 from itertools import dropwhile
@@ -29,7 +29,6 @@ from demandops.templating.values import Evaluate
 # a folder that the generator owns. No two objects of a cluster may have the same kind, namespace
 # and name.
 
-
 # whose schemas check the objects of built-in kinds
 KUBERNETES_VERSION = "1.36.0"
 
@@ -50,12 +49,7 @@ _API = re.compile(r"^apiVersion: (\S+)$", re.MULTILINE)
 def check_files(
     files: Mapping[str, str | None], checkpoint: Callable[[], None] = lambda: None
 ) -> None:
-    """Check files that are about to be committed. A file with the text ``None`` is removed.
-
-    Raises:
-        InvalidInput: if a file is not valid, or if an object of a cluster appears twice. The cause
-            is a mistake in DemandOps or in a template, not in a demand.
-    """
+    """Raise InvalidInput for a mistake in DemandOps or a template; ``None`` removes a file."""
     faults: list[Fault] = []
     seen: dict[tuple[str, str, str, str], str] = {}
     for path, text in sorted(files.items()):
@@ -66,13 +60,25 @@ def check_files(
         if text is None or path.startswith("ledger/"):
             continue
         for document in _documents(path, text, faults):
-            faults += _check_object(path, document, seen)
+            metadata = document.get("metadata") or {}
+            api, kind = str(document.get("apiVersion")), str(document.get("kind"))
+            name = str(metadata.get("name"))
+            cluster = path.split("/")[1].removesuffix(".yaml")
+            identity = (cluster, kind, str(metadata.get("namespace")), name)
+            other = seen.get(identity)
+            if other is not None:
+                where = "twice in this file" if other == path else f"in {other} too"
+                faults.append(fault("metadata.name", f"{kind} {name} is {where}").within(path))
+            seen[identity] = path
+            errors = _kind_validator(api, kind).iter_errors(document) if api in _BUILT_IN else ()
+            for error in errors:
+                place = field_path(tuple(error.instance_path))
+                faults.append(fault(place, error.message).within(path))
     if faults:
         raise InvalidInput(faults)
 
 
 def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, Any]]:
-    """Yield a file's valid documents, and append the faults of the others to ``faults``."""
     for part in text.split("\n---\n"):
         # The spec of a document for Flux or Argo CD is not parsed, because nothing reads it here. A
         # template of the program writes it, and Helm values were checked when they were computed.
@@ -89,24 +95,6 @@ def _documents(path: str, text: str, faults: list[Fault]) -> Iterator[dict[str, 
             faults.append(
                 fault("", "has a document that is not a mapping; fix its template").within(path)
             )
-
-
-def _check_object(
-    path: str, document: dict[str, Any], seen: dict[tuple[str, str, str, str], str]
-) -> Iterable[Fault]:
-    metadata = document.get("metadata") or {}
-    api, kind = str(document.get("apiVersion")), str(document.get("kind"))
-    name = str(metadata.get("name"))
-    cluster = path.split("/")[1].removesuffix(".yaml")
-    identity = (cluster, kind, str(metadata.get("namespace")), name)
-    other = seen.get(identity)
-    if other is not None:
-        where = "twice in this file" if other == path else f"in {other} too"
-        yield fault("metadata.name", f"{kind} {name} is {where}").within(path)
-    seen[identity] = path
-    if api in _BUILT_IN:
-        for error in _kind_validator(api, kind).iter_errors(document):
-            yield fault(field_path(tuple(error.instance_path)), error.message).within(path)
 
 
 @lru_cache(maxsize=64)
@@ -144,7 +132,6 @@ _CHART = re.compile(rf"{CLUSTERS_ROOT}/[^/]+/[^/]+/_charts/[^/]+\.yaml")
 
 
 def release_text(release: Release, config: Config, evaluate: Evaluate, current: str | None) -> str:
-    """Return the text of a release's file, whose text in the state repo is ``current``."""
     shaping = release.shaping
     if not shaping.held:
         comments = [override_comment(override, effects) for override, effects in shaping.by]
@@ -178,10 +165,7 @@ def override_comment(override: Override, effects: tuple[str, ...]) -> str:
 def kept_charts(
     files: Mapping[str, str], current: Mapping[str, str], world: World
 ) -> dict[str, str]:
-    """Return, by path, the chart sources that stay because a held release may still use them.
-
-    ``files`` are the new generated files, and ``current`` are those in the state repo.
-    """
+    """Return the chart sources in ``current`` that stay for releases that are held."""
     if not any(override.hold for override in world.overrides):
         return {}
     # not that of a chart in a folder of the state repo: it would fetch the folder's newest version

@@ -21,6 +21,7 @@ from demandops.model.ledger.records import in_turn
 from demandops.model.release import ServiceRelease, claims_of
 from demandops.views import explanations
 
+# those that the plain data lacks if they are empty
 _LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
 # Topic → the requesters of the topic, sorted.
 _Requesters: TypeAlias = dict[str, list[str]]
@@ -31,9 +32,7 @@ class ServiceEntry:
     """One running service and its requesters.
 
     ``inputs`` maps each input role to its topics, and each topic to its requesters. ``version`` is
-    the version of the service's chart. ``application_version`` is the version of the application in
-    ``registry/versions.yaml``, or ``None``. ``versions_asked`` maps each version that a demand
-    names to the requesters of such demands.
+    that of the chart, ``application_version`` that in ``registry/versions.yaml``, or ``None``.
     """
 
     applications: list[str]
@@ -51,8 +50,6 @@ class ServiceEntry:
 
 @dataclass(frozen=True, slots=True)
 class ConnectionEntry:
-    """One connection and its requesters, also those of each source topic."""
-
     type: str
     source: str
     target: str
@@ -99,9 +96,8 @@ class DemandEntry:
 class Bookkeeping:
     """The whole view: services by release name, connections and demands by id, all sorted.
 
-    ``demands`` includes demands whose claims are suspended. No service or connection counts the
-    claims in ``suspended``. ``nodes`` are the nodes that declare a capacity. ``waiting`` is in the
-    order in which the generator tries to book.
+    ``demands`` includes demands whose claims are suspended, but no service or connection counts
+    these claims. ``nodes`` declare a capacity. ``waiting`` is in the order of the tries to book.
     """
 
     services: dict[str, ServiceEntry]
@@ -114,7 +110,7 @@ class Bookkeeping:
 
 def bookkeeping(world: World) -> Bookkeeping:
     active = without_suspended(world)
-    services = {}
+    services, connections = {}, {}
     for release in explanations.releases(world):
         if not isinstance(release, ServiceRelease):
             continue
@@ -139,7 +135,6 @@ def bookkeeping(world: World) -> Bookkeeping:
             inputs={role: _sorted(topics) for role, topics in inputs.items()},
             requesters=list(release.requesters),
         )
-    connections = {}
     for id in world.ledger.subjects(SubjectKind.CONNECTION):
         first, claims = active.ledger.connection(id), active.ledger.connection_claims(id)
         if first is None or not claims:
@@ -175,14 +170,21 @@ def bookkeeping(world: World) -> Bookkeeping:
         )
         for demand in in_turn(world.ledger.waiting)
     ]
-    return Bookkeeping(
-        dict(sorted(services.items())),
-        connections,
-        _demands(world),
-        suspended,
-        _nodes(world),
-        waiting,
-    )
+    by_demand: dict[str, list[Claim]] = {}
+    subjects = [Subject(kind, id) for kind in SubjectKind for id in world.ledger.subjects(kind)]
+    for claim in (claim for subject in subjects for claim in world.ledger.claims_on(subject)):
+        if claim.keeping_override is None:  # a claim that an override keeps is of no demand
+            by_demand.setdefault(claim.demand, []).append(claim)
+    demands = {
+        demand: DemandEntry(
+            "DeploymentRequest" if claims[0].joined else "Demand",
+            claims[0].request,
+            list(requesters_of(claims)),
+        )
+        for demand, claims in sorted(by_demand.items())
+    }
+    services = dict(sorted(services.items()))
+    return Bookkeeping(services, connections, demands, suspended, _nodes(world), waiting)
 
 
 def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
@@ -203,43 +205,20 @@ def _nodes(world: World) -> dict[str, dict[str, ResourceEntry]]:
     return nodes
 
 
-def _demands(world: World) -> dict[str, DemandEntry]:
-    by_demand: dict[str, list[Claim]] = {}
-    for kind in SubjectKind:
-        for id in world.ledger.subjects(kind):
-            for claim in world.ledger.claims_on(Subject(kind, id)):
-                if claim.keeping_override is None:  # a claim that an override keeps is of no demand
-                    by_demand.setdefault(claim.demand, []).append(claim)
-    return {
-        demand: DemandEntry(
-            "DeploymentRequest" if claims[0].joined else "Demand",
-            claims[0].request,
-            list(requesters_of(claims)),
-        )
-        for demand, claims in sorted(by_demand.items())
-    }
-
-
 def _sorted(topics: dict[str, set[str]]) -> _Requesters:
     return {topic: sorted(who) for topic, who in topics.items()}
 
 
 def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
-    """Return the bookkeeping as plain data, as ``bookkeeping --output json`` prints it.
-
-    ``demands``, ``suspended``, ``nodes`` and ``waiting`` are left out if they are empty.
-    """
     data = asdict(view) | {"commit": commit}
     return {name: part for name, part in data.items() if part or name not in _LEFT_OUT}
 
 
 @dataclass(frozen=True, slots=True)
 class EntryChange:
-    """One service or connection that was added, changed or removed.
+    """A service or connection that was added, changed or removed, and its last requesters.
 
-    ``requesters`` are the requesters after the change. If the entry was removed, they are those
-    before the change. If the entry was changed, ``lost`` has the facts that no longer hold, and
-    ``gained`` has the new facts.
+    If it was changed, ``lost`` has the facts that no longer hold, and ``gained`` the new facts.
     """
 
     kind: Literal["service", "connection"]
@@ -248,13 +227,6 @@ class EntryChange:
     requesters: list[str]
     lost: tuple[str, ...] = ()
     gained: tuple[str, ...] = ()
-
-
-def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
-    return (
-        *_changes("service", old.services, new.services),
-        *_changes("connection", old.connections, new.connections),
-    )
 
 
 _Entry = ServiceEntry | ConnectionEntry
@@ -273,6 +245,13 @@ def _changes(
             lost = tuple(fact for fact in had if fact not in has)
             gained = tuple(fact for fact in has if fact not in had)
             yield EntryChange(kind, name, "changed", new[name].requesters, lost, gained)
+
+
+def bookkeeping_changes(old: Bookkeeping, new: Bookkeeping) -> tuple[EntryChange, ...]:
+    return (
+        *_changes("service", old.services, new.services),
+        *_changes("connection", old.connections, new.connections),
+    )
 
 
 def _facts(entry: _Entry, other: _Entry) -> Iterator[str]:

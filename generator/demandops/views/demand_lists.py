@@ -17,10 +17,7 @@ from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release
 
-# ---- the demands that hold something or wait for room ----
-#
-# An override that keeps claims is listed like a demand.
-
+# ---- the demands that hold something or wait for room, and the overrides that keep claims ----
 
 # The state of a claim or of a demand. A claim is held by its demand, kept by an override, or
 # suspended by an override. A demand has the state of its claims. If the states of its claims
@@ -52,15 +49,10 @@ def state_of(claim: Claim, world: World) -> State:
 
 
 def domains_of(nodes: Iterable[str], config: Config) -> tuple[str, ...]:
-    """Return the access domains of nodes, sorted; a node without a domain is skipped."""
     return tuple(sorted({config.domain_of[id].name for id in nodes if id in config.domain_of}))
 
 
 def nodes_of(claim: Claim) -> tuple[str, ...]:
-    """Return the nodes that a claim needs, sorted.
-
-    These include the sources of its inputs, the nodes to which it delivers, and its broker's node.
-    """
     held = claim.held
     if claim.is_on_application:
         sources = (topic.source for _, topic in claim.application.all_inputs())
@@ -70,7 +62,6 @@ def nodes_of(claim: Claim) -> tuple[str, ...]:
 
 
 def demands(world: World) -> list[HeldDemand]:
-    """Return every demand, and each override that keeps claims, the oldest first."""
     by_demand: defaultdict[str, list[Claim]] = defaultdict(list)
     for claim in world.ledger:
         by_demand[claim.demand].append(claim)
@@ -80,7 +71,6 @@ def demands(world: World) -> list[HeldDemand]:
 
 
 def held_demand(claims: Sequence[Claim], world: World) -> HeldDemand:
-    """Return the entry for a demand; ``claims`` are all claims that it holds."""
     states = {state_of(claim, world) for claim in claims}
     (state,) = states if len(states) == 1 else ("partly suspended",)
     suspending = filter(None, (suspended_by(claim, world) for claim in claims))
@@ -115,16 +105,12 @@ def ids_of(claims: Iterable[Claim], kind: SubjectKind) -> Iterator[str]:
     yield from sorted(claim.subject.id for claim in claims if claim.subject.kind is kind)
 
 
-# ---- the nodes, and what uses each of them, as a list for people ----
+# ---- the nodes, and what uses each of them ----
 
 
 @dataclass(frozen=True, slots=True)
 class UsedNode:
-    """A node of the inventory or of a claim, and what uses the node.
-
-    ``applications``, ``connections`` and ``requesters`` come from the claims that need the node.
-    These include claims on applications that only read an input from the node.
-    """
+    """A node of the inventory or of a claim, and what uses it, if only as a source of inputs."""
 
     name: str
     type: str | None
@@ -141,7 +127,6 @@ class UsedNode:
 
 
 def nodes(world: World, releases: Iterable[Release]) -> list[UsedNode]:
-    """Return every node, sorted by id; ``releases`` are all releases that run."""
     running: defaultdict[str, list[str]] = defaultdict(list)
     for release in releases:
         running[release.node.id].append(release.name)

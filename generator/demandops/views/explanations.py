@@ -23,7 +23,6 @@ from demandops.render.gitops import path_of
 
 # ---- the override report, for ``get overrides`` and ``check``: what each override does now ----
 
-
 # ``matches nothing``: the override selects nothing, or its effects do not apply to what it selects.
 # ``held back``: another override with ``hold`` keeps every file that this override would change.
 # ``not rendered yet``: a generator has not written the changed files yet
@@ -40,7 +39,6 @@ class Entry:
 
 
 def override_report(world: World, now: datetime) -> list[Entry]:
-    """Return an entry for every override, sorted by name."""
     if not world.config.overrides:
         return []
     releases = defaultdict[str, list[Release]](list)
@@ -62,8 +60,14 @@ def override_report(world: World, now: datetime) -> list[Entry]:
         held = tuple(claims[name])
         state: State = "matches nothing"
         if changed or held:
-            is_held_back = not held and all(_is_held(release, override) for release in changed)
-            state = "held back" if is_held_back else "in force"
+            state = "in force" if held else "held back"
+            for release in changed:
+                own = next(
+                    (effects for each, effects in release.shaping.by if each == override), ()
+                )
+                # only another override with ``hold`` keeps this one from changing the release
+                if not release.shaping.held or "hold" in own or {*own} == {"keep"}:
+                    state = "in force"
         if (override.end is not None and override.end <= now) or override not in world.overrides:
             state, changed, held = "expired", (), ()
         entries.append(Entry(override, state, changed, held))
@@ -83,10 +87,7 @@ def affected_releases(entry: Entry, world: World) -> list[Release]:
 
 
 def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
-    """Yield (file, warning) for each override that has no effect.
-
-    There is also a warning if several replicas publish the same outputs because of an override.
-    """
+    """Yield (file, warning) for each override without effect, or whose replicas repeat outputs."""
     for entry in entries:
         override = entry.override
         if entry.state == "expired" and override.end:
@@ -127,32 +128,18 @@ def warnings(entries: list[Entry]) -> Iterator[tuple[str, str]]:
                 )
 
 
-def _is_held(release: Release, override: Override) -> bool:
-    """Return whether another override with ``hold`` keeps ``override`` from changing a release."""
-    effects = next((effects for each, effects in release.shaping.by if each == override), ())
-    return release.shaping.held and "hold" not in effects and {*effects} != {"keep"}
-
-
-# ---- override state ----
-#
-# The state of an override, which is in force only once the files that it changes are written.
-
-
 def override_state(entry: Entry, world: World, not_rendered: Collection[str]) -> State:
-    """Return the state of an override; ``not_rendered`` are paths of files."""
+    # An override is in force only once the files that it changes are written.
     if entry.state != "in force" or not not_rendered:
         return entry.state
     paths = {path_of(release) for release in affected_releases(entry, world)}
     return "not rendered yet" if paths & {*not_rendered} else entry.state
 
 
-# ---- release causes ----
-#
-# Why a release runs as it does: the claims that need it, and the files of people that shape it.
+# ---- why a release runs as it does: its claims, and the files of people that shape it ----
 
 
 def releases(world: World, subject: Subject | None = None) -> Iterator[Release]:
-    """Yield the releases that run, or only those that claims on ``subject`` need."""
     keys = keys_of(world, subject) if subject else all_keys(world)
     yield from filter(None, (plan(world, key) for key in keys))
 
@@ -162,10 +149,7 @@ def release_named(world: World, name: str) -> Release | None:
 
 
 def claims_behind(ledger: Ledger, release: Release) -> list[Claim]:
-    """Return the claims that need a running release, sorted by their booking time.
-
-    ``ledger`` has no suspended claims.
-    """
+    # callers pass a ledger without suspended claims
     return by_booking(claim for claim in claims_of(release, ledger) if needs(claim, release))
 
 
@@ -174,14 +158,12 @@ def by_booking(claims: Iterable[Claim]) -> list[Claim]:
 
 
 def needs(claim: Claim, release: Release) -> bool:
-    """Return whether a claim on an application or connection of a release needs the release."""
     if not isinstance(release, ServiceRelease):
         return True
     return takes(claim.application, release.service, release.key)
 
 
 def versions_asked(release: ServiceRelease, ledger: Ledger) -> dict[str, list[str]]:
-    """Return the versions that claims on a service's applications name, with requesters."""
     asking: dict[str, set[str]] = {}
     for claim in claims_of(release, ledger):
         if claim.application.version:
@@ -204,10 +186,7 @@ def is_released_by_demand_id(claim: Claim) -> bool:
 
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
-    """Return (file, entry, what the entry decides) for each file entry that shapes a release.
-
-    Overrides are left out: :attr:`.Shaping.by` has them.
-    """
+    """Return (file, entry, what it decides) for all that shapes a release but overrides."""
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
         images = {name: release.version.image(name, image) for name, image in images.items()}

@@ -7,7 +7,7 @@ check what the policy allows (:mod:`.permission`).
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
 
@@ -110,21 +110,17 @@ def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
             unread += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
         elif isinstance(value, int):
             length += value.bit_length() // 4
-    if length > limits.demand_characters:
-        size = f"has more than {limits.demand_characters} characters"
-        message = _too_large(size, "demandCharacters", limits.demand_characters)
-        yield fault("", message, code="too-large")
-    if fields > most_fields:
-        message = _too_large(f"has more than {most_fields} fields", "demandItems", most_fields)
-        yield fault("", message, code="too-large")
-    if items > limits.demand_items:
-        size = f"lists more than {limits.demand_items} {_ITEMS}"
-        message = _too_large(size, "demandItems", limits.demand_items)
-        yield fault("", message, code="too-large")
+    for count, most, verb, what, limit in (
+        (length, limits.demand_characters, "has", "characters", "demandCharacters"),
+        (fields, most_fields, "has", "fields", "demandItems"),
+        (items, limits.demand_items, "lists", _ITEMS, "demandItems"),
+    ):
+        if count > most:
+            message = _too_large(f"{verb} more than {most} {what}", limit, most)
+            yield fault("", message, code="too-large")
 
 
 def items_of(request: DemandRequest) -> int:
-    """Return how many things a request lists in total."""
     items = len(request.own_requesters)
     items += len(request.positions) if isinstance(request, Put) else 0
     for item in request.demanded:
@@ -141,7 +137,6 @@ def items_of(request: DemandRequest) -> int:
 
 
 def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault for each limit on items and parameters that the request exceeds."""
     for item in request.demanded:
         held = item.held
         if isinstance(held, Application) and held.parameters:
@@ -224,11 +219,10 @@ def _delivery_faults(where: str, delivery: Delivery, services: Services) -> Iter
 def _definition_faults(
     app: Application, appdef: ApplicationDefinition, config: Config
 ) -> Iterator[Fault]:
-    """Yield a fault for each field of an application that contradicts its definition."""
-    for role, topics in app.inputs.items():
-        if role not in appdef.inputs and topics:
-            message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
-            yield fault(f"inputs.{role}", message)
+    unknown = [role for role, topics in app.inputs.items() if topics and role not in appdef.inputs]
+    for role in unknown:
+        message = f"{appdef.name} has no such input" + suggestion(role, appdef.inputs)
+        yield fault(f"inputs.{role}", message)
     parameters = config.parameters_of(appdef.name) if app.parameters else set()
     for name in app.parameters:
         if name not in parameters:
@@ -259,18 +253,6 @@ def _definition_faults(
         elif not app.services.get(name):
             yield from _id_faults(f"services.{name}", "")
     versions = config.versions_of(appdef.name)
-    yield from _instance_faults(app, appdef, versions)
-    if app.version and app.version not in versions:
-        yield fault(
-            "version",
-            f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
-            f"{config.versions_file(appdef.name)}{suggestion(app.version, versions)}",
-        )
-
-
-def _instance_faults(
-    app: Application, appdef: ApplicationDefinition, versions: Collection[str]
-) -> Iterator[Fault]:
     # An id that ends in '@<version>' belongs to a separate instance, which the generator names. A
     # claim that a person wrote, or an id that only looks like this, would share its names.
     id, _, version = app.id.rpartition("@")
@@ -283,6 +265,12 @@ def _instance_faults(
             f"{quoted(app.id)} is the instance of version {version}; demand {quoted(id)} with "
             f"version '{version}' instead, or choose an id that does not end in '@{version}'",
         )
+    if app.version and app.version not in versions:
+        yield fault(
+            "version",
+            f"{quoted(app.version)} is not a version or channel of {appdef.name} in "
+            f"{config.versions_file(appdef.name)}{suggestion(app.version, versions)}",
+        )
 
 
 def _unknown_application(name: str, config: Config) -> Fault:
@@ -293,14 +281,13 @@ def _unknown_application(name: str, config: Config) -> Fault:
             if appdef.deployment_request
         ]
         none = "; no appdef.yaml has a deploymentRequest.type: add one, commit and push it"
-        remedy = f"; known: {', '.join(types)}" if types else none
+        shown, remedy = name.removeprefix("#"), f"; known: {', '.join(types)}" if types else none
     else:
         none = (
             "; appdefs/ on main has no application definition: add one (demandops new "
             "application), commit and push it"
         )
-        remedy = suggestion(name, config.appdefs) or none
-    shown = name.removeprefix("#") if name.startswith("#") else quoted(name)
+        shown, remedy = quoted(name), suggestion(name, config.appdefs) or none
     message = f"{shown} is not a known application type{remedy}"
     return fault("appdef", message, code="unknown-application")
 
@@ -369,10 +356,6 @@ def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
 def with_chosen_types(
     request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
 ) -> AnyRequest:
-    """Return ``request`` with the type that each connection gets, if any type can carry it.
-
-    ``current`` takes an id and returns the claimed connection that has it, or ``None``.
-    """
     if not request.adds_claims:
         return request
 

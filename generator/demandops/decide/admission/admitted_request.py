@@ -10,7 +10,6 @@ from types import MappingProxyType
 from typing import TypeVar
 
 from demandops.base.errors import Fault, Refused
-from demandops.base.naming import Subject
 from demandops.connections.connection import Connection
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
@@ -29,6 +28,7 @@ from demandops.model.demand.demand_request import (
     DemandRequest,
     Put,
 )
+from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import Wait, WaitingDemand
 
 # ---- the choice of an access domain if a demand names a node that is in several domains ----
@@ -36,41 +36,33 @@ from demandops.model.ledger.records import Wait, WaitingDemand
 # In each further domain the node has the name ``<node>@<domain>``, which a demand may give wherever
 # it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
 #
-# A demand may name a node without a domain: as the node of an application or of a service, or as an
-# end of a connection. If the application or connection is booked already, its domain stays. If it
-# is not booked yet, the domain is the only one in which the rules let the requesters use the node.
-# If there is no such domain, the node's first domain is meant. If there are several, the demand is
+# A demand may name a node without a domain. If its application or connection is booked already, the
+# domain stays. If not, it is the only domain in which the rules let the requesters use the node. If
+# there is no such domain, the node's first domain is meant. If there are several, the demand is
 # refused.
 
-
 Held = Application | Connection
-# returns the application or connection that a subject's first claim holds
-Booked = Callable[[Subject], "Held | None"]
 
 
 def with_chosen_domains(
-    request: AnyRequest, config: Config, booked: Booked
+    request: AnyRequest, config: Config, ledger: Ledger
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Return the request with a chosen access domain for each node.
-
-    There is a fault for each node for which several access domains are possible. In a request that
-    adds no claims, such a node stays as it is named.
-    """
+    """Choose a domain for each node; there is a fault for each node with several domains."""
     if not config.hosts:
         return request, []
     faults: list[Fault] = []
     demanded = []
     for item in request.demanded:
         held = _with_short_names(item.held, config)
-        booked_nodes = dict(_named(at)) if (at := booked(held.subject)) else {}
-        chosen = dict(_chosen(item, booked_nodes, config, request.adds_claims, faults))
+        booked = ledger.held(held.subject)
+        booked_nodes = _named(booked) if booked else {}
+        chosen = _chosen(item, booked_nodes, config, request.adds_claims, faults)
+        nodes = {**_named(held), **dict(chosen)}
         if isinstance(held, Application):
-            services = {name: chosen.get(_field(name), n) for name, n in held.services.items()}
-            node = chosen.get("node", held.node)
-            held = replace(held, node=node, services=MappingProxyType(services))
+            services = {name: nodes[f"services.{name}"] for name in held.services}
+            held = replace(held, node=nodes["node"], services=MappingProxyType(services))
         else:
-            source, target = chosen.get("source", held.source), chosen.get("target", held.target)
-            held = replace(held, source=source, target=target)
+            held = replace(held, source=nodes["source"], target=nodes["target"])
         demanded.append(replace(item, held=held))
     return replace(request, demanded=tuple(demanded)), faults
 
@@ -95,29 +87,19 @@ def _with_short_names(held: Held, config: Config) -> Held:
     return held.with_inputs(inputs)
 
 
-def _named(held: Held) -> Iterator[tuple[str, str]]:
-    """Yield (field, node) for both ends of a connection, or for an application and its services."""
+def _named(held: Held) -> dict[str, str]:
     if isinstance(held, Connection):
-        yield from (("source", held.source), ("target", held.target))
-    else:
-        yield "node", held.node
-        yield from ((_field(name), node) for name, node in held.services.items())
-
-
-def _field(service: str) -> str:
-    return f"services.{service}"
+        return {"source": held.source, "target": held.target}
+    services = {f"services.{name}": node for name, node in held.services.items()}
+    return {"node": held.node, **services}
 
 
 def _chosen(
-    item: Demanded,
-    booked_nodes: Mapping[str, str],
-    config: Config,
-    adds: bool,
-    faults: list[Fault],
+    item: Demanded, booked_nodes: Mapping[str, str], config: Config, adds: bool, faults: list[Fault]
 ) -> Iterator[tuple[str, str]]:
     """Yield (field, the node's name in the chosen domain) for each node in several domains."""
     held = item.held
-    for field, node in _named(held):
+    for field, node in _named(held).items():
         choices = config.nodes_of(node)
         if len(choices) < 2:
             continue
@@ -152,7 +134,6 @@ def _chosen(
 
 
 def with_separate_instances(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with separate instances for versions other than the default."""
     demanded = (
         replace(item, held=_separated(item.held, config))
         if isinstance(item.held, Application) and item.held.version
@@ -177,19 +158,15 @@ def _separated(app: Application, config: Config) -> Application:
 
 
 def notes(request: DemandRequest) -> Iterator[str]:
-    """Yield a note for each separate instance that a request lists."""
     for item in request.demanded:
         if isinstance(item.held, Application) and item.held.separate:
             id, _, version = item.held.id.rpartition("@")
             yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"
 
 
-# ---- admitted request ----
-#
-# The request that a goal becomes: parsed, completed, and checked against the configuration.
+# ---- the request that a goal becomes: parsed, completed, checked against the configuration ----
 
 _ITEM = re.compile(r"(apps|applications|connections)\[(\d+)\]")
-
 
 # yields faults if a request comes too soon after others of its requesters
 Throttle = Callable[[DemandRequest, Config], Iterable[Fault]]
@@ -198,17 +175,9 @@ Checkpoint = Callable[[], None]
 
 
 def admitted(
-    state: State,
-    goal: object,
-    now: datetime,
-    throttle: Throttle,
-    checkpoint: Checkpoint,
+    state: State, goal: object, now: datetime, throttle: Throttle, checkpoint: Checkpoint
 ) -> DemandRequest:
-    """Return the request that a goal becomes: to wait, if it lacks only room and may wait.
-
-    Raises:
-        Refused: if the goal does not pass all checks of :func:`admit` and the demand cannot wait.
-    """
+    """Return the request that a goal becomes: to wait, if it lacks only room and may wait."""
     try:
         return admit(state, goal, throttle, None, checkpoint)
     except Refused as refused:
@@ -243,14 +212,9 @@ def admit(
     trial: placement.Trial | None = None,
     checkpoint: Checkpoint = lambda: None,
 ) -> DemandRequest:
-    """Return the request that a goal becomes, if the goal passes all checks.
+    """Return the request that a goal becomes, or raise Refused with all faults of the goal.
 
     If ``trial`` is given, a node is chosen only if ``trial`` accepts the request with this node.
-
-    Raises:
-        Refused: with the limits that the goal exceeds, if it is too large. Otherwise with every
-            fault in the form and in the content of the goal. If there is none, with every fault
-            that ``throttle`` yields.
     """
     config, ledger = state.config, state.ledger
     limits = config.repo_settings.limits
@@ -266,14 +230,14 @@ def admit(
             checkpoint()
         # the id of a separate instance comes first, because the placement looks for claims on it
         parsed = with_separate_instances(parsed, config)
-        parsed, unclear = with_chosen_domains(parsed, config, ledger.held)
+        parsed, unclear = with_chosen_domains(parsed, config, ledger)
         request = flows.with_further_topics(parsed, ledger, config)
     else:
         wired, faults = deployment_request_goal.parse(goal, config.appdef_by_wire_type)
         if wired is None:
             raise Refused(faults)
         _refuse(admission.size_faults(wired, limits))
-        request, unclear = with_chosen_domains(wired, config, ledger.held)
+        request, unclear = with_chosen_domains(wired, config, ledger)
     request, not_placed = placement.with_chosen_nodes(
         request, state, state.usage(), trial, checkpoint
     )
@@ -305,8 +269,13 @@ def admit(
     # last, because a goal with faults does not count against the limits of its requesters
     faults = faults or list(throttle(request, config))
     if faults:
+
+        def item_of(each: Fault) -> tuple[str, int]:
+            match = _ITEM.match(each.field)
+            return (match[1], int(match[2])) if match else ("", 0)
+
         # the faults of one application or connection are reported together
-        raise Refused(sorted(dict.fromkeys(faults), key=lambda each: _item_of(each.field)))
+        raise Refused(sorted(dict.fromkeys(faults), key=item_of))
     return request
 
 
@@ -322,7 +291,6 @@ def completed(request: DemandRequest, state: State) -> DemandRequest:
 
 
 def leaves_nodes_open(state: State, goal: object) -> bool:
-    """Return whether the generator chooses or checks nodes for the applications of a goal."""
     if isinstance(goal, dict) and demand_goal.is_demand_goal(goal):
         request: DemandRequest | None = demand_goal.parse(goal)[0]
     else:
@@ -362,8 +330,3 @@ def _with_parents(field: str) -> Iterator[str]:
     yield field
     for match in re.finditer(r"[.\[]", field):
         yield field[: match.start()]
-
-
-def _item_of(field: str) -> tuple[str, int]:
-    match = _ITEM.match(field)
-    return (match[1], int(match[2])) if match else ("", 0)

@@ -29,7 +29,6 @@ _NO_RULES = (Rule(name="everything"),)
 
 
 def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
-    """Yield a fault for everything that the access domains do not allow the requesters."""
     if not request.adds_claims:  # everybody may release what is theirs
         return
     lease_s = _wanted_lease(request)
@@ -50,10 +49,7 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
 def needed_access(
     held: Application | Connection, config: Config
 ) -> Iterator[tuple[AccessDomain, Access]]:
-    """Yield (access domain, access) for each node where services run or a connection has an end.
-
-    The access is what a rule of this domain must grant. A node without a domain is left out.
-    """
+    """Yield (domain, what a rule of it must grant) for each node of services or of an end."""
     more: Access = []
     if isinstance(held, Application):
         first = [("applications", held.appdef)]
@@ -79,9 +75,7 @@ def needed_access(
 
 
 def may_place(item: Demanded, appdef: str, node: str, config: Config) -> bool:
-    """Return whether the requesters may use a node for an ``appdef``, or as the end of a
-    connection.
-    """
+    """Return whether the requesters may use a node for an ``appdef``, or without one as an end."""
     domain = config.domain_of.get(node)
     access: Access = [("applications", appdef)] if appdef else []
     access.append(("nodes", config.host_of(node)))
@@ -89,7 +83,6 @@ def may_place(item: Demanded, appdef: str, node: str, config: Config) -> bool:
 
 
 def _not_allowed(item: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
-    """Yield a fault for each requester to whom no rule of the domain grants the access."""
     rules = domain.rules or _NO_RULES
     for index, requester in enumerate(item.requesters):
         own = [rule for rule in rules if matches(requester, rule.requesters)]
@@ -104,38 +97,31 @@ def _not_allowed(item: Demanded, domain: AccessDomain, access: Access) -> Iterat
                 f"{named}; ask for a change of policy/"
             )
         else:
-            reasons = "; ".join(
-                _reason(domain, rule, requester, *miss)
-                for rule, miss in zip(own, filter(None, misses), strict=True)
+            where, reasons = f"access domain '{domain.name}'", list[str]()
+            for rule, (kind, value) in zip(own, filter(None, misses), strict=True):
+                whose = f"rule '{rule.name}' of {where}"
+                if kind == PEERS:
+                    reasons.append(
+                        f"{whose if domain.rules else where} does not let '{requester}' connect "
+                        f"the domain's nodes to nodes of '{value}' (peers)"
+                    )
+                else:
+                    reasons.append(
+                        f"{whose} lets '{requester}' have only these {kind}: "
+                        f"{' '.join(getattr(rule, kind))}, not '{value}'"
+                    )
+            message = (
+                f"{'; '.join(reasons)}; request what is allowed, or ask for a change of policy/"
             )
-            message = f"{reasons}; request what is allowed, or ask for a change of policy/"
         yield item.fault(f"requesters[{index}]", message, code="not-allowed")
 
 
-def _reason(domain: AccessDomain, rule: Rule, requester: str, kind: str, value: str) -> str:
-    where = f"access domain '{domain.name}'"
-    if kind == PEERS:
-        whose = f"rule '{rule.name}' of {where}" if domain.rules else where
-        return (
-            f"{whose} does not let '{requester}' connect the domain's nodes to nodes of '{value}' "
-            "(peers)"
-        )
-    return (
-        f"rule '{rule.name}' of {where} lets '{requester}' have only these {kind}: "
-        f"{' '.join(getattr(rule, kind))}, not '{value}'"
-    )
-
-
 def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
-    """Return the first pair of ``access`` that ``rule`` lacks; ``None`` if it grants all pairs."""
-    return next(
-        ((kind, value) for kind, value in access if not matches(value, getattr(rule, kind))), None
-    )
+    missing = (pair for pair in access if not matches(pair[1], getattr(rule, pair[0])))
+    return next(missing, None)
 
 
 def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
-    """Return the request with the lease term that its access domain sets for each item."""
-
     def with_term(item: Demanded) -> Demanded:
         domain = config.domain_of.get(item.held.home)
         return replace(item, term=term(request, domain) if domain else None)
@@ -160,10 +146,7 @@ def _wanted_lease(request: DemandRequest) -> int | None:
 def approval_reasons(
     request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
 ) -> tuple[str, ...]:
-    """Return the reasons why a request needs approval, such as ``access domain 'edge'``, each once.
-
-    ``changes`` has each changed claim as (before the request, after the request).
-    """
+    """Return why a request needs approval, by its changed claims as (before, after)."""
     if not request.adds_claims:
         return ()
     listed = set(request.subjects())  # without the claims of overrides, which need no approval
@@ -180,28 +163,23 @@ def approval_reasons(
                 reasons[f"application definition '{appdef.name}'"] = None
         for domain, access in needed_access(after.held, config):
             for requester in after.requesters:
-                reasons |= dict.fromkeys(_domain_reasons(domain, requester, access))
+                granting = [
+                    rule
+                    for rule in domain.rules
+                    if matches(requester, rule.requesters) and first_uncovered(rule, access) is None
+                ]
+                # one rule that grants the access without approval is enough
+                if any((rule.approval or domain.approval) == "none" for rule in granting):
+                    continue
+                requiring = [rule.name for rule in granting if rule.approval == "required"]
+                for name in requiring:
+                    reasons[f"rule '{name}' of access domain '{domain.name}'"] = None
+                if not requiring and domain.approval == "required":
+                    reasons[f"access domain '{domain.name}'"] = None
     return tuple(reasons)
 
 
-def _domain_reasons(domain: AccessDomain, requester: str, access: Access) -> Iterator[str]:
-    rules = [
-        rule
-        for rule in domain.rules
-        if matches(requester, rule.requesters) and first_uncovered(rule, access) is None
-    ]
-    # one rule that grants the access without approval is enough
-    if any((rule.approval or domain.approval) == "none" for rule in rules):
-        return
-    own = [rule for rule in rules if rule.approval == "required"]
-    for rule in own:
-        yield f"rule '{rule.name}' of access domain '{domain.name}'"
-    if not own and domain.approval == "required":
-        yield f"access domain '{domain.name}'"
-
-
 def with_leases_from_approval(request: AnyRequest) -> AnyRequest:
-    """Return the request with leases that start when a person approves the request."""
     demanded = (
         replace(item, term=replace(item.term, on_approval=True)) if item.term else item
         for item in request.demanded

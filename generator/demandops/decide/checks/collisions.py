@@ -13,7 +13,7 @@ from rpds import HashTrieMap, HashTrieSet
 from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
-from demandops.connections.connection import ClientKey, Connection
+from demandops.connections.connection import ClientKey
 from demandops.decide.planning.flows import flows, outputs, usual_topic
 from demandops.decide.planning.planner import service_name
 from demandops.decide.planning.release_keys import (
@@ -43,22 +43,33 @@ from demandops.model.release import ServiceKey
 def topic_faults(
     request: DemandRequest, before: World, after: World, keys: Iterable[ReleaseKey]
 ) -> Iterator[Fault]:
-    """Yield a fault for each new service, route or delivery that clashes with another source.
-
-    It clashes if it would be a topic's second source on a node. Of a service's outputs, only the
-    first that clashes is reported. ``keys`` are the keys of the releases that the demand may
-    change.
-    """
+    """Yield a fault for each new service, route or delivery that clashes with another source."""
     if not request.adds_claims:
         return
     for key in keys:
         if isinstance(key, ServiceKey) and not is_needed(before, key):
             yield from islice(_clashes_of_service(request, after, key), 1)
     for item in request.demanded:
-        if isinstance(item.held, Connection):
-            yield from _clashes_of_connection(item, item.held, before, after)
-        else:
+        if isinstance(item.held, Application):
             yield from _clashes_of_flows(item, item.held, after)
+            continue
+        connection = item.held
+        for index, route in enumerate(connection.topics):
+            _, node = route.sender_and_receiver(*connection.nodes)
+            topic = route.written_topic
+            if connection.id in before.ledger.connections_bringing(node, topic):
+                continue
+            # Only services that run before and after the demand count. If an application moves, a
+            # connection may bring the application's output back to the old node.
+            staying = (key for key in _publishers(before, node, topic) if is_needed(after, key))
+            for other in islice(staying, 1):
+                yield item.fault(
+                    f"topics[{index}].{'source' if route.reverse else 'target'}",
+                    f"connection '{connection.id}' brings {topic} to '{node}', where "
+                    f"{words(other)} already publishes this topic; use a connection that brings "
+                    "the topic under another name",
+                    code="conflict",
+                )
 
 
 def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault]:
@@ -95,29 +106,7 @@ def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -
             )
 
 
-def _clashes_of_connection(
-    item: Demanded, connection: Connection, before: World, after: World
-) -> Iterator[Fault]:
-    for index, route in enumerate(connection.topics):
-        _, node = route.sender_and_receiver(*connection.nodes)
-        topic = route.written_topic
-        if connection.id in before.ledger.connections_bringing(node, topic):
-            continue
-        # Only services that run before and after the demand count. If an application moves, a
-        # connection may bring the application's output back to the old node.
-        staying = (key for key in _publishers(before, node, topic) if is_needed(after, key))
-        for other in islice(staying, 1):
-            yield item.fault(
-                f"topics[{index}].{'source' if route.reverse else 'target'}",
-                f"connection '{connection.id}' brings {topic} to '{node}', where "
-                f"{words(other)} already publishes this topic; use a connection that brings the "
-                "topic under another name",
-                code="conflict",
-            )
-
-
 def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterator[Fault]:
-    """Yield a fault for each output that the receiving node already gets from another source."""
     has_outputs_elsewhere = app.deliver or app.services or app.moved
     for flow in flows(after.config, app) if has_outputs_elsewhere else ():
         # Of an input that the demand lists, the demand names the source, so it is no fault.
@@ -126,22 +115,17 @@ def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterato
         for id in after.ledger.connections_bringing(flow.receiver, flow.target):
             other = after.ledger.connection(id)
             elsewhere = other is not None and {*other.nodes} != {flow.sender, flow.receiver}
-            if flow.delivery is None:
-                if elsewhere:
-                    message = (
-                        f"{flow.target} already comes to '{flow.receiver}' by connection '{id}', "
-                        f"and would also come from '{flow.sender}'; choose another node for the "
-                        "service that reads this topic"
-                    )
-                    yield item.fault("id", message, code="conflict")
-                continue
-            if elsewhere:
-                yield item.fault(
-                    f"deliver[{flow.delivery}].output",
-                    f"{flow.target} already comes to '{flow.receiver}' by connection '{id}'; leave "
-                    "this delivery out",
-                    code="conflict",
+            brought = f"{flow.target} already comes to '{flow.receiver}' by connection '{id}'"
+            if elsewhere and flow.delivery is None:
+                message = (
+                    f"{brought}, and would also come from '{flow.sender}'; choose another node for "
+                    "the service that reads this topic"
                 )
+                yield item.fault("id", message, code="conflict")
+            elif elsewhere:
+                place, message = f"deliver[{flow.delivery}].output", "leave this delivery out"
+                yield item.fault(place, f"{brought}; {message}", code="conflict")
+            if elsewhere or flow.delivery is None:
                 continue
             claims = after.ledger.connection_claims(id)
             routes = (route for claim in claims for route in claim.connection.topics)
@@ -158,10 +142,7 @@ def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterato
 def _publishers(
     world: World, node: str, topic: str, *, excluded: ServiceKey | None = None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of the service instances on a node that publish ``topic``.
-
-    The instance ``excluded`` and each instance that no claim needs are left out.
-    """
+    """Yield the keys of the needed instances on a node that publish ``topic``."""
     # The output patterns of the definitions tell which instances would publish the topic. So only
     # these are looked up, and not the outputs of all services on the node.
     for services in world.config.services.values():
@@ -172,21 +153,29 @@ def _publishers(
                 match = re.fullmatch(expression, topic)
                 if match is None:
                     continue
-                keys = (
-                    _keys_called(world, node, service, match[1], excluded)
-                    if others
-                    else _keys_on(world, node, service)
-                )
-                yield from (key for key in keys if key != excluded and is_needed(world, key))
+                keys: Iterable[ReleaseKey]
+                if others:
+                    keys = _keys_called(world, node, service, match[1], excluded)
+                elif service.scope == "cluster":
+                    keys = [ServiceKey(service.name, node, for_cluster=True)]
+                else:
+                    ids = world.ledger.applications_at(node)
+                    subjects = (Subject(SubjectKind.APPLICATION, id) for id in ids)
+                    keys = (key for subject in subjects for key in keys_of(world, subject))
+                for key in keys:
+                    if (
+                        isinstance(key, ServiceKey)
+                        and (key.node, key.service) == (node, service.name)
+                        and key != excluded
+                        and is_needed(world, key)
+                    ):
+                        yield key
 
 
 def _keys_called(
     world: World, node: str, service: Service, instance: str, excluded: ServiceKey | None
 ) -> Iterator[ServiceKey]:
-    """Yield the keys of a service's instances on ``node`` that topic names show as ``instance``.
-
-    Some of the instances may not run. The instance ``excluded`` may be left out.
-    """
+    """Yield keys on ``node`` that topic names show as ``instance``; some may not run."""
     ledger, config = world.ledger, world.config
     name, role = service.name, service.root
     if service.scope in ("node", "cluster"):
@@ -206,18 +195,6 @@ def _keys_called(
     for further, version in ledger.further_topics(role, instance):
         own = "" if service.shared else version
         yield ServiceKey(name, node, source=further.source, topic=further.topic, version=own)
-
-
-def _keys_on(world: World, node: str, service: Service) -> Iterator[ServiceKey]:
-    """Yield the keys of a service's instances on a node; some of them may not run."""
-    name = service.name
-    if service.scope == "cluster":
-        yield ServiceKey(name, node, for_cluster=True)
-        return
-    for id in world.ledger.applications_at(node):
-        for key in keys_of(world, Subject(SubjectKind.APPLICATION, id)):
-            if isinstance(key, ServiceKey) and (key.node, key.service) == (node, name):
-                yield key
 
 
 def words(key: ReleaseKey) -> str:
@@ -286,7 +263,6 @@ _REMEDY = "use another id, or wait until the other is released"
 
 
 def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
-    """Yield the names that only the release at ``key`` may have."""
     if isinstance(key, ClientKey):
         yield from key.type.names(key)
         return
@@ -303,7 +279,6 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
 
 
 def all_names(world: World) -> Names:
-    """Return the names of all releases. This takes time for a large ledger."""
     keys = (key for claims in world.ledger.claims.values() for key in keys_of_claims(world, claims))
     return with_keys(NONE, world, dict.fromkeys(keys))
 
@@ -333,11 +308,7 @@ def name_faults(
     changes: Changes,
     names: Names,
 ) -> Iterator[Fault]:
-    """Yield a fault for each new release that needs a name of another release.
-
-    ``keys`` are the keys of the releases that the demand may change. ``names`` are the names of the
-    releases in ``before``.
-    """
+    """Yield a fault for each new release that needs one of ``names``, those of ``before``."""
     for key in keys:
         for name in names_of(after, key):
             others = (names.get(name) or HashTrieSet()).discard(key)
@@ -358,10 +329,6 @@ def name_faults(
 def faults_in_files(
     request: DemandRequest, changes: Changes, text_at: Callable[[str], str | None]
 ) -> Iterator[Fault]:
-    """Yield a fault for each new claim or waiting demand whose file belongs to another.
-
-    ``text_at`` returns the text of a file of the state repo before the change.
-    """
     owners: dict[str, ClaimKey] = {}
     for change in changes.claims:
         path = claim_file.path_of(change.key)

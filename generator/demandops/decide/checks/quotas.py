@@ -66,7 +66,6 @@ def denial_faults(request: DemandRequest, after: World, changes: Changes) -> Ite
 
 
 def _matched_field(selector: Selector, item: Demanded, config: Config) -> str:
-    """Return the most specific field of a demanded item that a selector matches."""
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:
@@ -83,10 +82,7 @@ def _matched_field(selector: Selector, item: Demanded, config: Config) -> str:
 
 
 def warnings(request: DemandRequest, world: World) -> Iterator[str]:
-    """Yield a warning for each suspended claim that a demand holds or lists.
-
-    A claim that has no requester of the demand is left out.
-    """
+    """Yield a warning for each suspended claim of the requesters that a demand holds or lists."""
     if not any(override.deny for override in world.overrides):
         return
     claims = [
@@ -106,14 +102,12 @@ def warnings(request: DemandRequest, world: World) -> Iterator[str]:
 
 # ---- quotas of an access domain: claims for each requester, and services on each node ----
 #
-# A booking that does not raise an exceeded count is allowed. The quota ``demandsPerMinute`` is
-# checked elsewhere (:mod:`.limits`).
+# The quota ``demandsPerMinute`` is checked elsewhere (:mod:`.limits`).
 
 
 def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
-    """Yield a fault for each quota that the booking exceeds.
+    """Yield a fault for each quota that the booking exceeds and whose count it raises.
 
-    If a quota was exceeded before, there is a fault only if the booking raises the count further.
     Suspended claims count as claims, but nothing runs for them.
     """
     domain_of = after.config.domain_of

@@ -38,10 +38,9 @@ _REFUSING = ("refuse", "separate")
 class Difference:
     """A difference: demands ask for different versions of one application or service.
 
-    ``what`` describes this application or service. ``demanded`` is the version that the new demand
-    asks for. ``others`` is the newest version that the other demands ask for; ``newer`` tells
-    whether ``demanded`` is newer. ``policy`` is the value of ``versions`` in the application
-    definition ``appdef``. If two definitions share the service, it is the stricter of their values.
+    ``others`` is the newest version that the other demands ask for; ``newer`` tells whether
+    ``demanded`` is newer. ``policy`` is the value of ``versions`` in the definition ``appdef``. If
+    two definitions share the service, it is the stricter of their values.
     """
 
     what: str
@@ -54,10 +53,7 @@ class Difference:
     fault: Fault
 
     def matters_to(self, asked: str) -> bool:
-        """Return whether the difference concerns a demand that names the version ``asked``.
-
-        ``asked`` is empty if the demand names no version.
-        """
+        # A demand that names no version has an empty text for ``asked``.
         return bool(asked) or self.newer or self.is_refused
 
     @property
@@ -65,10 +61,7 @@ class Difference:
         return self.policy in _REFUSING
 
     def approval_reason(self) -> str:
-        """Return why a person must approve the difference; empty if no approval is needed.
-
-        The result has no meaning if :attr:`is_refused`.
-        """
+        """Return why a person must approve the difference, or ``""``; of no use if refused."""
         # Another major version breaks what others get, in both directions. In 0.x, too, only the
         # first number counts.
         same_major = precedence(self.demanded)[0][0] == precedence(self.others)[0][0]
@@ -82,7 +75,6 @@ class Difference:
         return f"application definition '{self.appdef}', for {change}"
 
     def warning(self) -> str:
-        """Return a warning that a newer version than the demanded one is deployed, or ``""``."""
         others = f"{self.what} runs version {self.others}, which others ask for"
         return "" if self.newer else f"{others}, not {self.demanded}"
 
@@ -96,9 +88,8 @@ def differences(
 ) -> Iterator[Difference]:
     """Yield the differences between the versions that a demand and other demands ask for.
 
-    A difference that existed before the demand is left out, and so is one that does not concern the
-    demand (:meth:`Difference.matters_to`). ``plans`` are the releases that the demand may change,
-    as they are after it.
+    A difference that existed before the demand is left out, and so is one that does not matter to
+    it. ``plans`` are the releases that the demand may change, as they are after it.
     """
     if not request.adds_claims:
         return
@@ -161,10 +152,7 @@ def _of_service(
     before: World,
     after: World,
 ) -> Iterator[Difference]:
-    """Yield a difference for each demanded application whose version of a shared service differs.
-
-    ``demanded`` has the applications of the demand by id, each with the version that it asks for.
-    """
+    """Yield the differences of demanded applications, each with the version it asks for."""
     service, key, config = release.service, release.key, after.config
     versions = {id: running_version(after, id) for id in release.applications}
     if len({contents(version, service) for version in versions.values() if version}) == 1:

@@ -62,14 +62,14 @@ def whole_usage(world: World) -> Usage:
 
 
 def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
-    """Return how much more ``after`` requests than ``before``; what stays the same is left out."""
+    if not config.limits_capacity:
+        return {}
     change = _requests(after, config)
     change.subtract(_requests(before, config))
     return {need: amount for need, amount in change.items() if amount}
 
 
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
-    """Return the growth of the services' requests when claims change."""
     if not after.config.limits_capacity:
         return {}
     keys = affected_keys(before, after, changes)
@@ -99,10 +99,7 @@ def _requests(plans: Plans, config: Config) -> Counter[Need]:
 
 
 def excesses(usage: Usage, grown: Mapping[Need, int], config: Config) -> Iterator[tuple[str, str]]:
-    """Yield (node, reason) for each resource of which a node has too little for the growth.
-
-    ``usage`` is what services request before the growth.
-    """
+    """Yield (node, reason) for each resource of which a node has too little for the growth."""
     for (id, resource), amount in sorted(grown.items()):
         node = config.nodes.get(id)
         most = node.most(resource) if node else None
@@ -146,30 +143,21 @@ class Room:
         self.book((claim for claim in given_back if claim.is_on_application), give_back=True)
 
     def take(self, claim: Claim) -> None:
-        """Book a claim on an application, and count the application in :attr:`newly_placed`."""
         self.newly_placed[claim.application.node] += 1
         self.book([claim])
 
     def book(self, claims: Iterable[Claim], *, give_back: bool = False) -> None:
-        """Reduce the room of the nodes by what these claims on applications need.
-
-        With ``give_back``, the claims are released instead.
-        """
         if self._world.config.limits_capacity:
             self._world, grown = self._after(claims, give_back=give_back)
             self._usage = self._usage.plus(grown)
 
-    def lacks(self, claims: Iterable[Claim], node: str, service: str = "") -> list[str]:
+    def lacks(self, claims: Sequence[Claim], node: str, service: str) -> list[str]:
         """Return, in words, the resources of which a node has too little for an application.
 
         ``claims`` are those to book for the application on ``node``. If ``service`` is not empty,
-        only the service of this name is placed there. The result is empty if the node has room, or
-        if the application cannot be planned.
+        only this service is placed there. An application that cannot be planned lacks nothing.
         """
-        entry = self._world.config.nodes.get(node)
-        if entry is None or entry.capacity is None:
-            return []
-        claims, host = list(claims), self._world.config.host_of(node)
+        host = self._world.config.host_of(node)
         least = {(host, resource): most for resource, most in self.least(claims, service).items()}
         short = [excess for _, excess in excesses(self._usage, least, self._world.config)]
         if short:
@@ -188,10 +176,9 @@ class Room:
         )
 
     def least(self, claims: Sequence[Claim], service: str) -> Mapping[str, int]:
-        """Return what an application requests at least of its node, as resource → amount.
+        """Return what an application, or its ``service``, requests at least of its node.
 
-        Services that it shares do not count, and neither do services with a node of their own. If
-        ``service`` is not empty, only the service of this name counts.
+        Services that it shares do not count, nor do services with a node of their own.
         """
         subject, world = claims[0].subject, self._world
         # Planning for each node takes long. This amount is the same on all nodes, so it is planned
@@ -238,7 +225,6 @@ class Room:
 
 
 def overcommitted(world: World, usage: Usage) -> Iterator[tuple[Node, str]]:
-    """Yield (node, excess in words) for each resource of which services request too much."""
     for (id, resource), used in sorted(usage.amounts.items()):
         node = world.config.nodes.get(id)
         most = node.most(resource) if node else None

@@ -47,7 +47,6 @@ class Chosen:
 
 
 def requirement_of(service: Service) -> Requirement:
-    """Return what a service's definition requires of a node in ``place``; without it, nothing."""
     place = service.place or Place()
     return Requirement(
         place.role,
@@ -66,21 +65,18 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
     return with_overridden_nodes(app, world)
 
 
-def shares(service: Service, one: Application, other: Application) -> bool:
-    """Return whether two applications share the instances of a service for each topic."""
+def shares(service: Service, app: Application, other: Application) -> bool:
     # A separate instance of an application shares only with separate instances of its version.
-    identities = {(app.appdef, app.node, app.own_version) for app in (one, other)}
-    return service.scope == "topic" and len(identities) == 1
+    identity = (app.appdef, app.node, app.own_version)
+    return service.scope == "topic" and identity == (other.appdef, other.node, other.own_version)
 
 
 @dataclass(frozen=True, slots=True)
 class Choice:
     """The choice of a node for one application, or for one of its services.
 
-    ``service`` is ``None`` if the node is for the whole application. ``claims`` are the claims that
-    the application would get; the chosen node replaces the node in them. ``suits`` returns whether
-    the demand can be booked with the given application; without it, a node is chosen without this
-    check.
+    ``claims`` are those that the application would get; the chosen node replaces the node in them.
+    ``suits`` returns whether the demand can be booked with the given application.
     """
 
     item: Demanded
@@ -110,10 +106,7 @@ class Choice:
         return not self._closed(entry) and self._is_permitted(entry)
 
     def candidates(self) -> Iterator[Chosen]:
-        """Yield the nodes that fit, have room and pass :attr:`suits`, the best first.
-
-        The choice ends early if the demand cannot be booked on :data:`MOST_TRIED` nodes.
-        """
+        """Yield the nodes that fit, have room and pass :attr:`suits`, the best first."""
         fitting = self._fitting()
         centre = self._centre()
         fitting.sort(key=lambda node: self._rank(node, centre))
@@ -149,17 +142,14 @@ class Choice:
                 yield Chosen(node.id, why if len(fitting) > 1 else "the only node that fits")
 
     def chosen(self, node: str, why: str) -> Chosen | None:
-        """Return ``node`` as the chosen node, or ``None`` if it does not fit or has no room.
-
-        :attr:`suits` is not asked.
-        """
+        # :attr:`suits` is not asked here.
         entry = self.config.nodes.get(node)
         if entry is None or not self.fits(node) or self._shortage(entry):
             return None
         return Chosen(node, why)
 
     def nodes(self) -> list[str]:
-        """Return the ids of the nodes that fit and that the requesters may use, even full ones."""
+        # The full ones count too.
         return [node.id for node in self._fitting() if self._is_permitted(node)]
 
     def _fitting(self) -> list[Node]:
@@ -214,7 +204,7 @@ class Choice:
         return (position.x - centre.x) ** 2 + (position.y - centre.y) ** 2
 
     def _centre(self) -> Position | None:
-        """Return the middle of the sources whose position is known; ``None`` if none is known."""
+        # the middle of the sources whose position is known
         sources = sorted({topic.source for _, topic in self.app.all_inputs()})
         placed = [at for source in sources if (at := self._position(source))]
         if not placed:
@@ -227,7 +217,6 @@ class Choice:
         return (entry.position if entry else None) or self.positions.get(node)
 
     def _closed(self, node: Node) -> str:
-        """Return why a node accepts no application at all, or an empty text."""
         if node.drained:
             return "is drained"
         return "" if node.id in self.config.domain_of else "is in no access domain"
@@ -236,11 +225,7 @@ class Choice:
         return permission.may_place(self.item, self.app.appdef, node.id, self.config)
 
     def none_fits(self) -> Fault:
-        """Return the fault for an application or a service that gets no node.
-
-        Call this only if :meth:`candidates` yields no node. The fault lists some nodes and what
-        each of them lacks. The nodes that lack the least come first.
-        """
+        """Return the fault if no node fits: what nodes lack, first those that lack the least."""
         if unknown := next(unmet(self.requirement, self.config), ""):
             return self._fault(unknown, "no-node")
         centre, code = self._centre(), "no-node"
@@ -278,11 +263,7 @@ class Choice:
 
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
-    """Yield a message for each part of a requirement that no node of the inventory can meet.
-
-    Such a part names a role or property that no node has, or compares a property with a value of
-    another type than the property has.
-    """
+    """Yield a message for each part of a requirement that no node of the inventory can meet."""
     role, roles = requirement.role, config.nodes_by_role.keys() - {""}
     if role and role not in roles:
         yield f"no node has the role {quoted(role)}{suggestion(role, roles)}"
@@ -301,7 +282,6 @@ def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
 
 
 def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
-    """Yield, in words, each part of a requirement that a node does not meet."""
     if requirement.role not in ("", node.type):
         yield f"the role {quoted(requirement.role)}"
     labels = node.labels() if requirement.labels else {}

@@ -53,8 +53,8 @@ def with_chosen_nodes(
 
     A booked application or service stays on its node if the node still fits. If other demands hold
     it too, it stays even on a node that is drained or no longer permitted. Any other application or
-    service gets the first node that fits and has room. ``placement`` in the settings decides the
-    order of the nodes. Finally, services move to the nodes that overrides name.
+    service gets the first node that fits and has room. Finally, services move to the nodes that
+    overrides name.
 
     If ``trial`` is given, a node is chosen only if ``trial`` returns ``True`` for the request with
     this node. It is not called for a node on which the application or service is booked already,
@@ -176,8 +176,7 @@ def _placed(
 def may_wait(request: DemandRequest, world: World, checkpoint: Callable[[], None]) -> bool:
     """Return whether a demand that lacks only room may wait.
 
-    For each application and service to place, there must be a node that would fit if it had room.
-    The node's access domain must let demands wait, and must ask for no approval.
+    Each application and service needs a node that would fit, in a domain that lets demands wait.
     """
     for item in request.demanded:
         app = item.held
@@ -192,20 +191,17 @@ def may_wait(request: DemandRequest, world: World, checkpoint: Callable[[], None
             choices.append(Choice(item, required, world, empty, claims, service))
         for choice in choices:
             checkpoint()
-            if not any(_waits_for(node, request, choice) for node in choice.nodes()):
+            for node in choice.nodes():
+                if world.config.domain_of[node].when_full == "wait":
+                    on_it = on_node(choice.app, node, choice.service, world)
+                    claim = _claim(request, replace(item, held=on_it))
+                    # A person approves only what can be booked at once, so what needs approval
+                    # cannot wait.
+                    if not permission.approval_reasons(request, [(None, claim)], world.config):
+                        break
+            else:
                 return False
     return True
-
-
-def _waits_for(node: str, request: DemandRequest, choice: Choice) -> bool:
-    config = choice.config
-    if config.domain_of[node].when_full != "wait":
-        return False
-    app = on_node(choice.app, node, choice.service, choice.world)
-    claim = _claim(request, replace(choice.item, held=app))
-    changes: list[tuple[Claim | None, Claim | None]] = [(None, claim)]
-    # A person approves only what can be booked at once, so what needs approval cannot wait.
-    return not permission.approval_reasons(request, changes, config)
 
 
 def _claim(request: DemandRequest, item: Demanded) -> Claim:
@@ -238,9 +234,8 @@ def _with_node(request: DemandRequest, item: Demanded, choice: Choice) -> Demand
 
 
 def _shared_node(app: Application, service: Service, world: World) -> str:
-    """Return the node on which another application has an instance to share, or an empty text."""
-    # If a second instance ran on another node, the application's node would get the same outputs
-    # twice.
+    # Another application may have an instance to share. If a second instance ran on another node,
+    # the application's node would get the same outputs twice.
     role = service.root or ""
     for topic in app.inputs.get(role, ()) if service.scope == "topic" else ():
         for claim in world.ledger.claims_reading(topic.source, topic.topic):
@@ -253,11 +248,7 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
 
 
 def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
-    """Return the node on which the application of ``demand`` is booked already and stays.
-
-    Return ``None`` if the generator may choose a node. Return a fault if another demand holds the
-    application on a node that lacks what ``demand`` requires.
-    """
+    """Return the booked node if it stays, a fault if it must but lacks something, or ``None``."""
     app, claims = choice.app, choice.world.ledger.claims_on(choice.app.subject)
     if not claims:
         return None
@@ -280,7 +271,6 @@ def _booked(choice: Choice, demand: str) -> Chosen | Fault | None:
 
 
 def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
-    """Return the first claim of a demand other than ``demand``, or ``None``."""
     others = (claim for claim in claims if claim.demand != demand and not claim.keeping_override)
     return next(others, None)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial, reduce
 from itertools import islice
@@ -50,11 +50,7 @@ from demandops.model.demand.demand_request import Demanded, Put
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
 
-# ---- moved connections: when an application moves, the connections of its demands follow ----
-#
-# The connections then carry the same topics to or from the new node, with the same type and
-# options.
-
+# ---- when an application moves, the connections of its demands follow, with type and options ----
 
 # Returns the given application on its new nodes.
 Move = Callable[[Application], Application]
@@ -63,32 +59,26 @@ Move = Callable[[Application], Application]
 def with_moved(
     world: World, claims: Iterable[Claim], move: Move
 ) -> tuple[World, tuple[ClaimChange, ...]]:
-    """Return the world with the applications of ``claims`` moved, and the changes of claims.
-
-    The connections of the demands that hold these claims follow the applications.
-    """
-    ledger, keys, claims = world.ledger, list[ClaimKey](), tuple(claims)
+    """Return the world with applications moved, followed by connections of their demands."""
+    ledger, claims = world.ledger, tuple(claims)
+    keys = [claim.key for claim in claims]
     for claim in claims:
         ledger = ledger.replace(claim.key, replace(claim, held=move(claim.application)))
-        keys.append(claim.key)
     for claim in claims:
         # A goal of the reference's action lists its connections itself, and its clients shut down
         # what they listed. So a move does not change these connections.
         if not claim.joined:
-            ledger, touched = _followed(replace(world, ledger=ledger), claim, move)
-            keys += touched
+            ledger, changed = _followed(replace(world, ledger=ledger), claim, move)
+            keys += changed
     return replace(world, ledger=ledger), claim_changes(world.ledger, ledger, keys)
 
 
 def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger in which the connections of a demand follow, and the changed keys.
-
-    ``claim`` is the demand's claim on the application before the move.
-    """
+    """Let a demand's connections follow an application, ``claim`` on which is not moved yet."""
     config, ledger, keys = world.config, world.ledger, list[ClaimKey]()
     app = claim.application
-    old, new = (flows(config, each) for each in (app, move(app)))
-    before, after = ({_path(flow) for flow in each} for each in (old, new))
+    old, new = flows(config, app), flows(config, move(app))
+    before, after = {_path(flow) for flow in old}, {_path(flow) for flow in new}
     needed = list(new)
     for other in ledger.claims_of_demand(claim.demand):
         if other.is_on_application and other.subject != claim.subject:
@@ -108,12 +98,25 @@ def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[Clai
                 reduced = replace(held, held=remaining) if remaining else None
                 ledger = ledger.replace(held.key, reduced)
                 keys.append(held.key)
-    for flow in new:
-        if _path(flow) not in before and derives:
-            carrier = carried.get((flow.topic, flow.target))
-            booked = _carried_by(flow, carrier, claim, replace(world, ledger=ledger))
-            ledger = ledger.replace(booked.key, booked)
-            keys.append(booked.key)
+    for flow in new if derives else ():
+        if _path(flow) in before:
+            continue
+        carrier = carried.get((flow.topic, flow.target))
+        former = carrier.topics[0] if carrier else None
+        brought = replace(flow, topic=former.read_topic) if former else flow
+        connection = connection_for(brought, carrier.known_type.word if carrier else "auto", ledger)
+        # If no claim brings the topic to the receiver yet, the connection gets the options of the
+        # one that carried the topic before.
+        if former and not ledger.is_carried_to(flow.receiver, flow.target):
+            same = replace(former, source=brought.topic, target=flow.target, reverse=False)
+            connection = replace(connection, topics=(same,))
+        put = Put("", (Demanded(connection, claim.requesters, str),))
+        (item,) = admission.with_chosen_types(put, config, ledger.connection).demanded
+        booked = replace(claim, held=item.held.booked(), partial={})
+        if current := ledger.get(booked.key):
+            booked = replace(current, held=current.connection.extended(booked.connection).booked())
+        ledger = ledger.replace(booked.key, booked)
+        keys.append(booked.key)
     return ledger, keys
 
 
@@ -121,19 +124,7 @@ def _path(flow: Flow) -> tuple[str, str, str, str]:
     return flow.topic, flow.sender, flow.receiver, flow.target
 
 
-def renaming(world: World, claim: Claim) -> Iterator[tuple[Flow, Route]]:
-    """Yield (flow, route) for each input whose topic is renamed by a connection of the demand.
-
-    The flow brings the input to the application, and the route renames the topic on the way.
-    """
-    for flow in flows(world.config, claim.application):
-        for _, route in _carrying(world.ledger, claim.demand, flow):
-            if flow.delivery is None and route.read_topic != route.written_topic:
-                yield flow, route
-
-
 def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, Route]]:
-    """Yield (the demand's claim, route) for each connection of a demand that carries a flow."""
     for id in ledger.connections_bringing(flow.receiver, flow.target):
         claim = ledger.get(ClaimKey(Subject(SubjectKind.CONNECTION, id), demand))
         if claim is not None:
@@ -143,54 +134,40 @@ def _carrying(ledger: Ledger, demand: str, flow: Flow) -> Iterator[tuple[Claim, 
                     yield claim, route
 
 
-def _carried_by(flow: Flow, carrier: Connection | None, claim: Claim, world: World) -> Claim:
-    """Return a demand's new or extended claim on the connection that carries a flow from now on.
-
-    ``carrier`` is the connection that carried the topic before the move, or ``None``. If no claim
-    brings the topic to the receiver yet, the connection gets its type and options.
-    """
-    route = carrier.topics[0] if carrier else None
-    flow = replace(flow, topic=route.read_topic) if route else flow
-    connection = connection_for(flow, carrier.known_type.word if carrier else "auto", world.ledger)
-    if route and not world.ledger.is_carried_to(flow.receiver, flow.target):
-        route = replace(route, source=flow.topic, target=flow.target, reverse=False)
-        connection = replace(connection, topics=(route,))
-    put = Put("", (Demanded(connection, claim.requesters, str),))
-    (item,) = admission.with_chosen_types(put, world.config, world.ledger.connection).demanded
-    booked = replace(claim, held=item.held.booked(), partial={})
-    current = world.ledger.get(booked.key)
-    if current is None:
-        return booked
-    return replace(current, held=current.connection.extended(booked.connection).booked())
-
-
 # ---- relocation: applications and services leave a drained node, and overrides move services ----
 #
 # Claims and definitions contain what is required of a node, so the original demands are not needed.
-# The connections of a moved application follow (:mod:`.relocation`).
 
 
 def with_moves(
     request: Drain, world: World, usage: Usage, names: Names, most: float = inf
 ) -> Drain:
-    """Return ``request`` with the moves of all applications and services that can leave the node.
-
-    After ``most`` tried nodes, the other applications are left for another drain.
-    """
+    """Return ``request`` with the moves that are possible, after ``most`` tried nodes no more."""
     start, moved, stays, keys = world, list[str](), list[str](), list[ClaimKey]()
     room, tried, last = Room(world, usage), 0, request.after
-    for id in applications_of(world.ledger, request.id):
+    node = request.id
+    for id in applications_of(world.ledger, node):
         if id <= request.after:
             continue
         if tried >= most:
             break
         last = id
-        for service in _placed_at(request.id, id, world):
-            ids = _moving_with(id, service, request.id, world)
-            claims = tuple(claim for each in ids for claim in world.ledger.application_claims(each))
-            what = [f"application '{each}'" for each in ids]
-            what = [f"service '{service.name}' of {each}" for each in what] if service else what
-            fixed = (_why_fixed(claim, request.id, service) for claim in claims)
+        app = world.ledger.application(id)
+        assert app is not None  # noqa: S101 - applications_of lists only claimed ones
+        definitions = world.config.services.get(app.appdef, {})
+        # The application itself is first, as ``None``.
+        leaving: list[Service | None] = [None] if app.node == node else []
+        leaving += [
+            definitions[name]
+            for name, at in sorted(app.services.items())
+            if at == node and name in definitions
+        ]
+        for service in leaving:
+            ids = _moving_with(id, service, node, world)
+            claims = tuple(claim for id in ids for claim in world.ledger.application_claims(id))
+            what = [f"application '{id}'" for id in ids]
+            what = [f"service '{service.name}' of {text}" for text in what] if service else what
+            fixed = (_why_fixed(claim, node, service) for claim in claims)
             outcome: _Moved | str = next(filter(None, fixed), "")
             tried += 1
             if not outcome:
@@ -200,12 +177,12 @@ def with_moves(
             if isinstance(outcome, str):
                 stays.append(f"{what[0]} stays, because {outcome}")
                 continue
-            world, chosen, touched, names = outcome
+            world, chosen, changed, names = outcome
             # ``world`` has the application on its new node, so ``room`` must count it on this node
-            for each in ids:
-                room.book(world.ledger.application_claims(each))
-            keys += touched
-            moved += [f"{each} is placed on {quoted(chosen.node)}, {chosen.why}" for each in what]
+            for moved_id in ids:
+                room.book(world.ledger.application_claims(moved_id))
+            keys += changed
+            moved += [f"{text} is placed on {quoted(chosen.node)}, {chosen.why}" for text in what]
     else:
         last = ""
     moves = claim_changes(start.ledger, world.ledger, keys)
@@ -216,18 +193,7 @@ def with_moves(
 _Moved = tuple[World, Chosen, list[ClaimKey], Names]
 
 
-def _placed_at(node: str, id: str, world: World) -> list[Service | None]:
-    """Return the services of an application on ``node``, and ``None`` first for itself."""
-    app = world.ledger.application(id)
-    if app is None:
-        return []
-    definitions = world.config.services.get(app.appdef, {})
-    names = sorted(name for name, at in app.services.items() if at == node and name in definitions)
-    return [*([None] if app.node == node else []), *(definitions[name] for name in names)]
-
-
 def _moving_with(id: str, service: Service | None, node: str, world: World) -> list[str]:
-    """Return the ids of the applications that must move together with ``id``, including ``id``."""
     app = world.ledger.application(id)
     if service is None or service.scope != "topic" or app is None:
         return [id]
@@ -242,7 +208,6 @@ def _moving_with(id: str, service: Service | None, node: str, world: World) -> l
 
 
 def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
-    """Return why a claim's application or service must stay on its node, or an empty text."""
     app = claim.application
     if service is not None:
         return f"demand '{claim.demand}' names the node" if service.name in app.named else ""
@@ -265,11 +230,7 @@ def applications_of(ledger: Ledger, node: str) -> list[str]:
 def _moved(
     world: World, claims: tuple[Claim, ...], room: Room, names: Names, service: Service | None
 ) -> tuple[_Moved | str, int]:
-    """Return the move of an application, or only of its ``service``, to the best other node.
-
-    If no move is possible, the result is the reason as a text. The second value is how many nodes
-    were tried.
-    """
+    """Return the move to the best other node, or why there is none, and how many were tried."""
     places = (claim.application.place or Requirement() for claim in claims)
     required = requirement_of(service) if service else reduce(Requirement.united, places)
     inputs: dict[str, dict[InputTopic, None]] = {}
@@ -282,7 +243,13 @@ def _moved(
     choice = Choice(demanded, required, world, room, claims, service)
     reasons: list[str] = []
     # On the sender's own node, no connection would rename the topic.
-    renamed = {flow.sender: route for claim in claims for flow, route in renaming(world, claim)}
+    renamed = {
+        flow.sender: route
+        for claim in claims
+        for flow in flows(world.config, claim.application)
+        for _, route in _carrying(world.ledger, claim.demand, flow)
+        if flow.delivery is None and route.read_topic != route.written_topic
+    }
     for chosen in islice(choice.candidates(), MOST_TRIED):
         if route := renamed.get(chosen.node):
             problem = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
@@ -300,22 +267,24 @@ def _moved(
 
 
 @dataclass(frozen=True, slots=True)
-class LedgerAfterMoves:
+class LedgerUpdate:
+    """The ledger after a change of overrides or claims, and the ledger files to write.
+
+    ``keys`` are the keys of the claims that may have changed. A file with ``None`` is removed.
+    """
+
     ledger: Ledger
-    # those of the claims that may have changed
     keys: tuple[ClaimKey, ...]
-    # (file, message) for each override that cannot move a service of an application
+    # (file, reason) for each override and each application whose service it cannot move
     stays: tuple[tuple[str, str], ...]
+    files: Mapping[str, str | None] = field(default_factory=dict)
 
 
-def following_overrides(
-    world: World, subjects: Iterable[Subject] | None = None
-) -> LedgerAfterMoves:
-    """Return the ledger after services have moved to the nodes that overrides name.
+def following_overrides(world: World, subjects: Iterable[Subject] | None = None) -> LedgerUpdate:
+    """Return the ledger after services have moved to the nodes that overrides name; no files.
 
-    The connections follow the services. A service also moves back when no override moves it any
-    longer. A service stays if the move would cause a fault. ``subjects`` are the subjects whose
-    claims changed; ``None`` means all applications.
+    A service moves back when no override moves it any longer, and stays if the move would cause a
+    fault. ``subjects`` are those whose claims changed; ``None`` means all applications.
     """
     ids = [subject.id for subject in subjects or () if subject.kind is SubjectKind.APPLICATION]
     if subjects is None:
@@ -352,15 +321,24 @@ def following_overrides(
             world, names = after, moved_names
             keys += [each.key for own in changes.values() for each in own]
         else:
-            stays += _unmoved(ids[0], world, fault)
-    return LedgerAfterMoves(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
+            app = world.ledger.application(ids[0])
+            assert app is not None  # noqa: S101 - it is claimed
+            nodes = change(app).moved
+            changed = {
+                name for name in {*nodes, *app.moved} if nodes.get(name) != app.moved.get(name)
+            }
+            for override in world.overrides:
+                services = sorted(name for name in changed if nodes.get(name) == override.node)
+                if override.node and services:
+                    message = (
+                        f"does not move {' and '.join(services)} of application '{app.id}' to "
+                        f"'{override.node}': {fault.message}"
+                    )
+                    stays.append((override.path, message))
+    return LedgerUpdate(world.ledger, tuple(dict.fromkeys(keys)), tuple(stays))
 
 
 def with_restored_moves(request: Restoration, world: World) -> Restoration:
-    """Return the restoration with its claims adapted to the overrides that move services now.
-
-    A service whose move would cause a fault among these claims is not adapted.
-    """
     if not any(override.node for override in world.overrides) and not any(
         claim.is_on_application and claim.application.moved for claim in request.claims
     ):
@@ -381,29 +359,10 @@ def _all_moved(
     return world, changes, collisions.followed(names, before, world, keys)
 
 
-def _unmoved(id: str, world: World, fault: Fault) -> Iterator[tuple[str, str]]:
-    app = world.ledger.application(id)
-    assert app is not None  # noqa: S101 - it is claimed
-    moved = with_overridden_nodes(app, world).moved
-    changed = {name for name in {*moved, *app.moved} if moved.get(name) != app.moved.get(name)}
-    nodes = {moved[name] for name in changed if name in moved}
-    for override in world.overrides:
-        if override.node in nodes:
-            services = " and ".join(sorted(n for n in changed if moved.get(n) == override.node))
-            yield (
-                override.path,
-                f"does not move {services} of application '{app.id}' to '{override.node}': "
-                f"{fault.message}",
-            )
-
-
 def _faults(
     before: World, after: World, changes: tuple[ClaimChange, ...], names: Names
 ) -> Iterator[Fault]:
-    """Yield the faults of moved claims; each claim is checked as if it were demanded now.
-
-    ``names`` are those of all releases in ``after``.
-    """
+    """Yield the faults of moved claims; each claim is checked as if it were demanded now."""
     for change in changes:
         claim = change.after
         if claim is None:
@@ -449,7 +408,7 @@ def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
             for from_node, to_node in [other.sender_and_receiver(*connection.nodes)]
             if (to_node, other.written_topic) == target
         }
-        for other_sender in senders - {sender}:
+        for other_sender in sorted(senders - {sender}):
             topic = quoted(route.written_topic)
             words = f"{topic} would come from {quoted(sender)} and from {quoted(other_sender)}"
             yield Fault("conflict", "", words)
@@ -462,20 +421,6 @@ def _brought_twice(claim: Claim, after: World) -> Iterator[Fault]:
 # stays in effect, so what runs depends on files alone and not on a clock.
 
 
-@dataclass(frozen=True, slots=True)
-class LedgerUpdate:
-    """The ledger after a change of overrides or claims, and the ledger files to write.
-
-    ``keys`` are the keys of the claims that may have changed. A file with ``None`` is removed.
-    """
-
-    ledger: Ledger
-    keys: tuple[ClaimKey, ...]
-    files: Mapping[str, str | None]
-    # (file, reason) for each override and each application whose service it cannot move
-    stays: tuple[tuple[str, str], ...] = ()
-
-
 def update_ledger(
     before: World,
     after: World,
@@ -486,7 +431,7 @@ def update_ledger(
     """Return the ledger that a change of the configuration requires, and the files to write.
 
     ``subjects`` are those whose claims a person changed. ``markers`` are the ledger's markers of
-    ended overrides, by path. ``now`` is also the booking time of claims that an override books.
+    ended overrides, by path.
     """
     # An override that is merged after its end never applies. One that was in effect before stays
     # in effect until the generator's own commit ends it.
@@ -512,27 +457,21 @@ def update_ledger(
     moved = following_overrides(replace(after, ledger=update.ledger))
     keys = (*update.keys, *moved.keys)
     files |= changed_claim_files(after.ledger, moved.ledger, keys)
-    return LedgerUpdate(moved.ledger, keys, files, moved.stays)
+    return replace(moved, keys=keys, files=files)
 
 
 def update_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> LedgerUpdate:
-    """After claims changed, update the kept claims and the moved services on these subjects.
-
-    ``before`` is the ledger before the change, ``after`` the world after it. ``now`` is the booking
-    time of each claim that an override books.
-    """
     subjects = tuple(subjects)
     ledger, kept = update_kept_claims(before, after, subjects, now)
     moved = following_overrides(replace(after, ledger=ledger), subjects)
     keys = (*kept, *moved.keys)
     files = changed_claim_files(after.ledger, moved.ledger, keys)
-    return LedgerUpdate(moved.ledger, keys, files, moved.stays)
+    return replace(moved, keys=keys, files=files)
 
 
 def end_override(world: World, override: Override, now: datetime) -> LedgerUpdate:
-    """Return the ledger after the end of an override, and the files to write with the marker."""
     if override.end is None:
         raise ValueError(f"{override.path} has no end")
     ended = {**world.ledger.ended, override.name: format_time(override.end)}
@@ -559,16 +498,12 @@ def changed_claim_files(
 
 def expired_overrides(world: World, now: datetime) -> list[Override]:
     """Return the overrides in effect although their end has passed, sorted by end."""
-    expired = [
-        (override.end, override.name, override)
-        for override in world.overrides
-        if override.end and override.end <= now
-    ]
-    return [override for _, _, override in sorted(expired, key=lambda item: item[:2])]
+    ends = [(each.end, each.name, each) for each in world.overrides if each.end]
+    expired = [each for each in ends if each[0] <= now]
+    return [override for _, _, override in sorted(expired, key=lambda each: each[:2])]
 
 
 def changed_override_files(before: World, after: World) -> list[str]:
-    """Return, sorted, the paths of the overrides that come into effect, change or end."""
     old = {override.name: override for override in before.overrides}
     new = {override.name: override for override in after.overrides}
     names = [name for name in {*old, *new} if old.get(name) != new.get(name)]

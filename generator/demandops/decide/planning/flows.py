@@ -34,11 +34,7 @@ from demandops.model.release import ServiceKey
 def outputs(
     config: Config, service: Service, key: ServiceKey, *, further: bool = False
 ) -> dict[str, str]:
-    """Return the topics that a service instance publishes, by the name of the output.
-
-    ``further`` is true if the instance runs for a further topic of a source. It is ignored if the
-    inventory names the usual topic.
-    """
+    """Return the topics by output; ``further`` is ignored if the inventory names the usual one."""
     if service.root is None:
         instance = naming.topic_part(key.application or key.node)
     else:
@@ -51,10 +47,7 @@ def outputs(
 
 
 def distinguishing_text(config: Config, role: str, topic: InputTopic, version: str) -> str:
-    """Return the text that makes topic names differ although their source is the same.
-
-    It contains ``topic`` if this is a further topic of its source, and ``version``.
-    """
+    """Return the text that makes topic names differ although their source is the same."""
     usual = usual_topic(config, topic.source, role)
     further = topic.further if usual is None else topic.topic != usual
     return topic.distinguishing_text(further, version)
@@ -71,16 +64,12 @@ def topic_name(pattern: str, instance: str) -> str:
 
 
 def usual_topic(config: Config, source: str, role: str) -> str | None:
-    """Return the usual topic of a source that the inventory names for ``role``, or ``None``."""
     node = config.nodes.get(source)
     return node.topics.get(role) if node else None
 
 
 def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
-    """Return the request in which ``further`` says for each input whether it is a further topic.
-
-    Only inputs that may have a service instance of their own are marked.
-    """
+    """Return the request with ``further`` set for inputs that may have an instance."""
     if not request.adds_claims:
         return request
     # The claims of the put's own demand do not count, because the put may release their topics.
@@ -101,7 +90,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 
     apps = [item.held for item in request.demanded if isinstance(item.held, Application)]
     # A usual topic that is booked stays the usual one, even if the request lists it after others.
-    for role, topic in (each for app in apps for each in _per_topic(app, config)):
+    for role, topic in (input for app in apps for input in _per_topic(app, config)):
         booked = ledger.booked_input(role, topic.source, topic.topic)
         if booked is not None and not booked.further:
             first.setdefault((role, topic.source), topic.topic)
@@ -115,10 +104,7 @@ def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> 
 
 
 def with_booked_topics_marked(ledger: Ledger, config: Config) -> Ledger:
-    """Return the ledger with ``further`` set in claims that were read from an earlier format.
-
-    In this format, the files of claims do not say which topics are further topics.
-    """
+    """Return the ledger with ``further`` set in claims of a format whose files do not say it."""
     first: dict[tuple[str, str], str] = {}
 
     def is_further(role: str, topic: InputTopic) -> bool:
@@ -151,9 +137,7 @@ def _marked(
     )
 
 
-# ---- flows ----
-#
-# The flow of topics through an application: which topics services read, and where they come from.
+# ---- flows: which topics the services of an application read, and where they come from ----
 #
 # The flows of a demand follow from its own applications and the configuration, never from other
 # demands. So the connections that a demand needs are claimed by it and end with it.
@@ -162,9 +146,8 @@ def _marked(
 class PublishedTopic(NamedTuple):
     """A topic of an application, and the node that publishes the topic.
 
-    ``root`` is the key of the demanded input from which ``topic`` comes: ``topic`` itself, or the
-    input from which services make ``topic``. It is empty if a service makes ``topic`` from all its
-    inputs together.
+    ``root`` is the key of the demanded input that ``topic`` is, or from which services make it. It
+    is empty if a service makes ``topic`` from all its inputs together.
     """
 
     topic: InputTopic
@@ -194,16 +177,11 @@ class Flow:
 
     @property
     def is_output(self) -> bool:
-        """Whether a service makes the topic; if not, the demand lists it as an input."""
         return "." in self.name
 
 
 def node_of(app: Application, service: Service, source: str) -> str:
-    """Return the node where a service of an application runs for inputs from ``source``.
-
-    The result is empty if no node is chosen for the service yet, or if the service runs once for
-    each cluster and has no node in the application's cluster.
-    """
+    """Return the service's node for inputs from ``source``; empty if there is none yet."""
     if service.nodes:
         return service.runs_at.get(app.node, "")
     if service.at_source:
@@ -229,10 +207,7 @@ def instances(app: Application, service: Service) -> Iterator[ServiceKey]:
 
 
 def version_of_instance(app: Application, service: Service) -> str:
-    """Return the ``version`` in the keys of a service's instances.
-
-    It is the version of the application if this is a separate instance, and empty otherwise.
-    """
+    """Return the ``version`` in the keys of a service's instances; empty unless separate."""
     # A shared service runs once for all versions: two drivers of one sensor do not work.
     return "" if service.shared else app.own_version
 
@@ -250,10 +225,7 @@ def roots_of(app: Application, service: Service, key: ServiceKey) -> list[TopicK
 
 
 def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[PublishedTopic]:
-    """Yield the topics of an application that ``origin`` names.
-
-    ``origin`` is an input role of the application, or ``<service>.<output>`` of its definition.
-    """
+    """Yield the topics that ``origin`` names: an input role, or ``<service>.<output>``."""
     name, _, output = origin.partition(".")
     if not output:
         for topic in app.inputs.get(origin, ()):
@@ -279,11 +251,7 @@ def topics_of_origin(config: Config, app: Application, origin: str) -> Iterator[
 
 
 def flows(config: Config, app: Application) -> list[Flow]:
-    """Return the flows that an application needs between nodes, sorted by ``name``.
-
-    The result is empty if the application definition is missing. A node that is not chosen yet is
-    an empty text.
-    """
+    """Return the flows between nodes by ``name``; a node that is not chosen yet is empty."""
     services = config.services.get(app.appdef, {})
     # Several services of one node may read a topic, but it must come to the node only once.
     needed: dict[tuple[str, str, str, str], Flow] = {}
@@ -309,7 +277,6 @@ def flows(config: Config, app: Application) -> list[Flow]:
 
 
 def _parts(app: Application, service: Service) -> Iterator[tuple[str, Application]]:
-    """Yield (node, application with only the inputs of this instance) for each instance."""
     if service.root is not None:
         for topic in app.inputs.get(service.root, ()):
             yield node_of(app, service, topic.source), app.with_inputs({service.root: (topic,)})
@@ -343,9 +310,7 @@ def _needing_field(field: str, path: str) -> str:
 def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
     """Return the request with a connection for each flow that no listed connection brings.
 
-    If a claimed connection carries the flow, the demand claims this connection too. Otherwise the
-    demand gets a derived connection between the two nodes. An application with ``connect: none``
-    gets no connection.
+    It is the claimed connection that carries the flow, or else a derived one.
     """
     first: dict[_Ends, Demanded] = {}
     routes: dict[_Ends, dict[tuple[str, str], Route]] = {}
@@ -392,14 +357,12 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
             for route in needed.topics:
                 names = (route.source, route.target)
                 topics[names] = route if route.type else topics.get(names, route)
-    demanded = []
-    for item in request.demanded:
+    demanded = list(request.demanded)
+    for index, item in enumerate(demanded):
         if isinstance(item.held, Connection):
             more = routes.pop((item.held.id, *item.held.nodes), {})
-            carried = (*item.held.topics, *more.values())
-            demanded.append(_with_topics(item, carried) if more else item)
-        else:
-            demanded.append(item)
+            if more:
+                demanded[index] = _with_topics(item, (*item.held.topics, *more.values()))
     implied = (_with_topics(first[ends], topics.values()) for ends, topics in routes.items())
     return replace(request, demanded=(*demanded, *implied))
 
@@ -412,15 +375,11 @@ def _with_topics(item: Demanded, topics: Iterable[Route]) -> Demanded:
 def without_idle_deliveries(
     before: Ledger, after: World, changes: Changes
 ) -> tuple[Ledger, Changes]:
-    """Return the ledger and changes, both without deliveries of outputs that are no longer made.
-
-    ``before`` is the ledger before a node is decommissioned, ``after`` the world after it, and
-    ``changes`` is what this changes.
-    """
+    """Return the ledger and changes, both without deliveries of outputs that are no longer made."""
     ledger, keys = after.ledger, [change.key for change in changes.claims]
-    # With the node a demand may lose an input, and with the input an output of its application. The
-    # demand may still hold the connection that delivers this output from one remaining node to
-    # another, where nothing would come any longer.
+    # With a decommissioned node a demand may lose an input, and with the input an output of its
+    # application. The demand may still hold the connection that delivers this output from one
+    # remaining node to another, where nothing would come any longer.
     for change in changes.claims:
         if change.before is None or change.key.subject.kind is not SubjectKind.APPLICATION:
             continue
@@ -439,11 +398,7 @@ def without_idle_deliveries(
 
 
 def connection_for(flow: Flow, type: str, ledger: Ledger) -> Connection:
-    """Return the connection that carries a flow, with the flow's topic as its only topic.
-
-    It is the claimed connection that carries the flow already, or a derived one of ``type``. With
-    ``auto``, a derived connection has no type yet.
-    """
+    """Return the claimed connection that carries a flow, or a derived one, only with its topic."""
     ends, names = (flow.sender, flow.receiver), (flow.topic, flow.target)
     for id in ledger.connections_bringing(flow.receiver, flow.target):
         for claim in ledger.connection_claims(id):

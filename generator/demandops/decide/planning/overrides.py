@@ -19,7 +19,7 @@ from demandops.model.demand.claim import (
     requesters_of,
 )
 from demandops.model.demand.demand_request import Demanded
-from demandops.model.ledger.ledger import Changes, Ledger, World, claim_changes
+from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.release import Release, ServiceRelease, claims_of, overridden
 
 # ---- effects on claims: ``deny`` suspends claims, ``keep`` books further claims ----
@@ -49,7 +49,6 @@ class Traits:
 
 
 def with_overridden_nodes(app: Application, world: World) -> Application:
-    """Return an application with its services moved to the nodes that overrides name."""
     moving = [override for override in world.overrides if override.node]
     nodes: dict[str, str] = {}
     for service in world.config.services.get(app.appdef, {}).values() if moving else ():
@@ -100,8 +99,6 @@ def selects(override: Override, traits: Traits, config: Config) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class UnsuspendedClaims(Ledger):
-    """A read-only view of a ledger, in which suspended claims are missing."""
-
     # A claim is checked when it is read, so there is no second ledger to keep up to date.
     world: World | None = field(default=None, compare=False)
 
@@ -147,7 +144,6 @@ class UnsuspendedClaims(Ledger):
 
 
 def without_suspended(world: World) -> World:
-    """Return the world with a view of its ledger that leaves out suspended claims."""
     ledger = world.ledger
     if isinstance(ledger, UnsuspendedClaims) or not any(each.deny for each in world.overrides):
         return world
@@ -157,16 +153,12 @@ def without_suspended(world: World) -> World:
 
 
 def suspended_by(claim: Claim, world: World) -> Override | None:
-    """Return the override of the highest rank that suspends a claim, or ``None``."""
     return denied_by(traits_of(claim), world) if world.overrides else None
 
 
 def denied_by(traits: Traits, world: World) -> Override | None:
-    """Return the override that denies a claim, demand or release with these traits, or ``None``.
-
-    For the release of a service, only selectors that name services count. For a claim or a demand,
-    only the others count.
-    """
+    # For the release of a service, only selectors that name services count. For claims and
+    # demands, only the others count.
     for override in reversed(world.overrides):
         if override.deny and any(
             bool(selector.services) is bool(traits.service) and fits(selector, traits, world.config)
@@ -177,7 +169,6 @@ def denied_by(traits: Traits, world: World) -> Override | None:
 
 
 def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
-    """Yield (claim, suspending override) for each suspended claim, sorted by subject."""
     if not any(override.deny for override in world.overrides):
         return
     for claim in sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand)):
@@ -186,33 +177,10 @@ def suspended_claims(world: World) -> Iterator[tuple[Claim, Override]]:
             yield claim, override
 
 
-def without_kept_claims(ledger: Ledger, subjects: Iterable[Subject]) -> Ledger:
-    for subject in subjects:
-        ledger = ledger.without(ledger.kept_claims(subject))
-    return ledger
-
-
-def with_kept_claims(
-    before: Ledger, after: World, changes: Changes, subjects: Iterable[Subject], now: datetime
-) -> tuple[Ledger, Changes]:
-    """Update the kept claims after a booking; return the ledger and all changes.
-
-    ``subjects`` are updated as well, although the booking may not have changed them.
-    """
-    keys = [change.key for change in changes.claims]
-    touched = dict.fromkeys((*changes.subjects(), *subjects))
-    ledger, kept = update_kept_claims(before, after, touched, now)
-    return ledger, replace(changes, claims=claim_changes(before, ledger, [*keys, *kept]))
-
-
 def update_kept_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> tuple[Ledger, list[ClaimKey]]:
-    """Return the ledger in which ``subjects`` have exactly the kept claims that overrides want.
-
-    The second value has the keys of all kept claims on ``subjects``, before and after the update.
-    ``now`` is the booking time of each claim that an override books.
-    """
+    """Give ``subjects`` the kept claims that overrides want; return all old and new keys."""
     keys, ledger = list[ClaimKey](), after.ledger
     for subject in subjects:
         existing = [*ledger.kept_claims(subject), *before.kept_claims(subject)]
@@ -234,11 +202,7 @@ def kept_subjects(ledger: Ledger) -> tuple[Subject, ...]:
 def _kept_claim(
     existing: list[Claim], before: tuple[Claim, ...], world: World, now: datetime
 ) -> Claim | None:
-    """Return the claim by which an override keeps a subject that no demand holds, or ``None``.
-
-    It is one of ``existing``, the kept claims before the update, or a copy of the last of the
-    claims that were on the subject ``before`` the change.
-    """
+    """Return one of the ``existing`` kept claims, or a copy of the last claim ``before``."""
     for claim in existing:
         keeping = keeping_overrides(claim, world)
         if any(override.name == claim.keeping_override for override in keeping):
@@ -274,7 +238,7 @@ def keeping_overrides(claim: Claim, world: World) -> list[Override]:
     return [override for override in keeping if selects(override, traits, world.config)]
 
 
-# ---- the effects of overrides on a planned release: version, node, replicas, or denial ----
+# ---- effects on a planned release: version, node, replicas, or denial ----
 #
 # Pins of images and patches of Helm values are applied later, when the release is rendered.
 
@@ -312,10 +276,9 @@ def service_denied_by(release: Release, world: World) -> Override | None:
 def apply_effects(
     release: Release, by: Iterable[tuple[Override, tuple[str, ...]]], config: Config
 ) -> Release:
-    """Return a release with the effects of overrides; the last override wins.
+    """Return a release with the effects of overrides, of which the last one wins.
 
-    ``by`` has pairs of an override and the names of its effects on the release. The effects on
-    images and Helm values are only recorded, in :attr:`ServiceRelease.shaping`.
+    Effects on images and Helm values are only recorded, in :attr:`ServiceRelease.shaping`.
     """
     by = tuple(by)
     if not by:
@@ -337,10 +300,7 @@ def apply_effects(
 
 
 def effects_on(release: Release, override: Override, config: Config) -> tuple[str, ...]:
-    """Return the names of the effects that an override has on a release that it selects.
-
-    ``deny`` and ``keep`` are never among them, because they are not effects on a release.
-    """
+    """Return the effects that an override has on a release; never ``deny`` and ``keep``."""
     possible = {"hold"}
     if isinstance(release, ServiceRelease):
         versions = config.charts[release.service.chart].versions()

@@ -39,14 +39,11 @@ from demandops.model.release import Release, ServiceKey, ServiceRelease, replica
 
 
 def plan(world: World, key: ReleaseKey) -> Release | None:
-    """Return the release at ``key`` with the effects of overrides.
-
-    Return ``None`` if no claim needs the release, or if an override denies it.
+    """Return the release at ``key``, or ``None`` if no claim needs it or an override denies it.
 
     Raises:
-        Refused: if claims contradict each other in a parameter; if the value of a parameter cannot
-            be used; if application definitions that share a service pin different images of one
-            chart version; or if the configuration no longer has what a claim needs.
+        Refused: if claims contradict each other, if a value of a parameter cannot be used, or if
+            the configuration no longer has what a claim needs.
     """
     world = without_suspended(world)
     release = _unshaped(world, key)
@@ -61,7 +58,6 @@ def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
 
 
 def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
-    """Return the release at ``key`` and the override that denies it, or ``None``."""
     world = without_suspended(world)
     release = _unshaped(world, key)
     override = overrides.service_denied_by(release, world) if release else None
@@ -141,10 +137,7 @@ def _as_claimed(world: World, app: Application) -> Application:
 def _parts(
     world: World, service: Service, key: ServiceKey, apps: Iterable[Application]
 ) -> Iterator[Application]:
-    """Yield each application with only those inputs that the instance at ``key`` depends on.
-
-    Several claims on one application give one application with the inputs of all these claims.
-    """
+    """Yield each application once, with only the inputs that the instance depends on."""
     claimed: dict[str, list[Application]] = {}
     for app in apps:
         claimed.setdefault(app.id, []).append(app)
@@ -181,11 +174,7 @@ def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str
 def demanded_inputs(
     world: World, release: ServiceRelease, app: Application
 ) -> Iterator[tuple[str, str, TopicKey]]:
-    """Yield (role, topic, root) for each topic that a service reads because of an application.
-
-    ``role`` is the service's input that reads the topic. ``root`` is the key of the demanded topic
-    from which this topic comes, or empty (:class:`.flows.PublishedTopic`).
-    """
+    """Yield (role, topic, root) for each topic that a service reads for an application."""
     service, key = release.service, release.key
     app = _as_claimed(world, app).with_inputs(app.inputs)
     if service.roots:
@@ -202,15 +191,11 @@ def demanded_inputs(
 
 
 def service_name(config: Config, service: Service, key: ServiceKey) -> str:
-    """Return the release name of a service instance, such as ``od-edge-vehicle00``.
-
-    If the instance runs for a topic, the name contains the node and the topic's source. The name
-    also contains a slug of the topic, unless ``topics`` in the source's inventory entry lists the
-    topic as the usual one. For a separate instance, the name also contains the version.
-    """
+    """Return the release name of a service instance, such as ``od-edge-vehicle00``."""
     if service.root is None:
         return naming.object_name(service.prefix, key.application or key.node)
     source, topic = str(key.source), str(key.topic)
+    # Only the inventory makes a topic the usual one here, so a name never depends on other demands.
     further = [] if topic == usual_topic(config, source, service.root) else [topic]
     version = [key.version] if key.version else []
     return naming.object_name(service.prefix, key.node, source, *further, *version)
@@ -231,16 +216,13 @@ def _merged_value(name: str, parameter: Parameter, claims: list[Claim]) -> objec
         return [unique[text] for text in sorted(unique)]
     if parameter.merge in ("max", "min"):
         numbers = [value for value in values if _is_number(value)]
-        if len(numbers) != len(values):
-            odd, claim = next(
-                (value, claim)
-                for value, claim in zip(values, claims, strict=True)
-                if not _is_number(value)
-            )
+        for value, claim in zip(values, claims, strict=True):
+            if _is_number(value):
+                continue
             message = (
-                f"{strict_yaml.short_repr(odd)} for {', '.join(claim.requesters)} is not a number, "
-                f"but the application definition merges the values by {parameter.merge}; give a "
-                "number"
+                f"{strict_yaml.short_repr(value)} for {', '.join(claim.requesters)} is not a "
+                f"number, but the application definition merges the values by {parameter.merge}; "
+                "give a number"
             )
             raise Refused.at(f"parameters.{name}", message)
         return max(numbers) if parameter.merge == "max" else min(numbers)
@@ -273,12 +255,6 @@ class _ClaimedConnections:
         return self.world.ledger.connections_at(self.type, node)
 
     def get(self, id: str) -> Connection | None:
-        """Return the connection with an id, or ``None`` if no connection of :attr:`type` has it.
-
-        Raises:
-            Refused: if a person wrote a claim with a route that this type cannot carry, or
-                removed from the inventory what the connection needs.
-        """
         first, claims = self.world.ledger.connection(id), self.world.ledger.connection_claims(id)
         if first is None or first.type is not self.type:
             return None
@@ -287,6 +263,8 @@ class _ClaimedConnections:
             for route in connection_topics(claims)
             if not is_bridged(route, *first.nodes, self.world.config)
         )
+        # A person may have written a claim with a route that this type cannot carry, or have
+        # removed from the inventory what the connection needs.
         problems = list(route_faults(self.type, topics, first.nodes, self.world.config))
         if problems:
             raise Refused(
@@ -298,12 +276,10 @@ class _ClaimedConnections:
 
 
 def connection_topics(claims: Iterable[Claim]) -> tuple[Route, ...]:
-    """Return one route for each source topic that the claims list, sorted by topic."""
     return routes.merged_routes(route for claim in claims for route in claim.connection.topics)
 
 
 def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
-    """Return whether the initial deployment already carries a route between two nodes."""
     sender, receiver = route.sender_and_receiver(source, target)
     node = config.nodes.get(sender)
     # The initial deployment keeps topic names, so it carries no route that renames a topic.
@@ -312,9 +288,7 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
     return route.read_topic in node.bridged.get(receiver, ())
 
 
-# ---- scale down ----
-#
-# When a service gets fewer replicas: at once, or after the time in the service's definition.
+# ---- scale down: a service gets fewer replicas at once, or after the time in its definition ----
 #
 # If the definition has such a time and demands need fewer replicas than before, the decision
 # records how many replicas the service keeps, and until when (:mod:`.records`). When that time is
@@ -324,10 +298,6 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
 def with_kept_replicas(
     before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
 ) -> tuple[Ledger, tuple[Instance, ...]]:
-    """Return the updated ledger, and the service instances whose kept replicas changed.
-
-    ``keys`` are the keys of the releases that the demand may change.
-    """
     kept, changed = after.ledger.kept, list[Instance]()
     for key in keys:
         if not isinstance(key, ServiceKey):
@@ -358,17 +328,10 @@ def _number(release: ServiceRelease | None) -> int:
     return release.replicas if release and isinstance(release.replicas, int) else 0
 
 
-def without_ended(world: World, instance: Instance, now: datetime) -> Ledger:
-    kept = world.ledger.kept
-    steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
-    return replace(world.ledger, kept=kept.replace(instance, steps))
-
-
 # ---- a plan that follows a sequence of ledgers, to verify commits ----
 #
-# Planning is a function of ledger and configuration. The plan records which parts of the ledger
-# were read for each release. As long as none of these parts changes, the release stays the same, so
-# only the other releases are planned again. The generator instead predicts which releases a claim
+# The plan records which parts of the ledger were read for each release. Only if one of these parts
+# changes is the release planned again. The generator instead predicts which releases a claim
 # affects (:func:`.release_keys.affected_keys`), but a proof must not rely on that prediction.
 
 T = TypeVar("T")
@@ -395,9 +358,8 @@ class TracedPlan:
     ) -> dict[ReleaseKey, Release | None]:
         """Plan the releases that the changes may affect; the first call plans all releases.
 
-        ``kept`` are the service instances whose kept replicas changed. A release that does not run
-        any longer is ``None``. If this raises ``Refused``, the plan is out of date and must not be
-        used again.
+        A release that does not run any longer is ``None``. If this raises ``Refused``, the plan is
+        out of date and must not be used again.
         """
         # The reads whose result may differ now.
         reads: set[_Read] = {_ALL, *kept}
@@ -412,7 +374,7 @@ class TracedPlan:
         for subject in ledger.claims:
             if subject in stale or subject not in self._keys:
                 self._keys[subject] = self._traced(ledger, subject, keys_needed)
-        for subject in [unit for unit in stale if unit in self._keys]:
+        for subject in self._keys.keys() & stale:
             if subject not in ledger.claims:
                 del self._keys[subject]
         needed = {key for keys in self._keys.values() for key in keys}
@@ -440,8 +402,6 @@ class TracedPlan:
 
 
 class _Recording:
-    """Wraps one of the ledger's mappings, and records which keys are read."""
-
     def __init__(self, map: Any, reads: set[_Read]) -> None:  # noqa: ANN401 - either map
         self._map, self._reads = map, reads
 

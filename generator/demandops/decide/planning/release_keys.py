@@ -27,10 +27,7 @@ from demandops.model.release import ServiceKey
 
 
 def running_version(world: World, application: str) -> ApplicationVersion | None:
-    """Return the deployed version of an application.
-
-    Return ``None`` if no claim holds the application, or if its appdef is missing.
-    """
+    """Return the deployed version; ``None`` if nobody holds it or its appdef is missing."""
     app = world.ledger.application(application)
     versions = world.config.application_versions.get(app.appdef) if app else None
     return newest_asked(world.ledger, application, versions) if versions else None
@@ -44,9 +41,8 @@ def newest_asked(
     return max((versions[word] for word in asked or ("",)), key=lambda version: version.rank)
 
 
-def same_version(one: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
-    """Return whether two versions of one appdef have the same rank, or both are ``None``."""
-    return (one and one.rank) == (other and other.rank)
+def same_version(version: ApplicationVersion | None, other: ApplicationVersion | None) -> bool:
+    return (version and version.rank) == (other and other.rank)
 
 
 def version_of_service(
@@ -81,7 +77,6 @@ def version_of_service(
 
 
 def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...]:
-    """Return what a version pins for a service: the version of the chart, and the images."""
     pins = (version.images.get(name) for name in service.images)
     return version.charts[service.chart].version, *pins
 
@@ -89,8 +84,7 @@ def contents(version: ApplicationVersion, service: Service) -> tuple[object, ...
 # ---- the keys of the releases that claims need, and of those that a change of claims affects ----
 #
 # Only the releases that :func:`affected_keys` returns are planned again for a demand, so the cost
-# of a demand does not grow with the number of other demands. :mod:`.planner` plans the release at
-# each key.
+# of a demand does not grow with the number of other demands.
 
 ReleaseKey = ServiceKey | ClientKey
 
@@ -108,10 +102,7 @@ def keys_of(world: World, subject: Subject, *, strict: bool = False) -> Iterator
 def keys_of_claims(
     world: World, claims: Iterable[Claim], *, strict: bool = False
 ) -> Iterator[ReleaseKey]:
-    """Yield the keys of the releases that ``claims`` need in ``world``, each once.
-
-    ``strict`` means the same as for :func:`keys_of`.
-    """
+    """Yield the keys of the releases that ``claims`` need in ``world``, each once."""
     keys: dict[ReleaseKey, None] = {}
     for claim in claims:
         if not claim.is_on_application:
@@ -157,10 +148,7 @@ def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
 
 
 def is_needed(world: World, key: ReleaseKey) -> bool:
-    """Return whether a claim needs a service instance or a client.
-
-    Callers pass a world without suspended claims if these must not count.
-    """
+    """Return whether a claim needs a release; suspended claims in ``world`` count."""
     if isinstance(key, ClientKey):
         if key.side is None:
             return bool(world.ledger.connections_at(key.type, key.id))
@@ -183,10 +171,7 @@ def takes(app: Application, service: Service, key: ServiceKey) -> bool:
 
 
 def _service(world: World, application: str, key: ServiceKey) -> Service | None:
-    """Return the application's service to which the instance at ``key`` may belong, or ``None``.
-
-    For example, no instance on a node belongs to an application that moved to another node.
-    """
+    """Return the service of an application to which the instance may belong, or ``None``."""
     first = world.ledger.application(application)
     services = world.config.services.get(first.appdef, {}) if first else {}
     service = services.get(key.service)
@@ -225,11 +210,7 @@ def affected_keys(
 
 
 def _differing(change: ClaimChange, world: World) -> tuple[Claim | None, Claim | None]:
-    """Return the claim before and the claim after a change, reduced to what differs.
-
-    If the claims differ only in inputs, the inputs that are in both claims are left out of both.
-    Otherwise both claims are returned whole.
-    """
+    """Return the claims before and after a change, reduced to the inputs that differ if no more."""
     before, after = change.before, change.after
     if before is None or after is None or not before.is_on_application:
         return before, after
