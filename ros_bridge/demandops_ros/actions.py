@@ -37,7 +37,6 @@ from demandops_ros.ros_process import ExecutorThread
 #
 # An adapter turns goals into plain data, and stages and outcomes into messages.
 
-
 # The first kind that fits counts.
 _CODES: tuple[tuple[type[BaseException], str], ...] = (
     (Withdrawn, "withdrawn"),

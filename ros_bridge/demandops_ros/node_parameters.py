@@ -35,7 +35,6 @@ from demandops_ros.messages import ANSWER_LEVELS
 # namespaces and the image registry come from the state repo. If the file names one that the state
 # repo lacks, the node warns. The node also warns about parameters that it replaces by other means.
 
-
 _NODE = "application_manager"
 ACTION_NAME = "deployment_action_name"
 _RENAMES = re.compile(r".*__(node|name):=.*")

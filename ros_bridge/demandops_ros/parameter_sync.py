@@ -22,7 +22,6 @@ from demandops_ros import ros_process
 
 # ---- reads the parameters of a node from the text of a ROS parameter file ----
 
-
 _EVERY_NODE = ("/**", "**", "/*", "*")
 _SECTION = "ros__parameters"
 

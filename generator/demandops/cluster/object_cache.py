@@ -60,7 +60,6 @@ class ObjectCache:
             return dict(self._objects)
 
     def why_unknown(self, wanted: Iterable[ObjectSelector]) -> str:
-        """Return why some of the ``wanted`` objects are unknown now; empty if all are known."""
         with self._lock:
             for selector in wanted:
                 if selector in self._errors:
@@ -70,7 +69,6 @@ class ObjectCache:
         return ""
 
     def unknown_health(self, domain: ClusterDomain) -> Health | None:
-        """Return a health that says why a domain's objects are unknown, if they are."""
         reason = self.why_unknown(health_reader(domain).objects_to_watch(domain))
         if not reason:
             return None
@@ -101,7 +99,6 @@ class ObjectCache:
             self._read(selector)
 
     def pods(self, namespace: str, deployment: str) -> list[Any]:
-        """Read the pods of a Deployment in the cache; the errors of the library are raised."""
         from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
 
         item = self.objects().get(("Deployment", namespace, deployment)) or {}
@@ -192,17 +189,16 @@ class ObjectCache:
 
 
 def _request(selector: ObjectSelector) -> dict[str, str]:
-    names = ("group", "version", "plural")
-    request = {
-        **dict(zip(names, _KINDS[selector.kind], strict=True)),
-        "namespace": selector.namespace,
-    }
-    # a call for one object needs fewer rights than a call for all objects of a namespace
-    return request | ({"field_selector": f"metadata.name={selector.name}"} if selector.name else {})
+    group, version, plural = _KINDS[selector.kind]
+    request = {"group": group, "version": version, "plural": plural}
+    request["namespace"] = selector.namespace
+    if selector.name:  # a call for one object needs fewer rights than for a whole namespace
+        request["field_selector"] = f"metadata.name={selector.name}"
+    return request
 
 
 def _is_answer(error: Exception) -> bool:
-    """Return whether the cluster answered with this error, so that it is reachable."""
+    # the library gives the HTTP status only of an error with which the cluster answered
     return bool(getattr(error, "status", None))
 
 

@@ -27,7 +27,6 @@ from demandops.templating.evaluator import EVALUATE
 
 # ---- the files of a new state repo: the skeleton, the appdefs and the rendered files ----
 
-
 EXAMPLE_URL = "https://git.example/fleet/state-repo.git"
 
 _ENTRIES = re.compile(r"(?ms)^(clusters|nodes|brokers|charts):\n.*")

@@ -33,7 +33,6 @@ from demandops.repo.load.snapshot import changed_kept_replicas
 # A commit of the generator may change generated files, reports, and the claims that its message
 # names. Some operations may change further files.
 
-
 _OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
 # Operations that may record or forget recent shutdowns.
 _RECORDING = ("shutdown", "join", "rollback")

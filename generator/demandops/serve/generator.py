@@ -110,11 +110,9 @@ class Generator:
         return self._worker.snapshot
 
     def snapshot_at(self, revision: str) -> Snapshot:
-        """Return the state in effect at a commit or a time, without a fetch; this may take seconds.
+        """Return the state in effect at a commit or a time, without a fetch; it may take seconds.
 
-        Raises:
-            InvalidInput, StateRepoError: if there is no such commit, or it has files that are not
-                valid and that no generator has quarantined.
+        Raises InvalidInput or StateRepoError if there is none.
         """
         objects = self._repository.reopened()  # as libgit2's objects belong to one thread
         tip, now = self.snapshot.commit, self._runtime.now()
@@ -185,27 +183,21 @@ class Generator:
         return ticket
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``other`` is ``commit`` or an ancestor; false if either is unknown."""
         return self._repository.includes(commit, other)
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` exists in two known commits with equal content."""
         return self._repository.unchanged(commit, other, path)
 
     def changes_since(self, since: str) -> tuple[str, list[str] | None]:
-        """Return the newest published commit, and the paths that changed from ``since`` to it.
-
-        The paths are None if the commit ``since`` is unknown.
-        """
+        # the newest published commit, and the changed paths, None if ``since`` is unknown
         commit = str(self.snapshot.commit)
         return commit, self._repository.changed_paths(since, commit)
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand that is not committed or answered; return whether it is withdrawn."""
         return self._demands.withdraw(operation)
 
     def on_publish(self, listener: Callable[[Config], None]) -> None:
-        """Have the worker call a listener, which must return at once, after each publication."""
+        # the worker calls it, so it must return at once
         self._worker.listeners.append(listener)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:

@@ -24,13 +24,12 @@ from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 
-# ---- the server of the webhook and of the page, which no slow or busy client can fill ----
+# ---- the server of the webhook and of the page ----
 #
 # Anyone who reaches the address may connect. A client that neither sends nor reads is cut off, and
 # so is one that sends in tiny pieces, because each piece costs as much as a large one. When too
 # many connections are open, the oldest that waits for its client gives way, so a health check gets
 # in.
-
 
 _PORT = re.compile(r"[0-9]{1,5}")
 _REMEDIES = {
@@ -104,7 +103,6 @@ class _BoundedConnection(H11Protocol):
             min(waiting, key=lambda each: each._since).transport.abort()
 
     def waits_for_client(self) -> bool:
-        """Return whether the client has to send or to read before anything goes on."""
         cycle = self.cycle
         is_asked = cycle is not None and not (cycle.response_complete or cycle.more_body)
         return not is_asked or self.flow.write_paused

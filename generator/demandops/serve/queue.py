@@ -19,7 +19,6 @@ from demandops.repo.write.journal import JournalEntry, ProposalRecord
 
 # ---- a demand under way, from its submission to its receipt ----
 
-
 log = logging.getLogger("demandops")
 
 # What a demand's listener is told.
@@ -92,7 +91,7 @@ class Ticket:
         return str(next((fields[key] for key in keys if fields.get(key)), ""))
 
     def refuse(self, error: DemandOpsError) -> None:
-        """Answer a demand that is not in the journal yet with an error."""
+        # only a demand that is not in the journal yet
         self.state = "done"
         self.future.set_exception(error)
         self.journaled.set_result(False)
@@ -239,14 +238,12 @@ class FairQueue:
         self._queued = again | self._queued
 
     def remove(self, tickets: Collection[Ticket]) -> None:
-        """Remove those of the demands that are in the queue."""
         for ticket in tickets:
             queued = self._queued.pop(ticket, None)
             if queued is not None:
                 queued.has_left = True
 
     def popleft(self) -> Ticket:
-        """Remove and return the next demand; the queue must not be empty."""
         while True:
             requester = next(iter(self._lanes))
             lane = self._lanes.pop(requester)
@@ -295,7 +292,6 @@ def requester_of(goal: Any) -> str:  # noqa: ANN401 - plain data
 
 
 def _requesters(goal: dict[str, Any]) -> Iterator[Any]:
-    """Yield the requesters of a goal of the reference's action."""
     bodies = (app.get("object_detection_fusion_app") for app in _items(goal, "apps"))
     for item in (*bodies, *_items(goal, "connections")):
         names = item.get("requester_ids") if isinstance(item, dict) else None

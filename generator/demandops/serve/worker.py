@@ -46,8 +46,7 @@ from demandops.serve.timing.timers import (
 )
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
-# ---- records whether the remote can be reached, for logs and diagnostics ----
-
+# ---- whether the remote can be reached, for logs and diagnostics ----
 
 log = logging.getLogger("demandops")
 
@@ -62,8 +61,7 @@ class RemoteStatus:
 
 
 class RemoteMonitor:
-    """Records and logs whether the remote can be reached; any thread may read ``status``."""
-
+    # any thread may read ``status``
     def __init__(self, address: str, runtime: Runtime) -> None:
         self._address, self._runtime = address, runtime
         self.status = RemoteStatus()
@@ -97,7 +95,7 @@ class RemoteMonitor:
         self.status = replace(self.status, push_denied=reason)
 
 
-# ---- logs each problem of the state repo once, until it is mended ----
+# ---- the log of the state repo's problems: each once, until it is mended ----
 
 
 class FaultLog:
@@ -129,12 +127,11 @@ class FaultLog:
             )
 
 
-# ---- the worker: follows the state repo, and publishes the demands as commits ----
+# ---- the worker ----
 #
 # The worker runs in one thread, the only one that writes to the state repo. Demands go first, so a
 # fetch stops when a demand arrives. The push of the demand finds new commits just as the fetch
 # would.
-
 
 # How many new Git packs to collect before git joins them; each publication or fetch adds one.
 _TIDY_EVERY = 50
@@ -146,10 +143,7 @@ _NAME = "writer"
 
 
 class Worker:
-    """Follows the state repo and turns batches of demands into published commits.
-
-    Any thread may read ``remote`` and ``snapshot`` (the newest published state).
-    """
+    # Any thread may read ``remote`` and ``snapshot`` (the newest published state).
 
     def __init__(
         self,
@@ -292,8 +286,18 @@ class Worker:
                 wait = backoff.unreachable()
             if wait is None:
                 continue
-            # wait before the fetch, not after it, because the push must follow the fetch closely
-            self._wait_to_retry(batch, wait)
+            # Wait before the fetch, not after it, because the push must follow the fetch closely.
+            # Meanwhile answer withdrawn demands, and tell the others what they wait for.
+            end, to_notify = self._runtime.monotonic() + wait, list(batch)
+            while not self._ends_soon.is_set():
+                unreachable = self.remote.status.unreachable
+                for ticket in to_notify if unreachable else ():
+                    ticket.notify("away", f"waiting: {unreachable}")
+                self._demands.answer_withdrawn(batch)
+                seconds = end - self._runtime.monotonic()
+                if seconds <= 0:
+                    break
+                to_notify = self._demands.new_demands(seconds)
             self._require_not_ending()
             self._demands.take(batch, self._batch_limit)
 
@@ -371,7 +375,6 @@ class Worker:
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended, to release its claims."""
         if self._rest or self._demands.has_queued:  # a queued demand may renew a lease
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
@@ -405,20 +408,6 @@ class Worker:
             if isinstance(result, Decision):
                 self._approvals.add(ticket, result)
         return True
-
-    def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
-        """Wait; meanwhile answer withdrawn demands, and tell the others what they wait for."""
-        end = self._runtime.monotonic() + seconds
-        to_notify = list(batch)
-        while not self._ends_soon.is_set():
-            unreachable = self.remote.status.unreachable
-            for ticket in to_notify if unreachable else ():
-                ticket.notify("away", f"waiting: {unreachable}")
-            self._demands.answer_withdrawn(batch)
-            left = end - self._runtime.monotonic()
-            if left <= 0:
-                return
-            to_notify = self._demands.new_demands(left)
 
     # ---- following the state repo ----
 
@@ -474,10 +463,7 @@ class Worker:
         return False  # other generators are faster, and they carry out the same changes
 
     def _new_commit_batch(self) -> CommitBatch:
-        """Return a commit batch on the newest known tip.
-
-        Its first commits render people's changes, and do the work of :class:`OwnWork` that is due.
-        """
+        # its first commits render people's changes, and do the own work that is due
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems and before.is_rendered:

@@ -18,7 +18,6 @@ from rclpy.node import Node
 
 # ---- the detector's parameters: their defaults, descriptions and ranges ----
 
-
 # Each parameter: its default, its description and, if it is a number, its range.
 PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
     "rules": ("", "File of rules.", None),

@@ -37,7 +37,6 @@ from demandops_ros.node import status
 #
 # Topics may appear and vanish at any time.
 
-
 # A subscription is reliable if all publishers that it finds are. The queue is deep, because many
 # entities may share a topic.
 _QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)

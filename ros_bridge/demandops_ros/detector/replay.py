@@ -24,7 +24,6 @@ from rosbags.typesys import Stores, get_typestore
 
 # ---- reads a recorded bag, MCAP or sqlite3, without ROS; only this module imports rosbags ----
 
-
 # Stands in `left_out` for the damaged end of a bag, whose topics are unknown. Its count is 1, as
 # the lost messages cannot be counted.
 REST_OF_BAG = "the rest of the bag"

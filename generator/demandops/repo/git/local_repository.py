@@ -30,7 +30,6 @@ from demandops.repo.git.repository import (
 
 # ---- the state repo as a bare repository on this disk, written in place and fsynced ----
 
-
 # From this age on, a branch's lock counts as left behind by a killed process: Git locks a branch
 # only for milliseconds.
 _STALE_LOCK_S = 5.0

@@ -28,7 +28,6 @@ from pygit2.enums import ObjectType
 # Each object is compressed and stored whole, not as a delta, because the search for deltas would
 # take longer than the rest of a demand's commit. Git's housekeeping makes deltas later.
 
-
 _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
 # The level of compression. A pack is short-lived, so speed counts more than size.
 _LEVEL = 1

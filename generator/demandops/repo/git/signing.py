@@ -25,7 +25,6 @@ from demandops.repo.git.objects import NewObjects
 # ``git verify-commit`` accepts it, and so do forges that check SSH signatures. This module knows
 # only the key's path; ``ssh-keygen`` reads the key or asks an SSH agent.
 
-
 _TIMEOUT_S = 20
 
 

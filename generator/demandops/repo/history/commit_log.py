@@ -29,7 +29,6 @@ from demandops.repo.git.tree import commit_of
 # escapes like ``\u202e``. So no value can begin a line, end the message, look like a trailer or
 # give a forge an order. Messages of earlier versions, which did not quote, are read the same way.
 
-
 Trailers = Iterable[tuple[str, str]]
 
 _WHY = "Why: "

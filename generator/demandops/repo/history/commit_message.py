@@ -40,7 +40,6 @@ from demandops.repo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME, R
 # --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
 # :mod:`.commit_log` quotes them. :mod:`.state_in_effect` adds the trailers about quarantined files.
 
-
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
 _LOCAL_PART = re.compile(r"[A-Za-z0-9]([A-Za-z0-9._-]{0,62}[A-Za-z0-9])?")

@@ -25,7 +25,6 @@ from demandops.repo.history import commit_log
 # an unchanged report causes no commit. This module only converts between problems and text; it
 # reads and writes no files.
 
-
 PATH = f"{NOTES_ROOT}/reports/problems.yaml"
 _HEAD = (
     "# Written by the generator: the files that are not valid. The last valid version of each\n"

@@ -36,7 +36,6 @@ from demandops.repo.load import state_in_effect
 # The generator's next commit undoes a manual edit, but an override lasts. So the check suggests one
 # where it can, and a person has to write only the reason into it.
 
-
 _VALUES = (("spec", "values"), ("spec", "source", "helm", "valuesObject"))  # Flux, Argo CD
 _IMAGE_KEYS = {"repository", "tag", "digest"}
 _REFERENCE = re.compile(

@@ -31,7 +31,6 @@ from demandops.repo.git.repository import disk_error
 # (docs/decisions/0020-journal.md). Journals of the first version have no digests, and can still be
 # read.
 
-
 _MOST_BYTES = 1 << 20
 _SEALED = re.compile(rb'(\{.*), "digest": "([0-9a-f]{64})"\}')
 

@@ -2,10 +2,8 @@
 
 This code runs in the worker thread. A proposal is booked once main has its claims, whether by a
 merge commit, a squash or a rebase. Until then the worker rebuilds the branch if a new main makes
-it outdated, so that the branch has the files that the generator would render on that main. A branch
-to which a person has committed stays unchanged.
-:meth:`Proposal.verdict` decides what happens to the demands of a proposal, and this module carries
-that verdict out.
+it outdated. A branch to which a person has committed stays unchanged. :meth:`Proposal.verdict`
+decides what happens to the demands of a proposal, and this module carries that verdict out.
 """
 
 from __future__ import annotations
@@ -128,7 +126,6 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """Withdraw each demand in ``earlier`` that needs approval and that ``by`` releases."""
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
             if request and isinstance(result, Decision) and releases(request, [result.request]):
@@ -154,15 +151,10 @@ class Approvals:
         proposal = next((each for each in waiting if goal in each.goals()), None)
         replaced = waiting if isinstance(request, Put) and proposal is None else []
         if proposal is None:
-            counts = Counter(
-                name
-                for each in self._proposals.values()
-                if each.waits
-                for name in each.requesters()
-            )
-            full = next(
-                (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT), ""
-            )
+            open_proposals = [each for each in self._proposals.values() if each.waits]
+            counts = Counter(name for each in open_proposals for name in each.requesters())
+            names = request.requesters()
+            full = next((name for name in names if counts[name] >= PROPOSAL_LIMIT), "")
             if full and not replaced:
                 message = (
                     f"requester {quoted(full)} already has {PROPOSAL_LIMIT} proposals that await "
@@ -188,13 +180,12 @@ class Approvals:
             self._replace(old, branch)
 
     def _waiting(self, request: DemandRequest) -> list[Proposal]:
-        """Return the proposals of the same demand, whatever its content."""
         key = key_of(request)
-        waiting = (each for each in self._proposals.values() if each.waits)
-        return [each for each in waiting if key in map(key_of, each.requests)]
+        waiting = (proposal for proposal in self._proposals.values() if proposal.waits)
+        return [proposal for proposal in waiting if key in map(key_of, proposal.requests)]
 
     def withdraw_replaced(self, request: DemandRequest) -> None:
-        """Withdraw the open proposal that a put replaces which needs no approval."""
+        # by a put that needs no approval
         for proposal in self._waiting(request) if isinstance(request, Put) else ():
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
 
@@ -205,7 +196,6 @@ class Approvals:
     # ---- after main was read ----
 
     def is_due(self, tip: str) -> bool:
-        """Return whether to check the proposals now; ``tip`` is the newest commit of main."""
         if not self._proposals:
             return False
         tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
@@ -431,7 +421,7 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return the request of a ticket that ends demands, or None if it would be refused."""
+    # None also if the request would be refused
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)

@@ -13,8 +13,7 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.model.config.repo_settings import Proposals
 from demandops.repo.forge import Forge, ForgeError, PullRequest, forge_for
 
-# ---- when to check the proposals: soon after main has moved, and otherwise at an interval ----
-
+# ---- when to check the proposals: soon after main has moved, else at an interval ----
 
 # The seconds between two checks of the branches, as only a check detects a deleted branch.
 CHECK_LOCAL_S = 1.0
@@ -45,8 +44,8 @@ class CheckTimer:
         return due - self._runtime.monotonic()
 
     def began(self) -> None:
-        """Record that a check begins, and plan the next one in case this one fails."""
         self._began = self._runtime.monotonic()
+        # this plans the next check, in case this one fails
         self._next, self._checked_at = self._began + self._interval, None
 
     def ended(self, tip: str) -> None:
@@ -55,7 +54,7 @@ class CheckTimer:
         self._rest_until = now + _PAUSE_FACTOR * (now - self._began)
 
 
-# ---- opens, watches and closes pull requests at a forge, in a thread of its own ----
+# ---- the pull requests ----
 #
 # A slow or unreachable forge delays no demand and no proposal, because a branch can be merged
 # without a pull request.
@@ -98,7 +97,6 @@ class ForgeWorker:
         self._due.set()
 
     def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
-        """Have the forge's thread open a pull request, unless the branch already has one."""
         if branch not in self._wanted:
             task = _Task(forge, branch, title, body)
             with self._lock:
@@ -106,7 +104,7 @@ class ForgeWorker:
             self._enqueue(task)
 
     def was_queried(self, branch: str) -> bool:
-        """Return whether the forge was queried about a branch, or cannot be queried now."""
+        # also true if the forge cannot be queried now
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:

@@ -130,8 +130,9 @@ class Proposal:
         self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
 
     def goals(self) -> list[str]:
-        """Return the goals of the demands that were not withdrawn, as JSON: 1 is not true."""
-        return [json.dumps(each.goal) for each in self.tickets if each.state == "proposed"]
+        # as JSON, because in Python 1 equals true
+        tickets = (ticket for ticket in self.tickets if ticket.state == "proposed")
+        return [json.dumps(ticket.goal) for ticket in tickets]
 
     def requesters(self) -> set[str]:
         return {name for request in self.requests for name in request.requesters()}
@@ -157,18 +158,17 @@ def key_of(request: DemandRequest) -> tuple[str, ...]:
 
 
 def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decided, Failed]:
-    """Decide each demand on the state after the previous one, with leases from approval on."""
     written: dict[str, str | None] = {}
     steps, failed = Decided(), Failed()
+
+    def read_step(path: str) -> str | None:
+        return written[path] if path in written else read(path)
+
     for ticket, decision in left:
+        # a lease counts from the approval on
         request = permission.with_leases_from_approval(decision.request)
         try:
-            step = decide(
-                state,
-                request,
-                ticket.received,
-                lambda path: written[path] if path in written else read(path),
-            )
+            step = decide(state, request, ticket.received, read_step)
         except InvalidInput as error:
             failed.append((ticket, error))
             continue
@@ -179,7 +179,6 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
 
 def is_release(goal: object) -> bool:
-    """Return whether a goal, as plain data, is a shutdown or the release of a demand."""
     fields = goal if isinstance(goal, dict) else {}
     return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
 

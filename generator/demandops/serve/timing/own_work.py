@@ -23,11 +23,10 @@ from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.queue import Receipt, Ticket
 from demandops.serve.timing.timers import within
 
-# ---- moves placed applications and services off drained nodes ----
+# ---- drained nodes: placed applications and services move off them ----
 #
 # While any of them cannot move, another attempt is made each minute, and at each change of the
 # configuration.
-
 
 log = logging.getLogger("demandops")
 
@@ -43,7 +42,6 @@ class Draining:
         self._after: dict[str, str] = {}
 
     def move_due(self, commits: CommitBatch) -> None:
-        """Commit the moves of placed applications that can leave their drained node now."""
         now = self._runtime.now()
         for node in self._due(commits.head.state, now):
             tried = (commits.head.state.config, now)
@@ -66,11 +64,9 @@ class Draining:
 
     @property
     def has_more(self) -> bool:
-        """Whether the last call left applications for later."""
         return bool(self._after)
 
     def postpone(self) -> None:
-        """Begin again with all applications later."""
         self._after.clear()
 
     def _warn(self, node: str, stays: Iterable[str], *, continued: bool = False) -> None:
@@ -94,13 +90,12 @@ class Draining:
         return nodes
 
 
-# ---- ends leases, overrides and kept replicas, and says when to check again ----
+# ---- ends of leases, overrides and kept replicas ----
 #
 # A person may set the clock. A clock that is set back only delays the end of a lease. A clock that
 # jumps forward would end leases that were renewed in time, so after a jump every lease gets its
 # full term again. The sleep of a machine looks like a jump and has the same effect. Overrides and
 # kept replicas get no more time after a jump.
-
 
 # By how much the clock may gain on the monotonic clock before leases get their full term again.
 _JUMP = timedelta(seconds=30)
@@ -125,12 +120,8 @@ class LeaseExpiry:
         self._next_end: datetime | None = None
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended, to release its claims.
-
-        If a ticket did not release the claims, the demand's next ticket comes at least a minute
-        later. The tickets are correct only at the time of the call: later, a requester may renew a
-        lease, or a person may set the clock.
-        """
+        # The tickets are correct only now: later, a requester may renew a lease, or a person may
+        # set the clock. If one does not release its claims, the next comes at least a minute later.
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
         # forget demands that were released or renewed meanwhile
@@ -162,7 +153,6 @@ class LeaseExpiry:
         return now, [claim for claim in ended if claim.demand not in granted]
 
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
-        """Return the seconds until the next check: at least one, but at most ``longest``."""
         first = ledger.first_to_end()
         if first is not self._first:  # a search is slow if many leases end at one time
             self._first, self._next_end = first, ledger.next_lease_end()
@@ -180,7 +170,6 @@ class LeaseExpiry:
         return wall
 
     def _has_ended(self, claim: Claim, now: datetime) -> bool:
-
         if claim.lease is None or self._jumped_at is None:
             return claim.lease is not None
         return now > self._jumped_at + timedelta(seconds=claim.lease.seconds + claim.lease.slack)
@@ -194,7 +183,6 @@ class OverrideExpiry:
         self._not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
-        """Commit the end of each expired override; if that fails, try again later."""
         for override in expired_overrides(commits.head.state, now):
             if self._retry_at.get((override.name, override.end), now) > now:
                 continue
@@ -207,7 +195,7 @@ class OverrideExpiry:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
     def postpone(self, now: datetime) -> None:
-        """For a minute, count no end as due, because a fetch or a publication failed."""
+        # because a fetch or a publication failed
         self._not_before = now + _RETRY
 
     def is_due(self, world: World, now: datetime) -> bool:
@@ -231,7 +219,6 @@ class ScaleDown:
         self._not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
-        """Commit each scale-down that is due; if that fails, try again later."""
         for instance in commits.head.state.ledger.kept.due(now):
             if self._retry_at.get(instance, now) > now:
                 continue
@@ -262,11 +249,10 @@ def _seconds_until(time: datetime, now: datetime, longest: float) -> float:
     return min(max((time - now).total_seconds() + 0.01, _SHORTEST_S), longest)
 
 
-# ---- when the demands that wait for room are tried again, and in which order ----
+# ---- the demands that wait for room: when they are tried again, and in which order ----
 #
 # If there may be room, the generator tries the waiting demands before it decides new demands. So no
 # demand gets the room for which an earlier demand, or a demand of higher priority, was waiting.
-
 
 # After this processor time, new demands come before the waiting demands that were not tried yet.
 _LONGEST_ROUND_S = 0.25
@@ -279,7 +265,6 @@ class WaitingTurns:
         self._left: list[str] = []
 
     def book_due(self, commits: CommitBatch) -> None:
-        """Commit each waiting demand that fits and needs no approval, in its turn."""
         state = commits.head.state
         if not self.is_due(state):
             return
@@ -320,11 +305,9 @@ class WaitingTurns:
 
     @property
     def has_more(self) -> bool:
-        """Whether the last round left demands for later."""
         return bool(self._left)
 
     def postpone(self) -> None:
-        """Begin again with all waiting demands later."""
         self._left.clear()
 
     def is_due(self, state: State) -> bool:
@@ -336,7 +319,7 @@ class WaitingTurns:
         return tried is not None and tried.ledger is state.ledger and tried.config is state.config
 
 
-# ---- the work that becomes due without a new demand, such as ends of overrides ----
+# ---- all of this work, in its order ----
 
 
 class OwnWork:
@@ -356,11 +339,9 @@ class OwnWork:
         self._waiting_turns.book_due(commits)
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand, decided on ``before``, freed room."""
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
-        """Begin no work for a while, because a fetch or a publication failed."""
         self._override_expiry.postpone(self._runtime.now())
         self._scale_down.postpone(self._runtime.now())
         self._draining.postpone()
@@ -376,7 +357,6 @@ class OwnWork:
         )
 
     def seconds_until_due(self, state: State, longest: float) -> float:
-        """Return the seconds until the next check: at most ``longest``."""
         # what was left off goes on at once, but after the demands that arrived meanwhile
         if self._draining.has_more or self._waiting_turns.has_more:
             return 0.0
