@@ -28,7 +28,7 @@ from demandops.repo.git.repository import (
     unopened,
 )
 
-# ---- the state repo as a bare repository on this disk, written in place and fsynced ----
+# ---- a bare repository on this disk ----
 
 # From this age on, a branch's lock counts as left behind by a killed process: Git locks a branch
 # only for milliseconds.
@@ -191,7 +191,7 @@ class LocalRepository(StateRepository):
                 ) from None
 
 
-# ---- state repos that are only read: a person's checkout, and the last fetch of a URL ----
+# ---- what is only read: a person's checkout, and the last fetch of a URL ----
 
 
 def is_checkout(folder: Path) -> bool:
@@ -199,7 +199,6 @@ def is_checkout(folder: Path) -> bool:
 
 
 def checkout_around(folder: Path) -> Path | None:
-    """Return the nearest checkout of a state repo, from ``folder`` upwards."""
     return next(filter(is_checkout, (folder, *folder.parents)), None)
 
 
@@ -244,7 +243,7 @@ class LastFetch(LocalRepository):
         pass  # the process that made the clone has checked it
 
 
-# ---- opens a state repo by its address: a folder, or a URL that Git can clone ----
+# ---- addresses: a folder, or a URL that Git can clone ----
 
 _SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]*)(://|::)")
 _SCP = re.compile(r"^([^/\s:]+:(?!:)|[^/\s:]+@\[[^\]/]+\]:)")
@@ -270,15 +269,10 @@ def connect(
     allow_offline: bool = False,
     only_read: bool = False,
 ) -> StateRepository:
-    """Return the state repo at an address.
+    """Return the state repo at an address: a URL, or a folder where main is not checked out.
 
-    Args:
-        address: the folder of a repository in which main is not checked out, such as a bare one,
-            or a URL.
-        folder: the folder in which the clone of a URL is made.
-        notify: called with a text before work that takes a while.
-        allow_offline: whether an existing clone may be used if its remote cannot be reached.
-        only_read: whether the address may also be the folder of a checkout.
+    The clone of a URL is made in ``folder``; with ``allow_offline``, an existing one is used if its
+    remote is away. With ``only_read``, the address may also be the folder of a checkout.
     """
     if is_url(address):
         _check_url(address)

@@ -247,30 +247,22 @@ class RemoteRepository(StateRepository):
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
-        """Return the remote's references that match ``patterns``, as name → commit.
-
-        The patterns are those of ``git ls-remote``. Raises Unavailable if git cannot read now.
-        """
+        # name → commit; the patterns are those of ``git ls-remote``
         out = self._read_remote(self._git, ("ls-remote",), *patterns)
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
-        """Fetch the branches whose names begin with ``prefix``, or raise Unavailable.
-
-        If the remote has deleted such a branch, this clone deletes its copy of the branch.
-        """
+        # what the remote has deleted, this clone deletes too
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         self._read_remote(self._git, ("fetch", "--no-tags", "--prune"), spec)
 
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
         """Push one reference and return git's output, or raise GitCommandError.
 
-        Args:
-            spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
-            lease: ``<reference>:<commit>``: the remote's reference must have this commit; if the
-                commit is empty, the reference must not exist.
-            options: options for the server (``git push --push-option``).
+        ``spec`` is ``<commit>:<reference>``, or ``:<reference>`` to delete it. ``lease`` is
+        ``<reference>:<commit>``: the commit that the remote's reference must have; if it is empty,
+        the reference must not exist. ``options`` are those of ``git push --push-option``.
         """
         push_options = [f"--push-option={option}" for option in options]
         command = ("push", "--porcelain", *push_options, f"--force-with-lease={lease}", "origin")

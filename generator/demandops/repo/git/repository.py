@@ -1,8 +1,4 @@
-"""The base class of state repos: Git objects, and a tip that only moves forward.
-
-A state repo is on this disk or behind a URL. Each of the two has a subclass, and
-:mod:`.open_repository` chooses between them.
-"""
+"""The base class of state repos, on this disk or behind a URL, and the errors of both."""
 
 from __future__ import annotations
 
@@ -179,8 +175,7 @@ class StateRepository(ABC):
         """Fetch and return the newest published commit.
 
         If ``urgent`` returns true before the fetch ends, git is ended and FetchInterrupted is
-        raised, so that a demand need not wait. Raises Unavailable if git cannot fetch now, and
-        StateRepoError if the state repo has no main.
+        raised, so that a demand need not wait.
         """
 
     @abstractmethod
@@ -223,7 +218,6 @@ class StateRepository(ABC):
         return trees.entry(pair[0], path) is not None and not trees.differ(*pair, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
-        """Return the sorted paths of the files that differ; None if a commit is unknown here."""
         pair = self._trees(since, commit)
         return None if pair is None else sorted(path for path, _ in trees.differences(*pair))
 
@@ -236,11 +230,7 @@ class StateRepository(ABC):
 
     @abstractmethod
     def renew_if_damaged(self) -> bool:
-        """Let git check the files, and replace a damaged clone; return whether it was replaced.
-
-        Raises Unavailable if damaged files cannot be replaced now, and StateRepoError if there is
-        nothing to replace them from.
-        """
+        """Let git check the files, and replace a damaged clone; return whether it was replaced."""
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End the running transfer with a remote, if any; later ones raise RemoteAway."""

@@ -11,11 +11,8 @@ _listeners: list[Callable[[str], None]] = []
 
 
 def listen(listener: Callable[[str], None]) -> None:
-    """Register a listener in place of an earlier one.
-
-    A slow run of git calls the listener each second with a text about what git does, and with an
-    empty text when git has ended.
-    """
+    # It replaces the earlier one. A slow run of git calls it each second with a text about what git
+    # does, and with an empty text when git has ended.
     _listeners[:] = [listener]
 
 

@@ -20,7 +20,7 @@ from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.tree import commit_of
 
-# ---- the text of commit messages: paragraphs of lines, and trailers in the last paragraph ----
+# ---- the text of messages: paragraphs of lines, and trailers in the last paragraph ----
 #
 # Only this module writes and reads messages. A line of a paragraph is for people: its text is
 # escaped and shortened. A trailer is for programs: its value is read back exactly. A value of
@@ -49,10 +49,7 @@ class MessageText:
 
 
 def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
-    """Return a message: paragraphs, each a list of lines, then the trailers.
-
-    Empty paragraphs, and trailers with an empty value, are left out.
-    """
+    # without empty paragraphs and trailers
     lines = [f"{key}: {_encoded(key, value)}" for key, value in trailers if value]
     body = ("\n".join(harmless(one_line(line)) for line in lines) for lines in paragraphs)
     return "\n\n".join(text for text in (*body, "\n".join(lines)) if text) + "\n"
@@ -91,7 +88,7 @@ def _decoded(text: str) -> str:
     )
 
 
-# ---- the state repo's history: commits with their trailers, and which commits changed a path ----
+# ---- the history: commits with their trailers, and which commits changed a path ----
 #
 # Everything comes from commit messages, trailers and ``git log -- <path>``, so plain git shows the
 # same.
@@ -132,11 +129,11 @@ class LogEntry:
 
 
 def time_of(commit: Commit) -> datetime:
-    """Return the committer's time, but none before 1970 or after the year 9999."""
     return _time(commit.commit_time)
 
 
 def _time(seconds: int) -> datetime:
+    # none before 1970 or after the year 9999
     return datetime.fromtimestamp(min(max(seconds, 0), _LAST_SECOND), tz=timezone.utc)
 
 
@@ -168,7 +165,7 @@ def entry_of(commit: Commit) -> LogEntry:
 
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
-    """Return whether the generator made a commit, and signed it if a signature is required."""
+    # signed, if a signature is required
     return entry_of(commit).by_generator and not signing.faults(repo, [commit])
 
 
@@ -273,7 +270,6 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
 
 
 def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
-    """Return the newest commit of the generator along the first parents, or None."""
     line = first_parents(repo, tip)
     return next((commit.id for commit in line if is_by_generator(repo, commit)), None)
 
@@ -287,18 +283,12 @@ class PathChange:
 
 @dataclass(frozen=True, slots=True)
 class PathHistory:
-    """The commits that changed a path since it was added for the last time.
+    """The commits that changed a path since it was added for the last time."""
 
-    ``started`` is the commit that added the path. ``newest`` lists the commits that changed the
-    path afterwards, newest first. ``more`` counts the older changes, which are not listed.
-    ``stopped`` is the commit that removed the path, or None if the path exists. If the path never
-    existed, ``started`` and ``stopped`` are None.
-    """
-
-    started: LogEntry | None
-    newest: tuple[LogEntry, ...]
-    more: int
-    stopped: LogEntry | None
+    started: LogEntry | None  # added the path; None if it never existed
+    newest: tuple[LogEntry, ...]  # changed it afterwards, newest first
+    more: int  # older changes, which are not listed
+    stopped: LogEntry | None  # removed the path; None if it exists or never did
 
 
 def changes_to(
@@ -338,14 +328,12 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that were ever stopped or moved; some may run again."""
     removed = _removed(repo, tip, "*.yaml")
     names = {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
     return {name for name in names if _NAME.fullmatch(name)}  # a chart's file has a version
 
 
 def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[str]:
-    """Return the paths of the files below domains that commits removed, the last removal first."""
     options = ("--diff-filter=D", "--no-renames", *more, "--format=", "--name-only")
     return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
 

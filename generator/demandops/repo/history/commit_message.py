@@ -34,7 +34,7 @@ from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME, REPLACES, compose
 
-# ---- commit messages: what changed in the desired state and why, for people and programs ----
+# ---- messages: what changed in the desired state and why, for people and programs ----
 #
 # The trailers are a contract: an auditor without this program finds everything with ``git log
 # --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
@@ -215,16 +215,8 @@ def of_follow(
     *,
     reports: bool = True,
 ) -> str:
-    """Return the message of a commit that renders people's changes of the state repo.
-
-    Args:
-        releases: the releases that the commit changes.
-        cause: the newest commit whose changes are rendered.
-        since: the commit whose state was in effect before these changes.
-        problems: the faults of invalid files.
-        more: further trailers.
-        reports: whether the commit changes the problem report.
-    """
+    # ``cause`` is the newest commit whose changes are rendered, and ``since`` the one whose state
+    # was in effect before them. ``reports`` says whether the problem report changes.
     problems, releases = list(problems), tuple(releases)
     names, after = ", ".join(release.name for release in releases), f" after commit {cause[:12]}"
     title = f"Update ledger{after}"
@@ -254,10 +246,7 @@ def of_override_end(
     keys: Iterable[ClaimKey],
     more: Iterable[tuple[str, str]] = (),
 ) -> str:
-    """Return the message of the commit that ends an expired override.
-
-    ``keys`` are those of the claims that this changes, of demands and of ``keep`` overrides.
-    """
+    # ``keys`` are of the claims that this changes, of demands and of ``keep`` overrides
     end = format_time(override.end) if override.end else ""
     paragraphs = [
         [f"End override {override.name}"],
@@ -303,7 +292,6 @@ def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
 
 
 def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
-    """Return a trailer for each demand that has one of these claims; overrides have none."""
     demands = {key.demand for key in keys if not key.demand.startswith(OVERRIDE_PREFIX)}
     return [("Demand-Id", demand) for demand in sorted(demands)]
 
@@ -320,7 +308,7 @@ def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
     return lines
 
 
-# ---- authors: which person made a commit or caused a follow commit, and who runs this program ----
+# ---- authors: who made a commit or caused a follow commit, and who runs this program ----
 #
 # A follow commit is made by the generator, and renders what people committed. Its trailers name
 # people's commits, and its author names these people. A commit is by a person if no generator on
@@ -332,14 +320,12 @@ _NO_ADDRESS = "@demandops.invalid"
 
 
 class Person(NamedTuple):
-    """The name and e-mail address of a person; ``str`` gives ``name <email>``, as git does."""
-
     name: str
     email: str
 
     @property
     def is_known(self) -> bool:
-        """Whether git knows the address. If not, the address is ``<login>@demandops.invalid``."""
+        # if git knows no address, it is ``<login>@demandops.invalid``
         return not self.email.endswith(_NO_ADDRESS)
 
     def __str__(self) -> str:
@@ -347,7 +333,6 @@ class Person(NamedTuple):
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
-    """Return people's commits since ``known`` that change files of the generator, newest first."""
     commits = commit_log.person_commits(repo, to, known)
     return [commit for commit in commits if _touches(commit, _ROOTS)]
 
@@ -383,7 +368,7 @@ def author_of(commit: Commit) -> Person:
 
 
 def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
-    """Return trailers for the newest of ``causes``, whose newest is first; in time's order."""
+    # of the newest causes, whose newest is first, in time's order
     named = reversed(causes[:_MOST_NAMED])
     return [("Caused-By", f"{commit.id} {author_of(commit)}") for commit in named]
 

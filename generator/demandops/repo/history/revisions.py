@@ -36,15 +36,10 @@ _LONGEST = 250  # bytes; a file system takes no longer name of a branch
 
 
 def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | None:
-    """Return the time that a text names, or None.
+    """Return the time that a date, a time of day, both, or a duration before ``now`` names.
 
-    Args:
-        text: a date, a time of day, a date with a time of day, or a duration before ``now``
-            (``2h``, ``1h30m``, ``2d ago``). A time of day without a date means its last occurrence
-            before ``now``.
-        now: the current time, with a time zone.
-        end: whether a date means the end of its day, and a time without seconds the end of its
-            minute, not the beginning.
+    A time of day without a date means its last occurrence before ``now``. With ``end``, a date
+    means the end of its day, and a time without seconds the end of its minute.
     """
     text = text.strip()
     try:
@@ -153,5 +148,4 @@ def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
 
 
 def format_time(at: datetime) -> str:
-    """Return a time as messages show it: ``2026-01-31 14:03:00 UTC``."""
     return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")
