@@ -51,8 +51,6 @@ _NAMES = {"flux": "Flux", "argocd": "Argo CD"}
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    """What an upgrade changes, besides rendering everything again."""
-
     # the new GitOps controller; None keeps the current one
     gitops: str | None = None
     # where a controller without a section in demandops.yaml fetches; None: as the current one does
@@ -61,8 +59,6 @@ class UpgradeRequest:
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """The files that an upgrade changes, and the configuration before and after it."""
-
     # of the upgrade, or the tip if no commit was made
     commit: str
     old: Config
@@ -71,7 +67,6 @@ class Upgrade:
 
     @property
     def switches(self) -> bool:
-        """Whether another GitOps controller reads the state repo from now on."""
         return self.old.repo_settings.gitops != self.new.repo_settings.gitops
 
 
@@ -81,7 +76,6 @@ def plan(
     now: datetime,
     progress: Progress = lambda done, total: None,
 ) -> Upgrade:
-    """Return what :func:`upgrade` would do, and write nothing."""
     with reader.opened(address) as repo:
         return _plan(repo.repository, request, now, progress)[0]
 
@@ -122,7 +116,7 @@ def upgrade(
 def _plan(
     repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
 ) -> tuple[Upgrade, CommitBatch, State, tuple[ClaimKey, ...]]:
-    """Return the upgrade, the batch and the state to commit, and the claims that may change."""
+    # the upgrade, the batch and the state to commit, and the claims that may change
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
     batch, old = CommitBatch(repository, snapshot), snapshot.state.config
@@ -168,7 +162,6 @@ def _plan(
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    """Return the claim files and markers that change if this program writes them."""
     written = {}
     for path, text in files.items():
         new = text
@@ -183,7 +176,6 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
 
 
 def _root(text: str, config: Config, request: UpgradeRequest) -> str:
-    """Return the text of ``demandops.yaml`` with this render version and the requested changes."""
     repository = config.repo_settings
     gitops = request.gitops or repository.gitops
     try:

@@ -75,10 +75,7 @@ class Advance:
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Read all files of a commit and return its snapshot, or raise InvalidInput.
-
-    ``progress`` is called with (files read, all files) of the ledger.
-    """
+    # ``progress`` gets the numbers of read and of all claim files
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
     files = ledger_files.read_claims(_claim_texts(commit.tree, progress))
@@ -110,9 +107,8 @@ def advance(
 ) -> Advance:
     """Return the snapshot of the commit ``to``, and the changes since the snapshot ``before``.
 
-    Only files that differ are read. Invalid changes are not applied, but reported as problems of
-    the snapshot. Raises InvalidInput if the files of ``recorded`` are not valid, which is the
-    recorded source of the configuration in effect at ``to``.
+    Only files that differ are read. ``recorded`` is the recorded source of the configuration in
+    effect at ``to``; if its files are not valid, InvalidInput is raised.
     """
     old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
     state, in_effect = before.state, LastValidConfig(None, before.config_source, ())
@@ -181,7 +177,7 @@ def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
 
 
 def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instance, Steps]]:
-    """Yield (instance, what it keeps now) for each service instance whose kept replicas changed."""
+    # what each instance whose kept replicas changed keeps now
     for path, _ in trees.differences(old, new, (records.REPLICAS_ROOT,)):
         texts = [trees.read_text(tree, path) for tree in (old, new)]
         before, after = (records.read_replicas(text, path) if text else None for text in texts)
@@ -190,7 +186,7 @@ def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instanc
 
 
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether people may have changed generated files since ``before``."""
+    # people may have changed generated files since ``before``
     people = list(commit_log.person_commits(repo, to, before))
     # where a generator made the newest commit, the generated files match the ledger
     if not people or people[0].id != to:
@@ -254,10 +250,8 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Remembers what was read, so that the next attempt to publish reads only newer commits."""
-
-    # Reading takes time. If each attempt read all commits since this generator's last publication,
-    # other generators could publish first every time.
+    # Reading takes time. If each attempt to publish read all commits since this generator's last
+    # publication, and not only the newer ones, other generators could publish first every time.
     def __init__(self) -> None:
         self._so_far: Advance | None = None
         self._start: Oid | None = None

@@ -31,7 +31,7 @@ from demandops.repo.git.repository import reading, unopened
 from demandops.repo.history import revisions
 from demandops.repo.load import state_in_effect
 
-# ---- overrides that do the same as manual edits, for values, replicas and images ----
+# ---- overrides in place of manual edits, for values, replicas and images ----
 #
 # The generator's next commit undoes a manual edit, but an override lasts. So the check suggests one
 # where it can, and a person has to write only the reason into it.
@@ -45,7 +45,6 @@ _REASON = "Say here why you need this override; it replaces a manual edit of a g
 
 
 def override_text(effects: dict[str, Any], release: Release, owner: str) -> str:
-    """Return an override with these effects on a release; ``owner`` may be any text."""
     who = owner.strip()[:100] if owner.isprintable() and owner.strip() else "unknown"
     head = {"apiVersion": API_VERSION, "kind": "Override", "reason": _REASON, "owner": who}
     if isinstance(release, ServiceRelease):
@@ -111,7 +110,6 @@ def effects_of(
 
 
 def _take(documents: list[Any], path: tuple[str, ...]) -> Any:  # noqa: ANN401
-    """Remove what is at a path of the first document, and return it."""
     part = documents[0] if documents else None
     for key in path[:-1]:
         part = part.get(key) if isinstance(part, dict) else None
@@ -141,7 +139,7 @@ def _merge_patch(
     return patch
 
 
-# ---- a checked-out state repo: its files, and the commit that an edit started from ----
+# ---- the checkout: its files, and the commit that an edit started from ----
 
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
@@ -252,11 +250,17 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         return None
     with reading(str(folder), repo):
         target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
-        tip = _tip_of(repo, target) if target else None
+        try:
+            head = repo.head.peel(Commit).id
+            tip = revisions.resolve(repo, head, target, REAL.now()) if target else None
+        except StateRepoError:
+            if repo.is_shallow:
+                raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
+            raise
         commit = _started_from(repo, target, tip)
         base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
         if tip is not None:
-            _, newer = repo.ahead_behind(repo.head.peel(Commit).id, tip.id)
+            _, newer = repo.ahead_behind(head, tip.id)
             merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
             name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
             base = replace(base, target=name, newer=newer, merged=merged)
@@ -265,15 +269,6 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         except (InvalidInput, StateRepoError):
             return base
         return replace(base, state=snapshot.state, valid=not snapshot.problems)
-
-
-def _tip_of(repo: Repository, target: str) -> Commit:
-    try:
-        return revisions.resolve(repo, repo.head.peel(Commit).id, target, REAL.now())
-    except StateRepoError:
-        if repo.is_shallow:
-            raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
-        raise
 
 
 def _started_from(repo: Repository, target: str, tip: Commit | None) -> Commit:

@@ -129,7 +129,6 @@ class CommitBatch:
         return str(commit)
 
     def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:
-        """Record the outcome of a demand that changed nothing, in the next commit of a demand."""
         # The process may die before it answers the demand. After a restart, it must not evaluate
         # the demand again, because later demands could change the outcome.
         self._settled.append((commit_log.settled_trailer(outcome), operation))
@@ -224,10 +223,7 @@ class CommitBatch:
         return snapshot, replace(change, files=files), tuple(keys)
 
     def end_override(self, override: Override, now: datetime) -> None:
-        """Commit the end of an expired override, with its effect on claims and releases.
-
-        Raises InvalidInput if the state without the override cannot be planned or rendered.
-        """
+        # InvalidInput is raised if the state without the override cannot be planned or rendered
         applied = end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
@@ -236,10 +232,7 @@ class CommitBatch:
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
 
     def scale_down(self, instance: Instance, now: datetime) -> str:
-        """Commit the removal of replicas that a service no longer keeps; return the title.
-
-        Raises InvalidInput if the service cannot be planned or rendered.
-        """
+        # the title of the commit; InvalidInput if the service cannot be planned or rendered
         state, change = scaled_down(self.head.state, instance, now, self.read)
         more = state_in_effect.trailers_of(self.head)
         text = commit_message.of_scale_down(instance, change, more)
@@ -247,11 +240,7 @@ class CommitBatch:
         return text.partition("\n")[0]
 
     def drain(self, node: str, after: str, operation: str, now: datetime) -> Decision:
-        """Commit the move of placed applications off a drained node, and return the decision.
-
-        It begins with the application that follows ``after`` (:class:`Drain`). If no application
-        can be moved, there is no commit.
-        """
+        # it begins with the application that follows ``after``; if none can move, nothing changes
         decision = decide(self.head.state, Drain(node, after=after), now, self.read)
         if decision.files:
             # the author is the person who last changed the node's file, and so drained the node
@@ -270,10 +259,7 @@ class CommitBatch:
     def render_all(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
     ) -> Changeset:
-        """Render all files; return those that differ from the batch's newest commit, and ``more``.
-
-        Raises InvalidInput if a release cannot be planned or rendered.
-        """
+        """Return the files that differ from the batch's newest commit, and ``more``."""
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
         changes = []
@@ -295,7 +281,6 @@ class CommitBatch:
         return Changeset({**more, **files}, tuple(changes))
 
     def publish(self) -> bool:
-        """Publish the commits, if any, like :meth:`StateRepository.publish`."""
         if self.is_empty:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)

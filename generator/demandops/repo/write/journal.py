@@ -19,7 +19,7 @@ from demandops.model.demand.claim import UNSTARTED
 from demandops.repo.git.objects import sync_folder
 from demandops.repo.git.repository import disk_error
 
-# ---- the journal: a file with all accepted, unpublished demands, so that a crash loses none ----
+# ---- the journal: all accepted, unpublished demands, so that a crash loses none ----
 #
 # The journal has one JSON line for each demand received, for each change of its proposal, and for
 # each demand done. A demand is written and fsynced before it is evaluated. After a restart, demands
@@ -76,8 +76,6 @@ class ProposalRecord:
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """An accepted demand: operation id, goal, time received, and the tip known at that time."""
-
     operation: str
     goal: Any
     received: str
@@ -85,7 +83,6 @@ class JournalEntry:
     proposal: ProposalRecord | None = None
 
     def record(self) -> dict[str, Any]:
-        """Return the entry as plain data for JSON; without ``proposal`` if there is none."""
         # asdict would copy the goal, which may be nested too deeply for that
         record = {field.name: getattr(self, field.name) for field in fields(self)}
         del record["proposal"]
@@ -105,7 +102,6 @@ class Journal:
             self._rewrite()
 
     def require_sound(self) -> None:
-        """Raise Unsound if an earlier write left the file in an unknown state."""
         if self._unsound is not None:
             raise self._unsound
 
@@ -222,12 +218,10 @@ class Journal:
 
 
 def read(path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands in a journal's file, by operation id; none if it is missing."""
     return parse(path.read_bytes() if path.exists() else b"", path)
 
 
 def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands of a journal's text, by operation id, or raise DamagedJournal."""
     *lines, last = text.split(b"\n")
     chain = "" if _SEALED.fullmatch((lines or [last])[0]) else None
     pending: dict[str, JournalEntry] = {}
@@ -246,7 +240,6 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
 
 
 def readable_entries(path: Path) -> list[JournalEntry]:
-    """Return the pending demands that can be read in a journal, even if it is damaged."""
     pending: dict[str, JournalEntry] = {}
     for line in path.read_bytes().split(b"\n"):
         sealed = _SEALED.fullmatch(line)
@@ -256,7 +249,7 @@ def readable_entries(path: Path) -> list[JournalEntry]:
 
 
 def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
-    """Return the journal's lines after one with the digest ``chain``, and the last digest."""
+    # the lines after one with the digest ``chain``, and the last digest
     lines = []
     for record in records:
         body = json.dumps(record, ensure_ascii=True)
@@ -270,7 +263,6 @@ def _digest(body: bytes, chain: str) -> str:
 
 
 def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> str | None:
-    """Apply a line after one with the digest ``chain``, and return the line's digest."""
     if chain is not None:  # else a journal of the first version, which has no digests
         sealed = _SEALED.fullmatch(line)
         if sealed is None or _digest(sealed[1] + b"}", chain) != sealed[2].decode():
@@ -299,7 +291,7 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         raise ValueError("the line is not an entry") from error
 
 
-# ---- slots: folders for the journal and the clone of each process that uses a state repo ----
+# ---- slots: a folder for the journal and the clone of each process ----
 
 _MAX_SLOTS = 256
 _JOURNAL = "outbox.jsonl"
@@ -351,10 +343,8 @@ class Slot:
 
 @dataclass(frozen=True, slots=True)
 class FoundJournal:
-    """A journal on this machine, and its demands that are not done and can be read."""
-
     file: Path
-    demands: list[JournalEntry]
+    demands: list[JournalEntry]  # that are not done and can be read
     # the error of reading the journal, if any
     damage: str = ""
     # the file's new path, if it was renamed

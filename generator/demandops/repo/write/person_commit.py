@@ -59,11 +59,7 @@ class Published:
 def commit_to_main(
     repository: StateRepository, make: Callable[[FileReader], Files], details: CommitDetails
 ) -> Published:
-    """Commit the files that ``make`` returns to main.
-
-    The argument of ``make`` reads a file on main. If main gets other commits meanwhile, ``make`` is
-    called again. Raises InvalidInput if the files give the configuration new faults.
-    """
+    # ``make`` reads files of main; it is called again if main gets other commits meanwhile
     return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), details)
 
 
@@ -74,10 +70,6 @@ def commit_to_branch(
     branch: str,
     options: Sequence[str],
 ) -> Published:
-    """Commit files to a new branch on top of main, with push options if the server has them.
-
-    Raises InvalidInput if the files give the configuration new faults.
-    """
     tip = trees.commit_of(repository.objects, repository.refresh())
     commit = _commit(repository, tip, files, [tip.id], details)
     branches = ProposalBranches(repository)

@@ -45,7 +45,6 @@ class BranchMoved(StateRepoError):
 
 
 def branch_name(name: str, operation: str) -> str:
-    """Return the branch name for a demand: a slug of ``name``, and a hash of the operation id."""
     return PREFIX + naming.slug_with_hash(name, operation, 12)
 
 
@@ -86,22 +85,13 @@ class ProposalBranches:
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
         """Make a branch point to ``commit``, durably, and return the link that the server printed.
 
-        Args:
-            branch: the branch's name.
-            commit: a commit in this repository.
-            expected: the branch's commit now; empty if the branch must not exist.
-            options: push options; left out if the server supports none.
-
-        Raises:
-            BranchMoved: the branch is not at ``expected``.
-            Unavailable, PushDenied: the branch could not be pushed for another reason.
-            GitError, OSError: the repository on this disk could not be written.
+        Raises BranchMoved if the branch is not at ``expected``; if that is empty, the branch must
+        not exist. Push options are left out if the server supports none.
         """
         with self._repository.new.packed(commit):
             return self._move(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
-        """Delete a branch, if it exists, with the errors of :meth:`put`."""
         self._move(branch, None, expected)
 
     def _move(
@@ -166,13 +156,9 @@ class ProposalBranches:
     def is_up_to_date(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
-        """Return whether a proposal merges into main cleanly, and changes exactly ``files``.
+        """Return whether a proposal merges into main at ``tip`` cleanly, and changes ``files``.
 
-        Args:
-            tip: the current commit of main.
-            commit: the proposal, on top of ``base``.
-            base: the commit of main that the proposal was made on.
-            files: path → text of the files that the demands would change on the current main.
+        The proposal is ``commit``, made on ``base``. The demands would now change ``files``.
         """
         if (compared := self._trees(tip, commit, base, files)) is None:
             return False
@@ -185,10 +171,7 @@ class ProposalBranches:
     def books_the_same(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
-        """Return whether a proposal would book the same on the current main, leases aside.
-
-        The arguments are those of :meth:`is_up_to_date`. Return True for an unknown proposal.
-        """
+        # leases aside; also true if the proposal is unknown
         if (compared := self._trees(tip, commit, base, files)) is None:
             return True
         old, proposal, now, new = compared
@@ -235,10 +218,7 @@ class PendingProposal:
 
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
-    """Yield the proposals whose commits are not on main, sorted by branch.
-
-    Branches that cannot be read are logged and left out. Raises Unavailable if git cannot fetch.
-    """
+    # those whose commits are not on main, sorted by branch
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
     space = f"{repository.branches}{PREFIX}"
