@@ -56,24 +56,15 @@ class DeploymentRequestAdapter:
         return message_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
-        """Return the id of a goal for the log."""
         return str(goal.id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return the level at which to answer a goal; None if it names none."""
-        return None
+        return None  # it names none
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         return DeploymentRequest.Feedback(message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return the result of a goal, as lines of text.
-
-        After success, the first line is ``<outcome>: <commit>``. A line follows for each placed
-        application, each warning and each listed item that was not held. After a refusal, each
-        fault has a line ``<code>: <field>: <remedy>``. After another error, the line is ``<code>:
-        <reason>``; for a canceled goal, only the reason.
-        """
         return DeploymentRequest.Result(message=_text(outcome))
 
 
@@ -102,6 +93,10 @@ class DemandAdapter(DeploymentRequestAdapter):
 
 
 def _text(outcome: Receipt | BaseException) -> str:
+    # After success, the first line is ``<outcome>: <commit>``. A line follows for each placed
+    # application, each warning and each listed item that was not held. After a refusal, each fault
+    # has a line ``<code>: <field>: <remedy>``. After another error, the line is ``<code>:
+    # <reason>``; for a canceled goal, only the reason.
     if isinstance(outcome, Receipt):
         warnings = (f"warning: {one_line(warning)}" for warning in outcome.warnings)
         head = [f"{outcome.outcome}: {outcome.commit}", *map(one_line, outcome.placed)]
@@ -128,9 +123,7 @@ def _code(outcome: Receipt | BaseException) -> str:
     return next(code for kind, code in _CODES if isinstance(outcome, kind))
 
 
-# ---- action endpoints ----
-#
-# Parts for ROS actions: a client that sends goals, a server, and a search for other servers.
+# ---- endpoints: a client that sends goals, a server, and a search for other servers ----
 
 # The length of the queues for goals, results, cancels and feedback. ROS's default of 10 is too
 # small for a burst, because a client's queue also gets the answers to other clients.
@@ -163,11 +156,8 @@ class DemandError(Exception):
 
 
 def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rclpy
-    """Send the node a harmless request, and return the future of the node's answer.
-
-    The answer shows that the node has discovered the client.
-    """
-    # It asks to cancel a goal that does not exist.
+    # A harmless request, to cancel a goal that does not exist. Its answer shows that the node has
+    # discovered the client.
     nobodys = UUID(uuid=list(bytes.fromhex(REAL.fresh_id().replace("-", ""))))
     return ClientGoalHandle(client, nobodys, None).cancel_goal_async()
 
@@ -265,10 +255,9 @@ class GoalSender:
         on_feedback: Callable[[Any], None],
         deadline: float,
     ) -> Any:  # noqa: ANN401 - a future of rclpy
-        """Send a goal in the thread that also receives; return the future of the response."""
-        # rclpy 9.1 registers two futures for a goal, one after the other, and returns the second.
-        # If another thread sent the goal, a response could arrive between the two registrations. It
-        # would then resolve only the first future, for which nobody waits.
+        # In the thread that also receives: rclpy 9.1 registers two futures for a goal, one after
+        # the other, and returns the second. If another thread sent the goal, a response could
+        # arrive between the two, and would resolve only the first, for which nobody waits.
         sent: Future[Any] = Future()
         done = REAL.event()
 

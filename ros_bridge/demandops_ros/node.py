@@ -44,10 +44,7 @@ from demandops_ros.actions import (
 
 
 def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
-    """Fill the response with the bookkeeping at a revision or time, and return it.
-
-    Without ``request.at``, that is the newest commit.
-    """
+    # at a revision or time; without one, at the newest commit
     try:
         snapshot = generator.snapshot_at(request.at) if request.at else generator.snapshot
         response.commit, response.bookkeeping_json = _commit_and_json(snapshot)
@@ -56,10 +53,8 @@ def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # 
         response.ok, response.message = False, str(error)
     except Exception as error:  # the caller must get an answer
         REAL.failed("bookkeeping", error)
-        response.ok, response.message = (
-            False,
-            one_line(f"internal error: {error!r}; see the node's log"),
-        )
+        response.ok = False
+        response.message = one_line(f"internal error: {error!r}; see the node's log")
     return response
 
 
@@ -77,8 +72,6 @@ _PAUSE_FACTOR = 20
 
 
 class BookkeepingTopic:
-    """Publishes the bookkeeping on the topic ``~/bookkeeping``: at the start and on change."""
-
     def __init__(
         self, node: Node, generator: Generator, in_executor: Callable[[Callable[[], None]], None]
     ) -> None:
@@ -110,92 +103,26 @@ class BookkeepingTopic:
 
 
 # ---- the node's status on ``/diagnostics``, for ROS 2's own tools ----
-#
-# The node publishes four statuses once a second: whether the state repo can be reached and written,
-# whether the configuration is valid, whether all parts of the generator work, and whether no other
-# node serves the node's actions.
 
 _PERIOD_S = 1.0
 _MOST_PROBLEMS = 20
 
 
-class Diagnostics:
-    def __init__(self, node: Node, generator: Generator, others: OtherServers) -> None:
-        self._node, self._generator, self._others = node, generator, others
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(_PERIOD_S, self._publish)
-
-    def _publish(self) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        generator, address, statuses = self._generator, self._generator.address, []
-
-        remote, unpublished = generator.remote_status, generator.unpublished
-        level, text = DiagnosticStatus.OK, "reachable"
-        if remote.push_denied:
-            level, text = DiagnosticStatus.ERROR, remote.push_denied
-        if remote.unreachable:
-            # while no demand waits, an unreachable repo delays only people's changes
-            level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
-            text = remote.unreachable
-        values = {
-            "reachable": str(not remote.unreachable).lower(),
-            "away since": _time(remote.unreachable_since),
-            "last reached": _time(remote.last_reached),
-            "last push": _time(remote.last_push),
-            "unpublished demands": str(unpublished),
-            "commit": str(generator.snapshot.commit),
-        }
-        statuses.append(status("demandops: state repo", address, level, text, values))
-
-        problems = generator.snapshot.problems
-        level, text = DiagnosticStatus.OK, "all files are valid"
-        if problems:
-            level = DiagnosticStatus.WARN
-            text = f"{len(problems)} problems; the last valid version is in effect"
-        values = {"problems": str(len(problems))}
-        for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
-            values[f"problem {number}"] = str(problem)
-        statuses.append(status("demandops: configuration", address, level, text, values))
-
-        failures = generator.failures
-        level, text = DiagnosticStatus.OK, "all parts work"
-        if failures:
-            level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
-        statuses.append(status("demandops: generator", address, level, text, failures))
-
-        others = self._others.find()
-        level, text = DiagnosticStatus.OK, "no other node serves these actions"
-        if any(others.values()):
-            level, text = (
-                DiagnosticStatus.WARN,
-                "another node serves these actions too; see the log",
-            )
-        values = {action: ", ".join(nodes) for action, nodes in others.items()}
-        statuses.append(status("demandops: actions", address, level, text, values))
-
-        message.status = statuses
-        self._publisher.publish(message)
-
-
 def status(
     name: str, address: str, level: bytes, text: str, values: dict[str, str]
 ) -> DiagnosticStatus:
-    """Return a diagnostic status; its text, its keys and its values have no line breaks."""
     pairs = [KeyValue(key=one_line(key), value=one_line(value)) for key, value in values.items()]
-    message = one_line(text)
-    return DiagnosticStatus(
-        level=level, name=name, message=message, hardware_id=address, values=pairs
-    )
+    text = one_line(text)
+    return DiagnosticStatus(level=level, name=name, message=text, hardware_id=address, values=pairs)
 
 
 def _time(time: datetime | None) -> str:
     return time.isoformat(timespec="seconds") if time else "never"
 
 
-# ---- the ROS 2 node: action servers that submit demands to the generator ----
+# ---- the node: action servers that submit demands to the generator ----
 #
-# A goal is accepted once its demand is in the generator's journal. Many goals may be open without
+# Many goals may be open without
 # blocking the executor, because events from the generator's threads are queued, and a guard
 # condition wakes the executor to handle them. The execute callback of a goal runs only once the
 # goal's outcome is known.
@@ -267,8 +194,9 @@ class DemandNode(Node):  # type: ignore[misc]
             callback_group=ReentrantCallbackGroup(),
         )
         self._bookkeeping_topic = BookkeepingTopic(self, generator, self._in_executor)
-        others = OtherServers(self, (action_name, demand_action_name))
-        self._diagnostics = Diagnostics(self, generator, others)
+        self._others = OtherServers(self, (action_name, demand_action_name))
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_timer(_PERIOD_S, self._report)
 
     def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> LastingResults:
         return LastingResults(
@@ -315,6 +243,56 @@ class DemandNode(Node):  # type: ignore[misc]
             if not done.done():  # the thread did not start
                 done.set_result(None)
 
+    def _report(self) -> None:
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        generator, address, statuses = self._generator, self._generator.address, []
+
+        remote, unpublished = generator.remote_status, generator.unpublished
+        level, text = DiagnosticStatus.OK, "reachable"
+        if remote.push_denied:
+            level, text = DiagnosticStatus.ERROR, remote.push_denied
+        if remote.unreachable:
+            # while no demand waits, an unreachable repo delays only people's changes
+            level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
+            text = remote.unreachable
+        values = {
+            "reachable": str(not remote.unreachable).lower(),
+            "away since": _time(remote.unreachable_since),
+            "last reached": _time(remote.last_reached),
+            "last push": _time(remote.last_push),
+            "unpublished demands": str(unpublished),
+            "commit": str(generator.snapshot.commit),
+        }
+        statuses.append(status("demandops: state repo", address, level, text, values))
+
+        problems = generator.snapshot.problems
+        level, text = DiagnosticStatus.OK, "all files are valid"
+        if problems:
+            level = DiagnosticStatus.WARN
+            text = f"{len(problems)} problems; the last valid version is in effect"
+        values = {"problems": str(len(problems))}
+        for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
+            values[f"problem {number}"] = str(problem)
+        statuses.append(status("demandops: configuration", address, level, text, values))
+
+        failures = generator.failures
+        level, text = DiagnosticStatus.OK, "all parts work"
+        if failures:
+            level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
+        statuses.append(status("demandops: generator", address, level, text, failures))
+
+        others = self._others.find()
+        level, text = DiagnosticStatus.OK, "no other node serves these actions"
+        if any(others.values()):
+            level = DiagnosticStatus.WARN
+            text = "another node serves these actions too; see the log"
+        values = {action: ", ".join(nodes) for action, nodes in others.items()}
+        statuses.append(status("demandops: actions", address, level, text, values))
+
+        message.status = statuses
+        self._diagnostics.publish(message)
+
     # ---- callbacks of the action server, in the executor's thread ----
 
     async def _accept_or_reject(
@@ -322,8 +300,8 @@ class DemandNode(Node):  # type: ignore[misc]
         adapter: DeploymentRequestAdapter,
         message: Any,  # noqa: ANN401
     ) -> GoalResponse:
-        """Accept a goal once its demand is in the journal, so that no crash loses it."""
-        # An invalid goal is accepted too, because a result can contain the reason, but a rejection
+        # A goal is accepted once its demand is in the journal, so that no crash loses it. An
+        # invalid goal is accepted too, because a result can contain the reason, but a rejection
         # cannot. Goals that arrive while the journal syncs share the next sync.
         goal = self._goals[id(message)] = _Goal(adapter, message)
         journaled = Future(executor=self.executor)
@@ -391,8 +369,6 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- an accepted goal, in the executor's thread ----
 
     def _after(self, goal: _Goal, future: Any, step: Callable[[_Goal, Any], None]) -> None:  # noqa: ANN401
-        """Make the executor call ``step`` with the goal and the future's result or error."""
-
         # a coroutine would be slower: rclpy's executor resumes all waiting ones at each event
         def take() -> None:
             try:

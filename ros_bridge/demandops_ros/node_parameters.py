@@ -28,7 +28,7 @@ from rclpy.node import Node
 
 from demandops_ros.messages import ANSWER_LEVELS
 
-# ---- reads the parameters of the reference's node, and warns about those without effect ----
+# ---- the parameters of the reference's node, and warnings about those without effect ----
 #
 # A fleet may start our node with the parameter file of the reference's node. The file calls that
 # node ``application_manager``. Our node takes the action's name from the file. Brokers, topics,
@@ -51,7 +51,6 @@ _REPLACED = {
 
 
 def read_reference_parameters(ros_args: Sequence[str]) -> dict[str, Any]:
-    """Return the reference node's parameters, from ROS arguments and their parameter files."""
     # a rule that renames our node would rename the temporary one, and hide the file's section
     renames = {
         at
@@ -75,7 +74,6 @@ def read_reference_parameters(ros_args: Sequence[str]) -> dict[str, Any]:
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
-    """Yield a warning for each parameter in ``values`` that our node replaces by other means."""
     for name in dict.fromkeys(dotted.partition(".")[0] for dotted in values):
         if name in _REPLACED:
             yield f"parameter {name} of the reference is not used: {_REPLACED[name]}"

@@ -20,7 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros import ros_process
 
-# ---- reads the parameters of a node from the text of a ROS parameter file ----
+# ---- the text of a ROS parameter file ----
 
 _EVERY_NODE = ("/**", "**", "/*", "*")
 _SECTION = "ros__parameters"
@@ -53,7 +53,7 @@ def _flat(section: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, A
             yield f"{prefix}{key}", value
 
 
-# ---- sets the parameters of another node, and sets them again after that node restarts ----
+# ---- the parameters of another node, set again after that node restarts ----
 #
 # A restarted node publishes its parameter events at a new endpoint, which the ROS graph shows.
 
@@ -81,10 +81,7 @@ class ParameterSetter:
         node.create_timer(_LOOK_S, self._set_if_needed)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
-        """Replace the parameters that the target must have; any thread may call this method.
-
-        A value that ROS cannot carry raises TypeError or ValueError, which names the parameter.
-        """
+        # any thread may call this; TypeError or ValueError names a value that ROS cannot carry
         wanted = [_parameter(name, value).to_parameter_msg() for name, value in parameters.items()]
         with self._lock:
             self._wanted, self._version = wanted, self._version + 1
@@ -145,7 +142,7 @@ def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401
         raise type(error)(f"parameter {name}: {error}") from None
 
 
-# ---- ``demandops parameter-sync``: keep a ROS node's parameters equal to those in a ConfigMap ----
+# ---- the command ----
 
 # The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
 # without its `period`, because a watch does not poll.

@@ -249,8 +249,7 @@ class _Signals:
             os._exit(ExitCode.PROGRAM_ERROR)  # an orderly exit could answer goals
 
     def wake(self) -> None:
-        """Make :meth:`wait` check again; any thread may call this."""
-        os.write(self._write, b"\0")
+        os.write(self._write, b"\0")  # any thread may call this
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.stopping:

@@ -16,7 +16,7 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-# ---- the detector's parameters: their defaults, descriptions and ranges ----
+# ---- the detector's parameters ----
 
 # Each parameter: its default, its description and, if it is a number, its range.
 PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
@@ -79,7 +79,7 @@ def declare(node: Node, rules: str | None) -> dict[str, Any]:
     return values
 
 
-# ---- ``demandops detect``: run the event detector, or try its rules on a recorded bag ----
+# ---- the command ----
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
