@@ -128,10 +128,7 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
 
 # ---- the node's parameters: their defaults, descriptions and ranges ----
 
-_CHOICES = {
-    "answer": ANSWER_LEVELS,
-    "log_level": ("debug", "info", "warn", "error", "fatal"),
-}
+_CHOICES = {"answer": ANSWER_LEVELS, "log_level": ("debug", "info", "warn", "error", "fatal")}
 DEFAULTS: dict[str, Any] = {
     "action_name": DEFAULT_ACTION_NAME,
     "demand_action_name": DEFAULT_DEMAND_ACTION_NAME,

@@ -173,10 +173,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
 
 
 def _run(
-    generator: Generator,
-    settings: dict[str, Any],
-    status: RolloutWatcher | None,
-    signals: _Signals,
+    generator: Generator, settings: dict[str, Any], status: RolloutWatcher | None, signals: _Signals
 ) -> None:
     node = DemandNode(
         generator,

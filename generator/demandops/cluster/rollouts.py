@@ -124,10 +124,7 @@ class _Rollout:
 
 class RolloutWatcher:
     def __init__(
-        self,
-        clusters: Mapping[str, ClusterAccess],
-        history: History,
-        runtime: Runtime = REAL,
+        self, clusters: Mapping[str, ClusterAccess], history: History, runtime: Runtime = REAL
     ) -> None:
         """Start; a domain is watched from its first rollout on, if its cluster has a kubeconfig."""
         self._history, self._runtime = history, runtime

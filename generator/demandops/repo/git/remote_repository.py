@@ -205,10 +205,7 @@ class RemoteRepository(StateRepository):
         partial.rename(self._folder)
 
     def _fetch(
-        self,
-        repo: git.Repo,
-        urgent: Callable[[], bool] = lambda: False,
-        timeout: float = TIMEOUT_S,
+        self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False, timeout: float = TIMEOUT_S
     ) -> None:
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.

@@ -130,9 +130,7 @@ def check(
             new if start is None else start.releases(), new, edit.before_merge(wanted), wanted
         )
         charts = rendered_charts.render_charts(
-            state,
-            edit.changed if start else None,
-            {file.path for file in preview.files},
+            state, edit.changed if start else None, {file.path for file in preview.files}
         )
         faults += charts.faults
         if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
