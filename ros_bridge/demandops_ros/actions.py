@@ -135,10 +135,8 @@ _UNHEARD_S = 5.0
 
 _ASK_AGAIN_S = 0.2
 
-# How long ROS keeps a goal that has ended.
-_GOAL_KEPT_S = 10
-# How long LastingResults keeps a result that ROS has forgotten.
-_RESULT_S = 900
+_GOAL_KEPT_S = 10  # how long ROS keeps a goal that has ended
+_RESULT_S = 900  # how long LastingResults keeps a result that ROS has forgotten
 # How many results it keeps; if there are more, it forgets the oldest ones earlier.
 _MOST_RESULTS = 2_000
 

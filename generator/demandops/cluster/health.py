@@ -340,8 +340,7 @@ def _handled(source: Object) -> str:
 # current spec.
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
-# A reason lists at most this many objects on which a sync failed.
-_DETAILS = 3
+_DETAILS = 3  # a reason lists at most this many objects on which a sync failed
 
 
 class ArgoCd(HealthReader):

@@ -21,10 +21,8 @@ from demandops.cluster.clusters_file import own_cluster_api
 
 log = logging.getLogger("demandops")
 
-# How long a Lease is valid if nobody renews it.
-_LEASE_S = 15
-# A leader that has not renewed its Lease for so long ends its process.
-_RENEW_WITHIN_S = 10
+_LEASE_S = 15  # how long a Lease is valid if nobody renews it
+_RENEW_WITHIN_S = 10  # a leader that has not renewed its Lease for so long ends its process
 # How long a call of the API may take. A renewal has two calls, and must end before the Lease does:
 # _RENEW_WITHIN_S + 2 * _CALL_S < _LEASE_S.
 _CALL_S = 2

@@ -42,8 +42,7 @@ from demandops.templating.evaluator import EVALUATE
 
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
-# The first render version whose claims mark the further topics of a source.
-_FIRST_WITH_MARKS = 2
+_FIRST_WITH_MARKS = 2  # the first render version whose claims mark the further topics of a source
 # How many parts the path ``clusters/<cluster>/<access domain>`` has.
 _FOLDER_DEPTH = 3
 _NAMES = {"flux": "Flux", "argocd": "Argo CD"}
@@ -51,16 +50,14 @@ _NAMES = {"flux": "Flux", "argocd": "Argo CD"}
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    # the new GitOps controller; None keeps the current one
-    gitops: str | None = None
+    gitops: str | None = None  # the new GitOps controller; None keeps the current one
     # where a controller without a section in demandops.yaml fetches; None: as the current one does
     url: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    # of the upgrade, or the tip if no commit was made
-    commit: str
+    commit: str  # of the upgrade, or the tip if no commit was made
     old: Config
     new: Config
     files: Mapping[str, str | None]

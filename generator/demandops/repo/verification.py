@@ -126,20 +126,14 @@ _CHARTS = "/_charts/"
 class Verdict:
     commit: str
     summary: str
-    # whether no fault was found, also in a commit that was skipped
-    holds: bool
-    # why the commit was not rendered again
-    skipped: str = ""
-    # the error of reading or rendering the commit again
-    fault: str = ""
-    # the generated files that differ from the rendered ones
-    differing: tuple[str, ...] = ()
+    holds: bool  # whether no fault was found, also in a commit that was skipped
+    skipped: str = ""  # why the commit was not rendered again
+    fault: str = ""  # the error of reading or rendering the commit again
+    differing: tuple[str, ...] = ()  # the generated files that differ from the rendered ones
     # the files that the commit changed, but was not allowed to change
     touched: tuple[str, ...] = ()
-    # whether the commit has a signature, valid or not
-    signed: bool = False
-    # who signed, if a signature is required and valid; else why it is not
-    signer: str = ""
+    signed: bool = False  # whether the commit has a signature, valid or not
+    signer: str = ""  # who signed, if a signature is required and valid; else why it is not
     signature: str = ""
 
 

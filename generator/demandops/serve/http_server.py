@@ -188,8 +188,7 @@ _PATH = "/push"
 _AT_ONCE = 32
 # The largest body that GitHub sends, in bytes; a body is hashed and not stored.
 _MAX_BODY = 25 << 20
-# Anyone may send requests, and a line for each could fill the log.
-_WARN_EVERY_S = 60.0
+_WARN_EVERY_S = 60.0  # anyone may send requests, and a line for each could fill the log
 
 _SIGNATURES = ("X-Hub-Signature-256", "X-Gitea-Signature", "X-Forgejo-Signature")
 _TOKEN = "X-Gitlab-Token"  # noqa: S105 - a header's name

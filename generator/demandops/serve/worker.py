@@ -138,8 +138,7 @@ _TIDY_EVERY = 50
 # How often to carry out a change by a person while other generators, which do the same, are faster.
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
-# The thread's name, under which a health check reports its failure.
-_NAME = "writer"
+_NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
 class Worker:

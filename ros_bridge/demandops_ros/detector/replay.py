@@ -227,8 +227,7 @@ def _text(x: float, y: float, text: str, color: str) -> str:
 
 # How many messages the detector gets at a time; the number does not change the events.
 _TOGETHER = 1_000
-# The least distance in metres between two points of an entity's track in the plot.
-_TRACK_M = 0.5
+_TRACK_M = 0.5  # the least distance in metres between two points of an entity's track in the plot
 
 
 @dataclass

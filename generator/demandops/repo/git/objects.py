@@ -29,16 +29,13 @@ from pygit2.enums import ObjectType
 # take longer than the rest of a demand's commit. Git's housekeeping makes deltas later.
 
 _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
-# The level of compression. A pack is short-lived, so speed counts more than size.
-_LEVEL = 1
-# An index has a separate table for offsets of at least this value.
-_SHORT_OFFSETS = 1 << 31
+_LEVEL = 1  # of compression; a pack is short-lived, so speed counts more than size
+_SHORT_OFFSETS = 1 << 31  # an index has a separate table for offsets of at least this value
 
 
 class Packed(NamedTuple):
-    # the checksum and the offset are those of the packed bytes
     oid: bytes
-    crc: int
+    crc: int  # of the packed bytes, as the offset is
     offset: int
 
 
@@ -110,12 +107,10 @@ def _write_synced(path: Path, parts: Iterable[bytes]) -> None:
 # loose copy of the object. The copy may not be on the disk yet, or git may soon prune it.
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
-# The prefix of the folders in which packs are built.
-UNFINISHED = "demandops-pack-"
+UNFINISHED = "demandops-pack-"  # the prefix of the folders in which packs are built
 # The errors raised if a file system has no hard links, or a file has too many.
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-# The first bytes of the index of a pack.
-_INDEX = b"\xfftOc"
+_INDEX = b"\xfftOc"  # the first bytes of the index of a pack
 
 # An entry of a tree object: the mode, the name and the raw id.
 _ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0.{20})", re.DOTALL)

@@ -89,8 +89,7 @@ _REMEDIES = (
 _AMBIGUOUS = re.compile(r"dst refspec \S+ matches more than one")
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to", "fsck": "checking the clone of"}
-# Git ends an idle HTTP transfer much earlier.
-_CLONE_TIMEOUT_S = 3600
+_CLONE_TIMEOUT_S = 3600  # Git ends an idle HTTP transfer much earlier
 # This machine's disk, not the server's, whose errors begin with ``remote:``.
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
 # Git's errors about its own clone: unreadable, or without the remote ``origin``.

@@ -156,8 +156,7 @@ class StateRepository(ABC):
     runtime: Runtime = REAL
     # called again and again while this waits for git
     while_waiting: Callable[[], object] = staticmethod(lambda: None)
-    # whether the tip needs no fetch, as in a repository on this disk
-    always_current: bool
+    always_current: bool  # whether the tip needs no fetch, as in a repository on this disk
     _tidying: subprocess.Popen[bytes] | None = None
     # of the tip: main, its remote-tracking branch, or HEAD of a checkout
     main_reference = MAIN

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-# How many seconds git may take before the listener is called.
-AFTER_S = 1
+AFTER_S = 1  # how many seconds git may take before the listener is called
 
 _listeners: list[Callable[[str], None]] = []
 

@@ -20,8 +20,7 @@ pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
 
-# How many folders deep a file may be; deeper folders are not read.
-MAX_DEPTH = 64
+MAX_DEPTH = 64  # how many folders deep a file may be; deeper folders are not read
 
 
 def commit_of(repo: Repository, commit: str | Oid) -> Commit:

@@ -97,8 +97,7 @@ def _decoded(text: str) -> str:
 PROPOSAL = "Proposal"
 # The trailer with the branch and commit where the demand was proposed with other content.
 REPLACES = "Replaces"
-# The trailer, repeated, with what requires the approval.
-REQUIRED_BY = "Approval-Required-By"
+REQUIRED_BY = "Approval-Required-By"  # the trailer, repeated, with what requires the approval
 
 # The committer of every commit by a generator.
 GENERATOR_NAME = "DemandOps generator"

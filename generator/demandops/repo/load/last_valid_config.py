@@ -42,8 +42,7 @@ class Problem:
     message: str
     since: str = ""
     author: str = ""
-    # not written to the report: ``Reader.problems`` finds it in the file
-    line: int | None = None
+    line: int | None = None  # not written to the report: ``Reader.problems`` finds it in the file
 
     def __str__(self) -> str:
         places = (place_text(self.file, self.line), self.field)

@@ -43,8 +43,7 @@ ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
 class Snapshot:
     commit: Oid
     state: State
-    # the newest commit without problems
-    last_valid_commit: Oid
+    last_valid_commit: Oid  # the newest commit without problems
     # the faults of invalid files, whose last valid versions are in effect
     problems: tuple[Fault, ...] = ()
     # ledger files whose content at this commit is not in effect
@@ -66,8 +65,7 @@ class Snapshot:
 @dataclass(frozen=True, slots=True)
 class Advance:
     snapshot: Snapshot
-    # those whose claims changed
-    subjects: tuple[Subject, ...]
+    subjects: tuple[Subject, ...]  # those whose claims changed
     # all releases must be rendered again, usually because the configuration changed
     config_changed: bool
 

@@ -175,14 +175,10 @@ class Judgement:
     repo: Repository
     before: Snapshot
     advance: Advance
-    # why a subject cannot be planned with the new configuration
-    with_new: Faults
-    # why a subject cannot be planned, or is refused, with the old configuration
-    with_old: Faults
-    # why a person's claim on the subject is refused with the new configuration
-    refused: Faults
-    # the configuration that was in effect before, with the new ledger
-    old: State
+    with_new: Faults  # why a subject cannot be planned with the new configuration
+    with_old: Faults  # why a subject cannot be planned, or is refused, with the old configuration
+    refused: Faults  # why a person's claim on the subject is refused with the new configuration
+    old: State  # the configuration that was in effect before, with the new ledger
 
     def with_new_config(self) -> Advance:
         # with the last valid versions of claims at fault; what has a fault only with the new

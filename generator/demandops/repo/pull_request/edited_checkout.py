@@ -159,12 +159,9 @@ class Base:
     files: Mapping[str, str]
     # in effect at this commit, with last valid versions; None if there never was a valid state
     state: State | None
-    # whether all files of the commit are valid
-    valid: bool
-    # the merge target as git names it, such as ``origin/main``, if there is one
-    target: str = ""
-    # how many commits of the merge target the checkout lacks
-    newer: int = 0
+    valid: bool  # whether all files of the commit are valid
+    target: str = ""  # the merge target as git names it, such as ``origin/main``, if there is one
+    newer: int = 0  # how many commits of the merge target the checkout lacks
     # the merge target's generated files, if the checkout lacks commits of it
     merged: Mapping[str, str] = field(default_factory=dict)
 

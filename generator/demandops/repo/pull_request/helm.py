@@ -43,12 +43,10 @@ _PLACE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    # API group and kind of each rendered object
-    kinds: tuple[tuple[str, str], ...] = ()
+    kinds: tuple[tuple[str, str], ...] = ()  # API group and kind of each rendered object
     faults: tuple[Fault, ...] = ()
     warnings: tuple[Fault, ...] = ()
-    # not, if helm was stopped because of its limits
-    ended: bool = True
+    ended: bool = True  # not, if helm was stopped because of its limits
 
 
 @dataclass(frozen=True, slots=True)

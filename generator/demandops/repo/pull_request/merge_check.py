@@ -49,15 +49,11 @@ _MOST_LEFT = 5
 class Suggestion:
     """A suggested override that replaces the manual edit of a generated file."""
 
-    # the path of the edited file
-    instead_of: str
-    # path and content of the override
-    file: str
+    instead_of: str  # the path of the edited file
+    file: str  # path and content of the override
     text: str
-    # the parts of the edit that the override leaves out
-    not_covered: tuple[str, ...]
-    # the other releases to which the override also applies
-    other_releases: tuple[str, ...]
+    not_covered: tuple[str, ...]  # the parts of the edit that the override leaves out
+    other_releases: tuple[str, ...]  # the other releases to which the override also applies
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,15 +69,12 @@ class CheckResult:
     preview: MergePreview | None = None
     # also None if the base's bookkeeping is not known; empty if there is no base
     bookkeeping: tuple[EntryChange, ...] | None = None
-    # the commit that the checkout is compared with
-    base: str | None = None
-    # if not, the last valid versions of its files are compared
-    base_valid: bool = True
+    base: str | None = None  # the commit that the checkout is compared with
+    base_valid: bool = True  # if not, the last valid versions of its files are compared
     # the name of the merge target, and how many commits it has that the checkout lacks
     target: str = ""
     newer: int = 0
-    # likely mistakes, and what a person has to do after the merge
-    warnings: tuple[Fault, ...] = ()
+    warnings: tuple[Fault, ...] = ()  # likely mistakes, and what a person has to do after the merge
     charts: RenderedCharts | None = None
 
 

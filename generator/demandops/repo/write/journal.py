@@ -53,17 +53,13 @@ class ProposalRecord:
     branch: str
     # where the generator left the branch, newest last; two if the newest's push may have failed
     commits: tuple[str, ...] = ()
-    # the commit of main on which the newest of the commits was made
-    base: str = ""
+    base: str = ""  # the commit of main on which the newest of the commits was made
     # If a pushed branch is missing, somebody deleted it. After a person merges only some of the
     # demands, this is false until the branch is pushed again.
     pushed: bool = False
-    # the address of the branch's merge request, if GitLab printed it at a push
-    link: str = ""
-    # the reason why the demand was withdrawn
-    withdrawn: str = ""
-    # branch and commit where the demand waited, before it became another
-    replaces: str = ""
+    link: str = ""  # the address of the branch's merge request, if GitLab printed it at a push
+    withdrawn: str = ""  # the reason why the demand was withdrawn
+    replaces: str = ""  # branch and commit where the demand waited, before it became another
 
     @property
     def replaced_branch(self) -> str:
@@ -345,10 +341,8 @@ class Slot:
 class FoundJournal:
     file: Path
     demands: list[JournalEntry]  # that are not done and can be read
-    # the error of reading the journal, if any
-    damage: str = ""
-    # the file's new path, if it was renamed
-    set_aside: Path | None = None
+    damage: str = ""  # the error of reading the journal, if any
+    set_aside: Path | None = None  # the file's new path, if it was renamed
 
 
 def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[FoundJournal]:

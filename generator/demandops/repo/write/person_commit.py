@@ -52,8 +52,7 @@ class CommitDetails:
 class Published:
     commit: str
     branch: str
-    # the address of the branch's merge request, if the server printed it
-    link: str = ""
+    link: str = ""  # the address of the branch's merge request, if the server printed it
 
 
 def commit_to_main(

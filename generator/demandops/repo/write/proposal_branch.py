@@ -194,11 +194,9 @@ class ProposalBranches:
 @dataclass(frozen=True, slots=True)
 class PendingProposal:
     branch: str
-    # the newest of the branch, perhaps by a person
-    commit: str
+    commit: str  # the newest of the branch, perhaps by a person
     summary: str
-    # when the first demand was received
-    since: datetime
+    since: datetime  # when the first demand was received
     requesters: tuple[str, ...]
     demands: tuple[str, ...]
     operations: tuple[str, ...]

@@ -63,8 +63,7 @@ log = logging.getLogger("demandops")
 
 # The seconds between two queries to the forge, to learn which pull requests were closed.
 POLL_S = 30.0
-# How long to pause after a forge has answered that it got too many requests.
-_REST_S = 60.0
+_REST_S = 60.0  # how long to pause after a forge has answered that it got too many requests
 
 
 @dataclass(frozen=True, slots=True)

@@ -39,8 +39,7 @@ class Verdict:
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
     # These were withdrawn or turned down, or can no longer be booked.
     failed: Failed = field(default_factory=list)
-    # These no longer need approval.
-    free: list[Ticket] = field(default_factory=list)
+    free: list[Ticket] = field(default_factory=list)  # these no longer need approval
     unapproved: Decided = field(default_factory=list)
 
 

@@ -25,8 +25,7 @@ from demandops.model.demand.demand_request import DemandRequest
 # flood a remote that comes back.
 
 FIRST_PAUSE_S = 0.05
-# While the remote cannot be reached.
-LONGEST_AWAY_S = 10.0
+LONGEST_AWAY_S = 10.0  # while the remote cannot be reached
 # After another writer published first; a writer that waits longer loses again to the others.
 LONGEST_TURN_S = 0.4
 # The most demands to publish together. A push takes about 50 ms, but moving a branch of a
@@ -104,8 +103,7 @@ class Rest:
 
 DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
-# A Git server may report many pushes at once; they share a fetch.
-_SHORTEST_GAP_S = 0.5
+_SHORTEST_GAP_S = 0.5  # a Git server may report many pushes at once; they share a fetch
 # The longest interval for a repository on this disk, where a check is cheap: it reads one file.
 _LOCAL_S = 1.0
 
