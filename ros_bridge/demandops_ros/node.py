@@ -122,10 +122,9 @@ def _time(time: datetime | None) -> str:
 
 # ---- the node: action servers that submit demands to the generator ----
 #
-# Many goals may be open without
-# blocking the executor, because events from the generator's threads are queued, and a guard
-# condition wakes the executor to handle them. The execute callback of a goal runs only once the
-# goal's outcome is known.
+# Many goals may be open without blocking the executor, because events from the generator's threads
+# are queued, and a guard condition wakes the executor to handle them. The execute callback of a
+# goal runs only once the goal's outcome is known.
 
 # How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost.
 _DEFAULT_DEPTH = 10
@@ -166,10 +165,7 @@ class DemandNode(Node):  # type: ignore[misc]
         timeout_s: float,
         status: RolloutWatcher | None,
     ) -> None:
-        """Start the servers.
-
-        ``level`` is that at which to answer a goal that names none. ``timeout_s`` limits a rollout.
-        """
+        # ``level`` is for goals that name none; ``timeout_s`` limits a rollout
         super().__init__("demandops")
         self._generator = generator
         self._level, self._timeout_s, self._status = level, timeout_s, status
@@ -420,7 +416,15 @@ class DemandNode(Node):  # type: ignore[misc]
             goal.is_refused = True
             self.get_logger().error(f"{goal}: {_one_line(text)}")
         else:
-            self._in_executor(partial(_give_feedback, goal, goal.adapter.feedback(stage, text)))
+            feedback = goal.adapter.feedback(stage, text)
+
+            def give() -> None:
+                if goal.handle is None:
+                    goal.feedback.append(feedback)
+                elif goal.handle.is_active:
+                    goal.handle.publish_feedback(feedback)
+
+            self._in_executor(give)
 
     def _in_executor(self, event: Callable[[], None]) -> None:
         self._events.append(event)
@@ -436,10 +440,3 @@ class DemandNode(Node):  # type: ignore[misc]
 
 def _one_line(text: str) -> str:
     return one_line(text.replace("\n", "; "))
-
-
-def _give_feedback(goal: _Goal, feedback: Any) -> None:  # noqa: ANN401
-    if goal.handle is None:
-        goal.feedback.append(feedback)
-    elif goal.handle.is_active:
-        goal.handle.publish_feedback(feedback)

@@ -270,7 +270,6 @@ class Flux(HealthReader):
         return (labels.get(_APPLIED_IN), labels.get(_APPLIED_BY)) == self.follower(domain)[1:]
 
     def handled_request(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the time stamp of the last fetch request that the source handled, or empty."""
         return _handled(self._source(domain, objects) or {})
 
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
@@ -486,7 +485,6 @@ def _failure(app: Object) -> tuple[str, str]:
 
 
 def _sync_message(operation: Object) -> str:
-    """Return the message of a failed sync, with those of failed objects that it lacks."""
     message = str(operation.get("message", ""))
     failed = [
         item

@@ -94,7 +94,6 @@ class Leadership:
             self._require_renewed()  # a renewal that begins now could end too late
 
     def _compete(self) -> None:
-        """Renew the Lease, or become the leader if it is free and this process may lead."""
         lease = self._read()
         spec = lease.get("spec") or {}
         holder = spec.get("holderIdentity") or ""

@@ -92,7 +92,6 @@ class ObjectCache:
             self._unread = reason
 
     def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read the ``wanted`` objects now; the errors of the library are raised."""
         # one after the other, because watches lag behind each other: the objects that the caller
         # names last are then the newest
         for selector in wanted:
@@ -132,7 +131,19 @@ class ObjectCache:
                 ):
                     if self._closed.is_set():
                         return
-                    self._apply(selector, event)
+                    if event["type"] not in ("ADDED", "MODIFIED", "DELETED"):
+                        continue
+                    item = event["object"]
+                    key = (selector.kind, selector.namespace, item["metadata"]["name"])
+                    with self._lock:
+                        cached = self._objects.get(key)
+                        if cached is not None and _version(item) < _version(cached):
+                            continue  # `refresh` has read a newer version
+                        if event["type"] == "DELETED":
+                            self._objects.pop(key, None)
+                        else:
+                            self._objects[key] = item
+                    self._on_change()
                 pause = _FIRST_PAUSE_S
             except Exception as error:  # the library raises errors of many kinds
                 self._set_error(selector, _reason(selector, error))
@@ -160,21 +171,6 @@ class ObjectCache:
                 self._objects[kind, namespace, item["metadata"]["name"]] = item
             self._known.add(selector)
         return str(listed["metadata"]["resourceVersion"])
-
-    def _apply(self, selector: ObjectSelector, event: dict[str, Any]) -> None:
-        item = event["object"]
-        if event["type"] not in ("ADDED", "MODIFIED", "DELETED"):
-            return
-        key = (selector.kind, selector.namespace, item["metadata"]["name"])
-        with self._lock:
-            cached = self._objects.get(key)
-            if cached is not None and _version(item) < _version(cached):
-                return  # `refresh` has read a newer version
-            if event["type"] == "DELETED":
-                self._objects.pop(key, None)
-            else:
-                self._objects[key] = item
-        self._on_change()
 
     def _set_error(self, selector: ObjectSelector, reason: str) -> None:
         with self._lock:

@@ -169,7 +169,6 @@ class RolloutWatcher:
         return rollout.future
 
     def close(self) -> None:
-        """Stop all watches, and resolve the open futures with the current health."""
         self._closed = True
         self._changed.set()
         self._thread.join(5)

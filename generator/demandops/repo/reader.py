@@ -41,7 +41,6 @@ class Reader:
 
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
-        """Return a reader of the state repo at an address; of a checkout only if ``only_read``."""
         try:
             # The clone of a URL stays on the disk for later readers. It is in a folder of readers,
             # so that none takes over a generator's journal.
@@ -70,7 +69,7 @@ class Reader:
         return str(self._tip)
 
     def for_another_thread(self) -> Reader:
-        """Return a new reader at the same commit, without a fetch, for use in another thread."""
+        # at the same commit, without a fetch
         other = Reader(self.repository, self._tip)
         try:
             other._objects = self.repository.reopened()
@@ -105,7 +104,6 @@ class Reader:
             return state_in_effect.state_at(self._objects, self.commit(revision), progress)
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        """Return :meth:`last_valid_snapshot` of the newest commit, if possible from ``before``."""
         is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
         if before.problems or is_recorded:
             return self.last_valid_snapshot(str(self._tip))
@@ -142,7 +140,6 @@ class Reader:
         )
 
     def edited_files(self, before: str, after: Snapshot) -> list[str]:
-        """Return the files that differ between two commits and are more than demands, sorted."""
         # Files that are as rendered from the claims are left out, whoever committed them: anybody
         # can commit under the generator's name.
         old, new = self._tree(before), self._tree(str(after.commit))
@@ -220,7 +217,7 @@ class Reader:
         return sorted(path for path, _ in changed)
 
     def base_of(self, commit: str) -> str:
-        """Return the commit at which another commit, of a proposal, left main."""
+        # the commit at which another one, of a proposal, left main
         base = self._objects.merge_base(self._tip, trees.commit_of(self._objects, commit).id)
         return str(base or self._tip)
 

@@ -84,11 +84,7 @@ def upgrade(
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
 ) -> Upgrade:
-    """Render everything again, and publish all changed files, if any, in one commit.
-
-    Raises InvalidInput if the state repo is not valid, or the request cannot be fulfilled.
-    ``progress`` is called with (files read, all files) while the ledger is read.
-    """
+    # InvalidInput is raised if the state repo is not valid, or the request cannot be fulfilled
     with reader.opened(address) as repo:
         repository = repo.repository
         repository.signer = signer

@@ -211,7 +211,6 @@ class _Proof:
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
-    """Yield a verdict on each of ``commits``, whose oldest is first."""
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
@@ -292,7 +291,6 @@ def _blob(text: str) -> Oid:
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return the verdicts; one of a generator's commit fails if it lacks a required signature."""
     pairs = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
     checks = signing.checks(repo, [commit for _, commit in pairs if entry_of(commit).by_generator])
     signed = []

@@ -124,7 +124,6 @@ class Demands:
         self._arrival.set()
 
     def wake(self) -> None:
-        """End the worker's wait even if no demand has arrived; any thread may call this."""
         with self._changed:
             self._woken = True
             self._changed.notify()
@@ -150,7 +149,6 @@ class Demands:
         self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
-        """Journal the demands that arrived, and fill ``batch`` up to ``limit`` demands."""
         self._take_in()
         with self._changed:
             self._journal.require_sound()
@@ -186,7 +184,6 @@ class Demands:
             self._take_in()
 
     def _take_in(self) -> None:
-        """Journal the demands that arrived; refuse those that cannot be accepted or journaled."""
         if not self._arrived:
             return
         taken, refused = list[Ticket](), list[tuple[Ticket, DemandOpsError]]()
@@ -248,7 +245,6 @@ class Demands:
         return None
 
     def commit(self, ticket: Ticket) -> bool:
-        """Mark a demand as committed; return whether it is, as it may be withdrawn already."""
         with self._changed:
             return _change(ticket, "committed")
 
@@ -273,7 +269,6 @@ class Demands:
             self._changed.notify()
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand that is not committed or answered; return whether it is withdrawn."""
         self._take_in()
         with self._changed:
             ticket = self._tickets.get(operation)
@@ -363,7 +358,6 @@ class Demands:
         self.answer([(ticket, error) for ticket in batch], keep)
 
     def end(self, error: Unsound) -> None:
-        """Accept no more demands, and answer all open ones with an error; keep the journal."""
         self.close()
         with self._changed:
             left = list(self._tickets.values())

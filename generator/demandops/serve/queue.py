@@ -97,9 +97,8 @@ class Ticket:
         self.journaled.set_result(False)
 
     def notify(self, stage: Stage, text: str) -> None:
-        """Report a stage to the listener once, or ``proposed`` once for each text."""
-        # a demand is evaluated again after each lost race, which must not repeat its stages; a
-        # proposal has another text once its pull request is known
+        # A stage is reported once, although a demand is evaluated again after each lost race. But a
+        # proposal has another text once its pull request is known.
         key = text if stage == "proposed" else stage
         if key in self.notified:
             return
@@ -110,7 +109,6 @@ class Ticket:
             log.exception("a listener failed")
 
     def mark_maybe_published(self, base: str) -> None:
-        """Record that a push on top of ``base`` may have succeeded although it seemed to fail."""
         if not self.maybe_published:  # the oldest base counts, because any try may have succeeded
             self.base, self.maybe_published = base, True
 
@@ -141,7 +139,6 @@ def reason_of(error: DemandOpsError) -> str:
 
 
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    """Return a ticket whose listener logs what becomes of the demand."""
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"
 

@@ -114,7 +114,6 @@ class FaultLog:
         self._logged = frozenset(current)
 
     def warn_if_unsigned(self, snapshot: Snapshot) -> None:
-        """Warn once if the state repo lists who may sign and this generator has no key."""
         if self._repository.signer is not None or self._warned_of_signers:
             return
         if signing.are_listed(self._repository.objects, snapshot.commit):
@@ -176,7 +175,6 @@ class Worker:
     # ---- from any thread ----
 
     def fetch_now(self) -> None:
-        """Have the worker fetch as soon as no demand is queued, even if no fetch is due."""
         self._timer.request()
         self._demands.wake()
 
@@ -411,7 +409,6 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if a fetch is due, carry out people's changes, and do the work that is due."""
         is_due = self._own_work.is_due(self.snapshot.state)
         try:
             if self._timer.start_if_due():

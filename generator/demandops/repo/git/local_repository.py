@@ -114,7 +114,6 @@ class LocalRepository(StateRepository):
             raise self._unreadable(f"its commit {self.tip()} is missing")
 
     def tip(self) -> Oid:
-        """Return the newest commit of main, or raise StateRepoError if main is no plain branch."""
         main = self.objects.references.get(self.main_reference)
         if main is None:
             raise missing_main(self.address)
@@ -167,10 +166,7 @@ class LocalRepository(StateRepository):
             raise reason from None
 
     def _break_stale_lock(self) -> None:
-        """Remove the branch's lock if it is so old that a killed process must have left it.
-
-        The age counts from the time when this process first saw the lock, by the monotonic clock.
-        """
+        # its age counts from when this process first saw it, by the monotonic clock
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         try:
             status = lock.lstat()
@@ -252,7 +248,6 @@ _ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
 
 
 def is_url(address: str) -> bool:
-    """Return whether an address is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``)."""
     try:
         exists = Path(address).exists()
     except OSError:  # the address is too long, or in a folder that this user cannot read

@@ -43,7 +43,14 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
     parts = [b"PACK" + struct.pack(">II", 2, len(objects))]
     packed, offset = list[Packed](), len(parts[0])
     for oid, kind, data in objects:
-        part = _header(_KINDS[kind], len(data)) + zlib.compress(data, _LEVEL)
+        # 4 bits of the size are beside the type, 7 in each further byte; the top bit means more
+        byte, size = _KINDS[kind] << 4 | len(data) & 0xF, len(data) >> 4
+        header = bytearray()
+        while size:
+            header.append(byte | 0x80)
+            byte, size = size & 0x7F, size >> 7
+        header.append(byte)
+        part = bytes(header) + zlib.compress(data, _LEVEL)
         packed.append(Packed(oid.raw, zlib.crc32(part), offset))
         parts.append(part)
         offset += len(part)
@@ -54,19 +61,8 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
     return path
 
 
-def _header(kind: int, size: int) -> bytes:
-    # 4 bits of the size are beside the type, and 7 in each further byte; the top bit means more
-    byte, size = kind << 4 | size & 0xF, size >> 4
-    header = bytearray()
-    while size:
-        header.append(byte | 0x80)
-        byte, size = size & 0x7F, size >> 7
-    header.append(byte)
-    return bytes(header)
-
-
 def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
-    """Return the bytes of the index (version 2) of a pack with this checksum, in parts."""
+    # version 2 of the format
     packed = sorted(packed)
     firsts = [item.oid[0] for item in packed]
     far = [item.offset for item in packed if item.offset >= _SHORT_OFFSETS]
@@ -151,7 +147,6 @@ class NewObjects(pygit2.OdbBackend):
         return oid
 
     def folder(self, oid: Oid) -> Entries:
-        """Return the entries of a folder, to change and pass to :meth:`add_folder`."""
         remembered = self._folders.pop(oid, None)
         if remembered is not None:
             return remembered
@@ -231,7 +226,6 @@ class NewObjects(pygit2.OdbBackend):
 
     @contextmanager
     def _placed(self, build: Callable[[Path], Path]) -> Iterator[None]:
-        """Build a pack, move it into place, and protect it from git while the block runs."""
         packs = self._packs
         with _locked(packs, fcntl.LOCK_SH), _new_folder(self.repo.path) as folder:
             built = build(folder)

@@ -388,7 +388,6 @@ class RemoteRepository(StateRepository):
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and its children, and return git's standard output and error output."""
     # first by SIGTERM, so that git can remove its locks
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):

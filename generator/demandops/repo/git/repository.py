@@ -164,7 +164,6 @@ class StateRepository(ABC):
     branches = "refs/heads/"
 
     def tip(self) -> Oid:
-        """Return the newest published commit that is known here, without asking the remote."""
         target = self.objects.references[self.main_reference].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
@@ -208,7 +207,6 @@ class StateRepository(ABC):
             return False
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` exists and is equal in two commits that are known here."""
         pair = self._trees(commit, other)
         if pair is None:
             return False

@@ -20,7 +20,6 @@ class SlowGit:
         self._what, self._told = what, 0
 
     def lasts(self, seconds: float) -> None:
-        """Call the listener once for each full second, however often this is called."""
         if int(seconds) > self._told and int(seconds) >= AFTER_S:
             self._told = int(seconds)
             for listener in _listeners:

@@ -171,7 +171,6 @@ def is_by_generator(repo: Repository, commit: Commit) -> bool:
 def commits(
     repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[tuple[Commit, LogEntry]]:
-    """Yield ``tip`` and its ancestors without ``after`` and its ancestors, the newest first."""
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
     walked: Iterable[Commit] = walker
     if after is not None:
@@ -293,7 +292,6 @@ class PathHistory:
 def changes_to(
     repo: Repository, tip: str | Oid, path: str, after: str | None = None
 ) -> Iterator[PathChange]:
-    """Yield the commits after ``after`` that changed a path, newest first, as ``git log`` does."""
     for revision in _git_log(repo, tip, after, "--format=%H", f":(literal){path}"):
         commit = commit_of(repo, revision)
         before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)
@@ -318,7 +316,6 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 
 
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
-    """Return the path of the file of the release ``name``, or its last path if it was stopped."""
     if not _NAME.fullmatch(name):
         return None
     files = trees.blobs(commit_of(repo, tip).tree, (CLUSTERS_ROOT,))

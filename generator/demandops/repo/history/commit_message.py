@@ -61,7 +61,6 @@ def generator_signature(time: datetime) -> pygit2.Signature:
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
-    """Return the author of the commit: the demand's requesters, or who ran the command."""
     request = decision.request
     if isinstance(request, Restoration):
         return signature(request.by, request.email, received)
@@ -338,11 +337,8 @@ def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
 
 
 def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
-    """Return a function from a file with a fault to the id and author of the commit that caused it.
-
-    This is the last person's commit that changed the file, else the last one that changed any file
-    of the generator, else None.
-    """
+    # A fault is caused by the last person's commit that changed its file, else by the last one that
+    # changed any file of the generator. The function returns the commit's id and author.
 
     @cache  # the commits are read only when needed: most problems are already in the report
     def commits() -> list[Commit]:
@@ -384,7 +380,6 @@ def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
 
 
 def operator(folder: str | None = None) -> Person:
-    """Return who runs this program, as git knows this person, else by the login."""
     try:
         login = getpass.getuser()
     except (KeyError, OSError):  # a container's user has no passwd entry

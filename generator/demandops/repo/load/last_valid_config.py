@@ -225,7 +225,6 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return the broken files, and all files that apply only together with them or with these."""
     together = set(broken)
     merges = [
         {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}

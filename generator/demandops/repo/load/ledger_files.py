@@ -95,7 +95,6 @@ def last_valid_claims(
 
 
 def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
-    """Return the lease that a claim had on main before its proposal was merged, if any."""
     for commit in commit_log.first_parents(repo, to):
         claim = valid_claim_at(commit.tree, path)
         # a merged proposal's lease has not started; the one before it has
@@ -125,7 +124,6 @@ def claims_by_people(
 
 
 def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
-    """Return the keys of the claims at ``to`` that people themselves have added since a commit."""
     if not since or since not in repo:
         return set()
     before, after = trees.commit_of(repo, since).tree, trees.commit_of(repo, to).tree

@@ -232,14 +232,13 @@ def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValid
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
-    """Return the configuration in ``files``; if it is new, only if samples render with it."""
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config, in_force = load_config(files), state.config.repo_settings.render_version
     if config.repo_settings.render_version < in_force:
         message = f"is lower than {in_force}, which `demandops upgrade` wrote; write {in_force}"
         raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
-    if config != state.config:
+    if config != state.config:  # a new one must render samples
         # what takes too long is a fault for `check`, and of each demand that needs it; whether a
         # configuration is valid must not depend on the machine
         with suppress(OverLimit), processor_time(each=DEMAND_S, together=4 * DEMAND_S):

@@ -189,7 +189,6 @@ class Judgement:
         return self._quarantined(self.advance, _merged(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        """Return the advance with the old configuration; ``faults`` are those of the new one."""
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
         snapshot = replace(

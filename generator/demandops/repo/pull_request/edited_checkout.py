@@ -58,7 +58,6 @@ def override_text(effects: dict[str, Any], release: Release, owner: str) -> str:
 
 
 def also_applies(release: Release, other: Release) -> bool:
-    """Return whether the override of :func:`override_text` also applies to another release."""
     if not (isinstance(release, ServiceRelease) and isinstance(other, ServiceRelease)):
         return False
     same = (release.key.service, release.node.id) == (other.key.service, other.node.id)
@@ -69,7 +68,6 @@ def also_applies(release: Release, other: Release) -> bool:
 def effects_of(
     before: str, after: str, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the effects that replace an edit, and the edited fields that they leave out."""
     try:
         old, new = list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after))
     except InvalidInput:

@@ -47,8 +47,6 @@ _MOST_LEFT = 5
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """A suggested override that replaces the manual edit of a generated file."""
-
     instead_of: str  # the path of the edited file
     file: str  # path and content of the override
     text: str
@@ -58,14 +56,9 @@ class Suggestion:
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """The result of checking a checkout before it is merged.
-
-    What the merge changes leaves out claims that are not valid. It is None if the configuration is
-    not valid or the desired state cannot be rendered.
-    """
-
     faults: tuple[Fault, ...]
     suggestions: tuple[Suggestion, ...] = ()
+    # what the merge changes, without claims that are not valid; None if it cannot be rendered
     preview: MergePreview | None = None
     # also None if the base's bookkeeping is not known; empty if there is no base
     bookkeeping: tuple[EntryChange, ...] | None = None

@@ -224,7 +224,6 @@ class _Run:
                 self._check_libraries(library, inner)
 
     def _add(self, report: Report, folder: str, files: Mapping[str, str]) -> None:
-        """Add the faults and warnings of a report, with the paths of files in the state repo."""
         for faults, into in ((report.faults, self._faults), (report.warnings, self._warnings)):
             for said in faults:
                 place = said.file.partition("/")[2]  # helm's path starts with the chart's name

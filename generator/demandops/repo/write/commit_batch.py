@@ -82,7 +82,6 @@ class CommitBatch:
         now: datetime,
         proposal: ProposalRecord | None = None,
     ) -> str:
-        """Commit one demand, for its proposal if it needs approval, and return the commit's id."""
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
             more += [
@@ -259,7 +258,6 @@ class CommitBatch:
     def render_all(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
     ) -> Changeset:
-        """Return the files that differ from the batch's newest commit, and ``more``."""
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
         changes = []

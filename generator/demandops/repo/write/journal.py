@@ -172,7 +172,6 @@ class Journal:
                 self._rewrite()
 
     def _rewrite(self) -> None:
-        """Replace the file by one that has only the pending demands."""
         text, chain = _sealed([entry.record() for entry in self.pending.values()], "")
         if text:
             fresh = self._path.with_suffix(".new")
@@ -195,7 +194,6 @@ class Journal:
         self._limit = max(_MOST_BYTES, 2 * len(text))
 
     def _require_known(self, error: OSError) -> None:
-        """Raise Unsound if the content of the disk is unknown after ``error``."""
         reason = disk_error(error, f"the journal {self._path}")
         if isinstance(reason, Unsound):
             self._unsound = reason
@@ -346,10 +344,8 @@ class FoundJournal:
 
 
 def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[FoundJournal]:
-    """Yield the journals in a data folder that have demands or are damaged.
-
-    If ``set_aside`` is true, each damaged journal is renamed, unless a running process uses it.
-    """
+    # Those that have demands or are damaged. With ``set_aside``, each damaged journal is renamed,
+    # unless a running process uses it.
     for file in sorted(root.glob(f"slot-*/{_JOURNAL}")):
         try:
             demands = list(read(file).values())

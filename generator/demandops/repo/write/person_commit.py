@@ -81,11 +81,7 @@ def commit_to_branch(
 def merge(
     repository: StateRepository, proposal: PendingProposal, details: CommitDetails
 ) -> Published:
-    """Merge the commit of a proposal, which a person has seen, into main.
-
-    Raises InvalidInput if the proposal gives the configuration new faults, and StateRepoError if
-    the branch has moved, or main has other changes to the same files.
-    """
+    """Merge the commit of a proposal, which a person has seen, into main."""
     objects = repository.objects
     head = trees.commit_of(objects, proposal.commit)
 

@@ -147,7 +147,6 @@ class ProposalBranches:
             references.create(reference, commit)
 
     def message(self, commit: str) -> str:
-        """Return a commit's message, empty if this repository lacks the commit."""
         try:
             return commit_of(self._repository.objects, commit).message
         except StateRepoError:
@@ -205,7 +204,6 @@ class PendingProposal:
     replaces: tuple[str, ...] = ()
 
     def require(self, commit: str) -> None:
-        """Raise InvalidInput unless ``commit`` is the whole id of the newest commit."""
         # whoever may push to the branch finds another commit with the same 10 digits in minutes
         if commit != self.commit:
             raise InvalidInput.at(

@@ -108,7 +108,6 @@ class Approvals:
     # ---- while a batch is evaluated ----
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Withdraw each proposal that a demand of ``batch`` releases, and delete its branch."""
         # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
         # merged it earlier, the batch is evaluated on a tip that includes the merge.
         for ticket in batch if self._proposals else ():
@@ -412,7 +411,6 @@ class Approvals:
         self._demands.wake()
 
     def suspend(self) -> None:
-        """Answer the demands that await approval with an error; the next start resumes them."""
         error = ShuttingDown("the demand awaits approval, and is resumed at the next start")
         for proposal in self._proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)

@@ -110,7 +110,6 @@ class ForgeWorker:
         return self._pull_requests.get(branch)
 
     def forget(self, branch: str, closed_as: str) -> None:
-        """Stop watching a branch; also close its pull request, if ``closed_as`` says why."""
         with self._lock:
             task = self._wanted.pop(branch, None)
             pull_request = self._pull_requests.pop(branch, None)

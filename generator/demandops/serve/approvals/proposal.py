@@ -64,7 +64,6 @@ class Proposal:
         return any(ticket.state == "proposed" for ticket in self.tickets)
 
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
-        """Return whether main, this proposal's branch and its demands are as at the last check."""
         head = branches.get(self.branch)
         all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
         return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
@@ -150,7 +149,6 @@ def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
 
 
 def key_of(request: DemandRequest) -> tuple[str, ...]:
-    """Return what tells a demand from others, whatever its content."""
     if request.is_reference:  # the reference's goals have no demand id
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
@@ -196,7 +194,6 @@ def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
 
 
 def parse_waiting_text(text: str) -> dict[str, str]:
-    """Return ``branch`` and ``link`` from a :func:`waiting_text`; the link may be empty."""
     branch, _, rest = text.removeprefix(_PREFIX).partition(" ")
     link = rest.split(" ")[0] if rest.startswith("http") else ""
     return {"branch": branch, "link": link}
@@ -247,5 +244,5 @@ def code(text: str) -> str:
 
 
 def _fence(text: str, shortest: int) -> str:
-    """Return at least ``shortest`` backticks, and more than ``text`` has in a row."""
+    # more backticks than the text has in a row
     return "`" * max([shortest, *(len(run) + 1 for run in re.findall(r"`+", text))])

@@ -109,8 +109,6 @@ _RETRY = timedelta(seconds=LONGEST_WAIT_S)
 
 
 class LeaseExpiry:
-    """Decides which leases have ended, and makes tickets to release the claims of these leases."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._last = (runtime.now(), runtime.monotonic())
@@ -331,7 +329,6 @@ class OwnWork:
         self._waiting_turns = WaitingTurns(runtime)
 
     def commit_due(self, commits: CommitBatch) -> None:
-        """Commit all work that is due; if a part fails, try it again later."""
         # a scale-down frees room for what moves, and what runs moves before what waits is booked
         self._override_expiry.end_due(commits, self._runtime.now())
         self._scale_down.end_due(commits, self._runtime.now())

@@ -61,7 +61,6 @@ class Backoff:
         return self._jittered(wait)
 
     def unreachable(self) -> float:
-        """Return the seconds to wait after the remote could not be reached."""
         wait, self._away = self._away, min(self._away * 2, LONGEST_AWAY_S)
         return self._jittered(wait)
 
@@ -239,7 +238,6 @@ class RateLimit:
                     yield fault("", message, code="quota")
 
     def _count(self, key: tuple[str, str], operation: str, received: datetime) -> int:
-        """Count a demand, and return its number among those of the last minute."""
         # forget requesters that sent nothing for a minute, because vehicles come and go
         while self._seen:
             idlest = next(iter(self._seen))
