@@ -257,7 +257,6 @@ class GoalSender:
         # the other, and returns the second. If another thread sent the goal, a response could
         # arrive between the two, and would resolve only the first, for which nobody waits.
         sent: Future[Any] = Future()
-        done = REAL.event()
 
         def send() -> None:
             try:
@@ -268,23 +267,17 @@ class GoalSender:
                 )
             except Exception as error:  # the caller must get it, not the executor
                 sent.set_exception(error)
-            done.set()
 
         self._thread.call(send)
-        if not done.wait(max(0.0, deadline - REAL.monotonic())):
-            raise self._no_answer()
-        return sent.result()
+        return self._await(sent, deadline)
 
     def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
         done = REAL.event()
         future.add_done_callback(lambda _: done.set())
         if not done.wait(max(0.0, deadline - REAL.monotonic())):
-            raise self._no_answer()
+            text = f"no answer on {self._action_name} within {self.timeout_s:g} s"
+            raise DemandError("timeout", text)
         return future.result()
-
-    def _no_answer(self) -> DemandError:
-        text = f"no answer on {self._action_name} within {self.timeout_s:g} s"
-        return DemandError("timeout", text)
 
 
 class LastingResults(ActionServer):  # type: ignore[misc]

@@ -40,22 +40,7 @@ from demandops_ros.actions import (
 
 # ---- the bookkeeping over ROS 2, by a ROS service and on a latched topic ----
 #
-# The service and the topic carry the JSON that ``demandops bookkeeping --output json`` prints.
-
-
-def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
-    # at a revision or time; without one, at the newest commit
-    try:
-        snapshot = generator.snapshot_at(request.at) if request.at else generator.snapshot
-        response.commit, response.bookkeeping_json = _commit_and_json(snapshot)
-        response.ok = True
-    except DemandOpsError as error:
-        response.ok, response.message = False, str(error)
-    except Exception as error:  # the caller must get an answer
-        REAL.failed("bookkeeping", error)
-        response.ok = False
-        response.message = one_line(f"internal error: {error!r}; see the node's log")
-    return response
+# Both carry the JSON that ``demandops bookkeeping --output json`` prints.
 
 
 def _commit_and_json(snapshot: Snapshot) -> tuple[str, str]:
@@ -69,38 +54,6 @@ _SHORTEST_PAUSE_S = 1.0
 # The larger the ledger, the longer it takes to compute the bookkeeping. So this takes at most a
 # 20th of the time, and changes during a pause share one message.
 _PAUSE_FACTOR = 20
-
-
-class BookkeepingTopic:
-    def __init__(
-        self, node: Node, generator: Generator, in_executor: Callable[[Callable[[], None]], None]
-    ) -> None:
-        self._generator = generator
-        self._in_executor = in_executor
-        self._publisher = node.create_publisher(BookkeepingMessage, "~/bookkeeping", _LATCHED)
-        self._changed, self._closed = REAL.event(), REAL.event()
-        self._changed.set()
-        generator.on_publish(lambda config: self._changed.set())
-        REAL.keep_running("bookkeeping-topic", self._run)
-
-    def close(self) -> None:
-        self._closed.set()
-        self._changed.set()
-
-    def _run(self) -> None:
-        while self._changed.wait() and not self._closed.is_set():
-            self._changed.clear()
-            began = REAL.monotonic()
-            commit, text = _commit_and_json(self._generator.snapshot)
-            message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
-            self._in_executor(partial(self._publish, message))
-            took = REAL.monotonic() - began
-            self._closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
-
-    def _publish(self, message: Any) -> None:  # noqa: ANN401
-        if not self._closed.is_set():  # else the node may be destroyed already
-            self._publisher.publish(message)
-
 
 # ---- the node's status on ``/diagnostics``, for ROS 2's own tools ----
 
@@ -189,7 +142,13 @@ class DemandNode(Node):  # type: ignore[misc]
             self._bookkeeping,
             callback_group=ReentrantCallbackGroup(),
         )
-        self._bookkeeping_topic = BookkeepingTopic(self, generator, self._in_executor)
+        self._bookkeeping_topic = self.create_publisher(
+            BookkeepingMessage, "~/bookkeeping", _LATCHED
+        )
+        self._has_news, self._is_closed = REAL.event(), REAL.event()
+        self._has_news.set()
+        generator.on_publish(lambda config: self._has_news.set())
+        REAL.keep_running("bookkeeping-topic", self._publish_bookkeeping)
         self._others = OtherServers(self, (action_name, demand_action_name))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_timer(_PERIOD_S, self._report)
@@ -211,7 +170,8 @@ class DemandNode(Node):  # type: ignore[misc]
         )
 
     def close(self) -> None:
-        self._bookkeeping_topic.close()
+        self._is_closed.set()
+        self._has_news.set()
 
     @property
     def open_goals(self) -> int:
@@ -225,8 +185,19 @@ class DemandNode(Node):  # type: ignore[misc]
         before, done = self._last_reading, Future(executor=self.executor)
 
         def work() -> None:
-            filled = fill_response(self._generator, request, response)
-            self._in_executor(partial(done.set_result, filled))
+            try:
+                # at a revision or time; without one, at the newest commit
+                generator, at = self._generator, request.at
+                snapshot = generator.snapshot_at(at) if at else generator.snapshot
+                response.commit, response.bookkeeping_json = _commit_and_json(snapshot)
+                response.ok = True
+            except DemandOpsError as error:
+                response.ok, response.message = False, str(error)
+            except Exception as error:  # the caller must get an answer
+                REAL.failed("bookkeeping", error)
+                response.ok = False
+                response.message = one_line(f"internal error: {error!r}; see the node's log")
+            self._in_executor(partial(done.set_result, response))
 
         self._readers, self._last_reading = self._readers + 1, done
         try:
@@ -238,6 +209,22 @@ class DemandNode(Node):  # type: ignore[misc]
             self._readers -= 1
             if not done.done():  # the thread did not start
                 done.set_result(None)
+
+    def _publish_bookkeeping(self) -> None:
+        # at the start and after each publication
+        while self._has_news.wait() and not self._is_closed.is_set():
+            self._has_news.clear()
+            began = REAL.monotonic()
+            commit, text = _commit_and_json(self._generator.snapshot)
+            message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
+
+            def publish(message: Any = message) -> None:  # noqa: ANN401
+                if not self._is_closed.is_set():  # else the node may be destroyed already
+                    self._bookkeeping_topic.publish(message)
+
+            self._in_executor(publish)
+            took = REAL.monotonic() - began
+            self._is_closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
 
     def _report(self) -> None:
         message = DiagnosticArray()

@@ -45,11 +45,8 @@ def call_flux(url: str, secret: bytes | None) -> None:
 def call_argocd(
     url: str, secret: bytes | None, repo: str, before: str, after: str, paths: Iterable[str] | None
 ) -> None:
-    """Report to Argo CD that a repository's main branch moved, or raise NoAnswer.
-
-    Argo CD fetches the state repo from ``repo``. ``before`` is the commit of the last call, if
-    there was one. With None as ``paths``, Argo CD refreshes all Applications of the repo.
-    """
+    # Argo CD fetches the state repo from ``repo``. ``before`` is the commit of the last call, if
+    # there was one. With None as ``paths``, Argo CD refreshes all Applications of the repo.
     event = {
         "ref": f"refs/heads/{MAIN_BRANCH}",
         "before": before or _NO_COMMIT,

@@ -39,14 +39,11 @@ from demandops.render.gitops import domains_in_use, project_of
 
 
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
-    """Return the targets of the releases that a demand needs, changes or removes.
-
-    A release that only other demands need is left out, even if they share a subject with this one.
-    """
+    # of the releases that a demand needs, changes or removes; what only other demands need is left
+    # out, even if they share a subject with this one
     after, request = decision.state, decision.request
     active = without_suspended(after)
     claims = [*active.ledger.claims_of_demand(request.demand)]
-
     for demanded in request.demanded if request.adds_claims else ():
         for requester in demanded.requesters:
             claims += active.ledger.claims_held_by(requester, demanded.held.subject)
@@ -154,8 +151,7 @@ class RolloutWatcher:
         """Follow releases of a published commit; return at once.
 
         :meth:`why_unreachable` must be empty for their domains. The future has the health when it
-        reaches ``level``, after the timeout in seconds, or at :meth:`close`. If the health is not
-        at ``level`` then, it says why. ``on_progress`` is called from the status thread.
+        reaches ``level``, or when the time is over or this watcher is closed; it then says why.
         """
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))

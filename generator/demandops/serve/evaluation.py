@@ -82,8 +82,7 @@ class Evaluator:
         """Decide a demand, commit it on the commit batch and return its result.
 
         A demand that needs approval gets no commit; its result is the decision. A receipt is true
-        only once the commit batch is published. Unavailable, PushDenied and Unsound are raised:
-        they concern all demands.
+        only once the batch is published. Errors that concern all demands are raised.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
@@ -147,11 +146,8 @@ class Evaluator:
             return internal(error)
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results, oldest first, of the unanswered demands that main records already.
-
-        They have no answer because the process or the connection ended after the remote accepted
-        the push, or because an fsync failed.
-        """
+        # Oldest first, the results of those demands that main records already. They have no answer
+        # because the process or the connection ended after the push, or because an fsync failed.
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())
         objects = self._repository.objects

@@ -56,11 +56,7 @@ class Generator:
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Open the state repo, start the worker and resume the demands in the journal.
-
-        StateRepoError or InvalidInput is raised if the state repo, the key or the journal cannot be
-        used, and Unsound if a disk failed.
-        """
+        """Open the state repo, start the worker and resume the demands in the journal."""
         heartbeat = Heartbeat(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
         try:
@@ -96,6 +92,8 @@ class Generator:
             fetch_interval,
             heartbeat,
         )
+        self.fetch_now, self.withdraw = self._worker.fetch_now, self._demands.withdraw
+        self.includes, self.unchanged = repository.includes, repository.unchanged
         self._finished: Future[bool] | None = None
         self._stop_lock = runtime.lock()
         for operation in self.operations:
@@ -135,9 +133,6 @@ class Generator:
     @property
     def failures(self) -> dict[str, str]:
         return self._runtime.failures
-
-    def fetch_now(self) -> None:
-        self._worker.fetch_now()
 
     def submit(
         self,
@@ -182,19 +177,10 @@ class Generator:
         self._demands.arrive(ticket)
         return ticket
 
-    def includes(self, commit: str, other: str) -> bool:
-        return self._repository.includes(commit, other)
-
-    def unchanged(self, commit: str, other: str, path: str) -> bool:
-        return self._repository.unchanged(commit, other, path)
-
     def changes_since(self, since: str) -> tuple[str, list[str] | None]:
         # the newest published commit, and the changed paths, None if ``since`` is unknown
         commit = str(self.snapshot.commit)
         return commit, self._repository.changed_paths(since, commit)
-
-    def withdraw(self, operation: str) -> bool:
-        return self._demands.withdraw(operation)
 
     def on_publish(self, listener: Callable[[Config], None]) -> None:
         # the worker calls it, so it must return at once

@@ -259,8 +259,7 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, the demands that arrive during retries, and the ends of leases.
 
-        The batch is empty afterwards; demands that there was no time to evaluate are queued again.
-        If an error is raised, the demands are still in the batch.
+        The batch is empty afterwards, unless an error is raised.
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
@@ -306,10 +305,7 @@ class Worker:
             )
 
     def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
-        """Evaluate and publish a part of a batch.
-
-        Return the seconds to wait before the next attempt, or None to continue at once.
-        """
+        # the seconds to wait before the next attempt, or None to continue at once
         # fetch before a demand is committed, because after that it can no longer be withdrawn
         if self._must_fetch or self.remote.status.unreachable:
             self._repository.refresh()
@@ -379,12 +375,9 @@ class Worker:
     def _publish_commits(
         self, commits: CommitBatch, results: list[Result], independent: int
     ) -> bool:
-        """Publish a commit batch and answer its demands.
-
-        Return false, without answers, if another writer was first or locks main. The first
-        ``independent`` results were decided before the batch had a commit, so they do not depend on
-        the push.
-        """
+        # False, without answers, if another writer was first or locks main. The first
+        # ``independent`` results were decided before the batch had a commit, so they do not depend
+        # on the push.
         try:
             published = commits.publish()
         except PushDenied as error:

@@ -112,11 +112,8 @@ def unopened(folder: Path, error: Exception) -> StateRepoError | None:
 
 
 def access_error(error: Exception, address: str, objects: Repository | None = None) -> Exception:
-    """Return the error to raise if reading or writing ``address`` failed with ``error``.
-
-    An error that is neither of the system nor of libgit2 is returned unchanged. With ``objects``,
-    the text names the file and the commit of an object that cannot be read.
-    """
+    # An error that is neither of the system nor of libgit2 is returned unchanged. With ``objects``,
+    # the text names the file and the commit of an object that cannot be read.
     is_missing = isinstance(error, KeyError) and isinstance(error.args[0], Oid)
     if not (is_missing or isinstance(error, OSError | pygit2.GitError)):
         return error
@@ -181,13 +178,8 @@ class StateRepository(ABC):
         """Make ``commit``, a descendant of ``expected``, the tip, durably, and return true.
 
         If the current tip is not ``expected``, or another writer holds the lock of main, change
-        nothing and return false.
-
-        Raises:
-            Unavailable: the commit was not published, or nobody knows whether the remote got it. So
-                look for the commit before you publish it again.
-            PushDenied: the commit was not published, and another attempt would fail too.
-            Unsound: the disk failed, and nobody knows whether the commit was published.
+        nothing and return false. After Unavailable, nobody knows whether the remote got the commit,
+        so look for it before you publish it again. After PushDenied, it is not published.
         """
 
     def write_anew(self, since: str) -> None:  # noqa: B027 - a remote confirms what it stored

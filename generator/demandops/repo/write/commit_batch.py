@@ -7,7 +7,7 @@ the batch is dropped and its demands are evaluated again on the new tip.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
 from itertools import islice
@@ -135,8 +135,7 @@ class CommitBatch:
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
         """Render people's changes, and commit the generated files that differ, if any.
 
-        What cannot be planned or rendered, for example because its node left the inventory, stays
-        in effect in its last valid version, and is a problem of ``head``.
+        What cannot be planned or rendered stays in effect as it was, as a problem of ``head``.
         """
         self.head, change, keys = self._followed(advance, before, now)
         state, tip, problems = self.head.state, self.head.commit, self.head.problems
@@ -177,39 +176,27 @@ class CommitBatch:
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
         judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
-        accepted = judgement.with_new_config()
+        accepted, change = judgement.with_new_config(), None
         if advance.config_changed:
             try:
                 marked = last_valid_config.end_markers_at(self._tree)
-                state = accepted.snapshot.state
-                applied = update_ledger(before.state, state, accepted.subjects, marked, now)
+                state, subjects = accepted.snapshot.state, accepted.subjects
+                applied = update_ledger(before.state, state, subjects, marked, now)
                 state = replace(state, ledger=applied.ledger)
                 change = self.render_all(state, applied.files)
-                return self._with_started_leases(
-                    accepted.snapshot, state, change, applied.keys, now
-                )
             except InvalidInput as error:
                 accepted = judgement.with_old_config(error.faults)
-        # with the configuration as before, only the subjects that people changed are rendered
-        state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-        applied = update_claims(old, state, subjects, now)
-        touched = claim_changes(state.ledger, applied.ledger, applied.keys)
-        state = state.with_ledger(applied.ledger, touched)
-        subjects = tuple(dict.fromkeys((*subjects, *(change.key.subject for change in touched))))
-        change = changeset_of_edit(state, old, subjects, self.read)
-        change = replace(change, files={**applied.files, **change.files})
-        return self._with_started_leases(accepted.snapshot, state, change, applied.keys, now)
-
-    def _with_started_leases(
-        self,
-        snapshot: Snapshot,
-        state: State,
-        change: Changeset,
-        keys: Iterable[ClaimKey],
-        now: datetime,
-    ) -> _Followed:
+        if change is None:
+            # with the configuration as before, only the subjects that people changed are rendered
+            state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
+            applied = update_claims(old, state, subjects, now)
+            touched = claim_changes(state.ledger, applied.ledger, applied.keys)
+            state = state.with_ledger(applied.ledger, touched)
+            subjects = tuple(dict.fromkeys((*subjects, *(each.key.subject for each in touched))))
+            change = changeset_of_edit(state, old, subjects, self.read)
+            change = replace(change, files={**applied.files, **change.files})
         # an approved claim's lease starts only now, because else it could end before the approval
-        ledger, files = state.ledger, dict(change.files)
+        snapshot, ledger, files = accepted.snapshot, state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():
             assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
             path = claim_file.path_of(claim.key)
@@ -219,7 +206,7 @@ class CommitBatch:
             files[path] = claim_file.text_of(started)
         # a lease does not affect a release, so the usage of nodes need not be counted again
         snapshot = replace(snapshot, state=state.with_ledger(ledger, ()))
-        return snapshot, replace(change, files=files), tuple(keys)
+        return snapshot, replace(change, files=files), tuple(applied.keys)
 
     def end_override(self, override: Override, now: datetime) -> None:
         # InvalidInput is raised if the state without the override cannot be planned or rendered

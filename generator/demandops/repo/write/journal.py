@@ -104,8 +104,7 @@ class Journal:
     def append(self, entries: Iterable[JournalEntry]) -> None:
         """Write and fsync all ``entries``, or raise StateRepoError and write none of them.
 
-        An entry replaces the pending entry with the same operation id. Raises Unsound if nobody
-        knows whether they are written.
+        Unsound is raised if nobody knows whether they are written.
         """
         entries = list(entries)
         if entries:
@@ -115,14 +114,10 @@ class Journal:
             self._rewrite_if_large()
 
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
-        """Remove demands that are published, refused or withdrawn, if they are pending.
-
-        If ``durably`` is true, the removal is fsynced, and a failure raises StateRepoError and
-        keeps the demands.
-        """
-        # Otherwise the next append makes the removal durable. If the machine fails before that, the
-        # demands are evaluated again after a restart. This is harmless if a commit records their
-        # outcome, but a refused demand could be booked.
+        # With ``durably``, the removal is fsynced, and a failure raises StateRepoError and keeps
+        # the demands. Otherwise the next append makes the removal durable. If the machine fails
+        # before that, the demands are evaluated again after a restart. This is harmless if a commit
+        # records their outcome, but a refused demand could be booked.
         done = [operation for operation in dict.fromkeys(operations) if operation in self.pending]
         records = [{"done": operation} for operation in done]
         if durably and done:

@@ -132,11 +132,7 @@ class Approvals:
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
-        """Add a demand to the proposal of the same demand, or to a new proposal.
-
-        The demand gets an error as its answer if other requesters own the earlier proposal, if a
-        requester has too many proposals, or if the demand was withdrawn.
-        """
+        """Add a demand to the proposal of the same demand, or to a new one, or answer it."""
         request, waiting = decision.request, self._waiting(decision.request)
         owners = {name for each in waiting for name in each.requesters()}
         if owners and not owners & set(request.requesters()):
@@ -213,8 +209,7 @@ class Approvals:
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
         """Answer the demands that are decided or withdrawn, and update the other proposals.
 
-        ``snapshot`` is the state of main, at the commit ``heads.main`` or a later one. If an error
-        is raised, the next check handles the proposals that this check did not reach.
+        ``snapshot`` is of main, at ``heads.main`` or later. After an error, the next check goes on.
         """
         while self._changed:
             if changed := self._proposals.get(self._changed.popleft()):
@@ -312,10 +307,7 @@ class Approvals:
     def _update(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
-        """Rebuild the branch if it is outdated, open its pull request and notify the requesters.
-
-        Return false if a demand was withdrawn meanwhile and the proposal must be checked again.
-        """
+        # false if a demand was withdrawn meanwhile, so that the proposal must be checked again
         head = heads.branches.get(proposal.branch)
         if head and head not in proposal.record.commits:
             # a rebuild would throw away what a person has written
@@ -340,10 +332,7 @@ class Approvals:
     def _bring_up_to_date(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
-        """Rebuild the branch on main, with one commit for each demand, unless it is up to date.
-
-        Return false if a demand was withdrawn; the branch is then not pushed.
-        """
+        # one commit for each demand; false, without a push, if a demand was withdrawn
         commits = CommitBatch(self._repository, snapshot)
         steps, failed = decide_in_turn(verdict.unapproved, snapshot.state, commits.read)
         verdict.failed.extend(failed)

@@ -77,12 +77,9 @@ class Proposal:
         head: str,
         pull_request: PullRequest | None,
     ) -> Verdict:
-        """Return the verdict on the proposal's demands.
-
-        ``on_main`` has the operation ids in the commits of main since ``searched_to``. ``added``
-        has the claims that people added since then; it is empty unless a person edited or deleted
-        the branch. ``head`` is empty if the branch does not exist.
-        """
+        # ``on_main`` has the operation ids in the commits of main since ``searched_to``. ``added``
+        # has the claims that people added since then, if a person edited or deleted the branch.
+        # ``head`` is empty if the branch does not exist.
         verdict = Verdict()
         for ticket in self.tickets:
             decision: Decision | InvalidInput
@@ -137,10 +134,7 @@ class Proposal:
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
-    """Return whether a request releases all demands in ``pending``.
-
-    It has the key and a requester of one of them, and names all their subjects or is a Release.
-    """
+    # with the key and a requester of one of the demands; names all their subjects or is a Release
     requesters = {name for each in pending for name in each.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False
