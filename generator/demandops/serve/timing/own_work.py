@@ -39,13 +39,14 @@ class Draining:
         self._runtime = runtime
         self._tried: dict[str, tuple[Config, datetime]] = {}
         self._logged: dict[str, frozenset[str]] = {}
-        self._after: dict[str, str] = {}
+        # by node: the last application that was moved, if others are left for later
+        self.after: dict[str, str] = {}
 
     def move_due(self, commits: CommitBatch) -> None:
         now = self._runtime.now()
         for node in self._due(commits.head.state, now):
             tried = (commits.head.state.config, now)
-            after = self._after.pop(node, "")
+            after = self.after.pop(node, "")
             try:
                 decision = commits.drain(node, after, self._runtime.fresh_id(), now)
             except InvalidInput as error:
@@ -55,19 +56,12 @@ class Draining:
             # a commit may fail to be published, so only a try without commit is recorded
             assert isinstance(decision.request, Drain)  # noqa: S101 - it was decided
             if decision.request.last:
-                self._after[node] = decision.request.last
+                self.after[node] = decision.request.last
             elif not decision.files:
                 self._tried[node] = tried
             for moved in decision.placed:
                 log.info("'%s' is drained: %s", node, moved)
             self._warn(node, decision.warnings, continued=bool(after))
-
-    @property
-    def has_more(self) -> bool:
-        return bool(self._after)
-
-    def postpone(self) -> None:
-        self._after.clear()
 
     def _warn(self, node: str, stays: Iterable[str], *, continued: bool = False) -> None:
         # the texts of the last try are not logged again, as a try comes each minute
@@ -178,7 +172,7 @@ class OverrideExpiry:
         # By name and end: an override whose end a person changes is tried again at once.
         self._retry_at: dict[tuple[str, datetime | None], datetime] = {}
         # Before this time no end counts as due, but each batch of demands still commits the ends.
-        self._not_before = datetime.min.replace(tzinfo=timezone.utc)
+        self.not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
         for override in expired_overrides(commits.head.state, now):
@@ -192,10 +186,6 @@ class OverrideExpiry:
                 for problem in error.faults:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
-    def postpone(self, now: datetime) -> None:
-        # because a fetch or a publication failed
-        self._not_before = now + _RETRY
-
     def is_due(self, world: World, now: datetime) -> bool:
         return any(time <= now for time in self._due_times(world))
 
@@ -205,7 +195,7 @@ class OverrideExpiry:
 
     def _due_times(self, world: World) -> list[datetime]:
         return [
-            max(self._retry_at.get((override.name, override.end), override.end), self._not_before)
+            max(self._retry_at.get((override.name, override.end), override.end), self.not_before)
             for override in world.overrides
             if override.end
         ]
@@ -214,7 +204,7 @@ class OverrideExpiry:
 class ScaleDown:
     def __init__(self) -> None:
         self._retry_at: dict[Instance, datetime] = {}
-        self._not_before = datetime.min.replace(tzinfo=timezone.utc)
+        self.not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
         for instance in commits.head.state.ledger.kept.due(now):
@@ -230,17 +220,14 @@ class ScaleDown:
                 if isinstance(error, OverLimit):  # the next may take as long, and demands wait
                     break
 
-    def postpone(self, now: datetime) -> None:
-        self._not_before = now + _RETRY
-
     def is_due(self, ledger: Ledger, now: datetime) -> bool:
-        if now < self._not_before:
+        if now < self.not_before:
             return False
         return any(self._retry_at.get(due, now) <= now for due in ledger.kept.due(now))
 
     def seconds_until_due(self, ledger: Ledger, now: datetime, longest: float) -> float:
         end = ledger.kept.next_end()
-        return longest if end is None else _seconds_until(max(end, self._not_before), now, longest)
+        return longest if end is None else _seconds_until(max(end, self.not_before), now, longest)
 
 
 def _seconds_until(time: datetime, now: datetime, longest: float) -> float:
@@ -260,17 +247,17 @@ class WaitingTurns:
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._tried: World | None = None
-        self._left: list[str] = []
+        self.left: list[str] = []  # demands that the last round left for later
 
     def book_due(self, commits: CommitBatch) -> None:
         state = commits.head.state
         if not self.is_due(state):
             return
-        if not self._is_tried(state) or not self._left:
-            self._left = [waiting.demand for waiting in in_turn(state.ledger.waiting)]
+        if not self._is_tried(state) or not self.left:
+            self.left = [waiting.demand for waiting in in_turn(state.ledger.waiting)]
         end = self._runtime.processor_s() + _LONGEST_ROUND_S
-        while self._left:
-            demand = self._left.pop(0)
+        while self.left:
+            demand = self.left.pop(0)
             state, now = commits.head.state, self._runtime.now()
             waiting = state.ledger.waiting.get(demand)
             if waiting is None:  # it was released meanwhile
@@ -301,15 +288,8 @@ class WaitingTurns:
         elif self._tried is before:  # the last demand freed no room, so the tries are still valid
             self._tried = commits.head.state
 
-    @property
-    def has_more(self) -> bool:
-        return bool(self._left)
-
-    def postpone(self) -> None:
-        self._left.clear()
-
     def is_due(self, state: State) -> bool:
-        return bool(state.ledger.waiting) and (bool(self._left) or not self._is_tried(state))
+        return bool(state.ledger.waiting) and (bool(self.left) or not self._is_tried(state))
 
     def _is_tried(self, state: World) -> bool:
         # by identity: ledger and configuration are frozen, and to compare their content takes long
@@ -339,10 +319,11 @@ class OwnWork:
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
-        self._override_expiry.postpone(self._runtime.now())
-        self._scale_down.postpone(self._runtime.now())
-        self._draining.postpone()
-        self._waiting_turns.postpone()
+        # because a fetch or a publication failed
+        later = self._runtime.now() + _RETRY
+        self._override_expiry.not_before = self._scale_down.not_before = later
+        self._draining.after.clear()
+        self._waiting_turns.left.clear()
 
     def is_due(self, state: State) -> bool:
         now = self._runtime.now()
@@ -355,7 +336,7 @@ class OwnWork:
 
     def seconds_until_due(self, state: State, longest: float) -> float:
         # what was left off goes on at once, but after the demands that arrived meanwhile
-        if self._draining.has_more or self._waiting_turns.has_more:
+        if self._draining.after or self._waiting_turns.left:
             return 0.0
         now = self._runtime.now()
         seconds = self._override_expiry.seconds_until_due(state, now, longest)
