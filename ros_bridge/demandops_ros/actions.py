@@ -48,8 +48,7 @@ _CODES: tuple[tuple[type[BaseException], str], ...] = (
 
 
 class DeploymentRequestAdapter:
-    """The adapter for the reference's action; its results and feedback are plain text."""
-
+    # of the reference's action, whose results and feedback are plain text
     action: Any = DeploymentRequest
 
     def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
@@ -317,18 +316,13 @@ class LastingResults(ActionServer):  # type: ignore[misc]
 
 
 class OtherServers:
-    """Finds other nodes that serve the same actions as ``node``."""
-
     def __init__(self, node: Node, actions: Iterable[str]) -> None:
         self._node = node
         self._own = f"{node.get_namespace().rstrip('/')}/{node.get_name()}"
         self._found = {node.resolve_service_name(action): list[str]() for action in actions}
 
     def find(self) -> dict[str, list[str]]:
-        """Return, for each action, the names of the other nodes that serve it; log changes.
-
-        A node that comes and goes between two calls is not seen.
-        """
+        # by action; changes are logged, but not of a node that comes and goes between two calls
         for action, others in self._found.items():
             publishers = self._node.get_publishers_info_by_topic(f"{action}/_action/status")
             now = sorted(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)

@@ -198,11 +198,8 @@ def _word(words: tuple[str, ...], number: int) -> str:
 
 
 def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
-    """Fill a message from plain data and return it; missing fields keep ROS's defaults.
-
-    A field or value that the message cannot carry raises AttributeError, AssertionError or
-    TypeError.
-    """
+    # Missing fields keep ROS's defaults. A field or value that the message cannot carry raises
+    # AttributeError, AssertionError or TypeError.
     _checking(message)
     types = message.get_fields_and_field_types()
     for name, value in data.items():

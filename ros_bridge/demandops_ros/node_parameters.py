@@ -152,13 +152,11 @@ _DESCRIPTIONS = {
     "log_level": "Lowest level of messages in the log.",
 }
 
-_RANGES = {
-    "answer_timeout": {
-        "floating_point_range": [FloatingPointRange(from_value=0.001, to_value=86_400.0)]
-    },
-    "requester_queue_limit": {
-        "integer_range": [IntegerRange(from_value=1, to_value=QUEUE_LIMIT, step=1)]
-    },
+_SECONDS = [FloatingPointRange(from_value=0.001, to_value=86_400.0)]
+_COUNT = [IntegerRange(from_value=1, to_value=QUEUE_LIMIT, step=1)]
+_RANGES: dict[str, Any] = {
+    "answer_timeout": {"floating_point_range": _SECONDS},
+    "requester_queue_limit": {"integer_range": _COUNT},
 }
 
 
@@ -196,7 +194,6 @@ def read_node_parameters(given: Mapping[str, str | None]) -> dict[str, Any]:
 
 
 def descriptor(name: str, *, read_only: bool = False) -> ParameterDescriptor:
-    """Return a parameter's descriptor; only ``fetch_interval`` may be of any type."""
     choices = _CHOICES.get(name)
     return ParameterDescriptor(
         description=_DESCRIPTIONS[name],

@@ -48,9 +48,8 @@ class Leadership:
         """
         name = _NAME.fullmatch(lease)
         if name is None:
-            raise InvalidInput.at(
-                "--leader-lease", f"{quoted(lease)} names no Lease; write NAMESPACE/NAME"
-            )
+            message = f"{quoted(lease)} names no Lease; write NAMESPACE/NAME"
+            raise InvalidInput.at("--leader-lease", message)
         self._request = {
             "group": "coordination.k8s.io",
             "version": "v1",

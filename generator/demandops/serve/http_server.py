@@ -138,20 +138,16 @@ class _BoundedConnection(H11Protocol):
 def bound(address: str, option: str) -> socket.socket:
     host, colon, port = address.rpartition(":")
     if not colon or not host or not _PORT.fullmatch(port) or int(port) > 0xFFFF:
-        raise InvalidInput.at(
-            option,
-            f"{quoted(address)} is not an address to listen on; write one like 127.0.0.1:8090",
-        )
+        message = f"{quoted(address)} is not an address to listen on; write one like 127.0.0.1:8090"
+        raise InvalidInput.at(option, message)
     host = host.removeprefix("[").removesuffix("]")  # of an IPv6 address
     try:
         family, *_, resolved = socket.getaddrinfo(
             host, int(port), type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except (OSError, UnicodeError):
-        raise InvalidInput.at(
-            option,
-            f"'{address}': host '{host}' cannot be resolved; write an address of this machine",
-        ) from None
+        message = f"'{address}': host '{host}' cannot be resolved; write an address of this machine"
+        raise InvalidInput.at(option, message) from None
     listening = socket.socket(family)
     try:
         # a restart need not wait until the kernel has forgotten the last connections
@@ -161,9 +157,8 @@ def bound(address: str, option: str) -> socket.socket:
     except OSError as error:
         listening.close()
         remedy = _REMEDIES.get(error.errno or 0, "choose another port")
-        raise InvalidInput.at(
-            option, f"cannot listen on '{address}': {error.strerror}; {remedy}"
-        ) from None
+        message = f"cannot listen on '{address}': {error.strerror}; {remedy}"
+        raise InvalidInput.at(option, message) from None
     return listening
 
 

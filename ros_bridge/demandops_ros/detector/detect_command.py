@@ -57,7 +57,6 @@ LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
 def declare(node: Node, rules: str | None) -> dict[str, Any]:
-    """Declare all parameters of a node, where ``rules`` is a default, and return their values."""
     values = {}
     for name, (default, description, span) in PARAMETERS.items():
         described = ParameterDescriptor(description=description, read_only=True)

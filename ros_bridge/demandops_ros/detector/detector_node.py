@@ -131,8 +131,6 @@ Log = Callable[[str, str], None]  # of a level, `info` or `warning`, and a text
 
 
 class DemandSender:
-    """Keeps the demands of the current events booked: sends, retries and renews them."""
-
     def __init__(
         self, action_name: str, demand_action_name: str, timeout_s: float, log: Log
     ) -> None:
@@ -192,7 +190,6 @@ class DemandSender:
                 self._log("info", f"rule {rule}: {what}: {outcome.message}")
 
     def _take(self) -> Sending | None:
-        """Wait for a goal to send; return None once the sender is closed."""
         with self._changed:
             while not self._is_closed:
                 now = REAL.monotonic()

@@ -56,9 +56,8 @@ class RecordedBag:
                 else:
                     self.unread[connection.topic] = connection.msgtype
         if not self.topics:
-            wanted = ", ".join(
-                f"{source.topic} ({source.type})" for source in file.sources.values()
-            )
+            sources = file.sources.values()
+            wanted = ", ".join(f"{source.topic} ({source.type})" for source in sources)
             topics = sorted({f"{each.topic} ({each.msgtype})" for each in self._reader.connections})
             recorded = ", ".join(topics) or "no topic"
             self.close()
@@ -270,14 +269,8 @@ def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
 
 
 def show(replay: Replay, output: str) -> None:
-    columns = [
-        Column("Second"),
-        Column("Change"),
-        Column("Rule"),
-        Column("Entities"),
-        Column("Why", rank=2, wraps=True),
-        Column("Demand", rank=1),
-    ]
+    columns = [Column(name) for name in ("Second", "Change", "Rule", "Entities")]
+    columns += [Column("Why", rank=2, wraps=True), Column("Demand", rank=1)]
     rows = [
         (
             f"{event.at - replay.span[0]:.1f}",

@@ -234,12 +234,8 @@ class RemoteRepository(StateRepository):
         try:
             self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         except (pygit2.GitError, OSError) as error:  # the next fetch moves the reference
-            log.warning(
-                "commit %s was pushed, but the clone %s cannot record this: %s",
-                commit,
-                self._folder,
-                error,
-            )
+            text = "commit %s was pushed, but the clone %s cannot record this: %s"
+            log.warning(text, commit, self._folder, error)
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
@@ -281,10 +277,8 @@ class RemoteRepository(StateRepository):
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
         """Return PushDenied if another attempt at a push would fail too, else Unavailable."""
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
-        if _NO_ROOM.search(text):
-            return self._disk_full()
-        if _NO_CLONE.search(text):
-            return self._unreadable()
+        if error_here := self._error_of_clone(text):
+            return error_here
         rejected, reason = _REMOTE_REJECTED.search(text), _reason(text)
         if rejected:
             message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
@@ -311,10 +305,8 @@ class RemoteRepository(StateRepository):
             text = without_secrets(str(error.stderr))
         if "couldn't find remote ref" in text:
             raise missing_main(self.address)
-        if _NO_ROOM.search(text):
-            raise self._disk_full()
-        if _NO_CLONE.search(text):
-            raise self._unreadable()
+        if error_here := self._error_of_clone(text):
+            raise error_here
         failed = "read" if command[0] == "ls-remote" else "fetched"
         reason = _reason(text)
         remediable = _NO_FILE.sub("", reason)  # credentials do not make a file readable
@@ -327,11 +319,13 @@ class RemoteRepository(StateRepository):
             "check the clone's owner and disk, then start again, which replaces a damaged clone"
         )
 
-    def _disk_full(self) -> DiskFull:
-        return DiskFull(
-            f"{self.address} cannot be fetched or pushed: the disk of {self._folder} has no room; "
-            "free some"
-        )
+    def _error_of_clone(self, text: str) -> Unavailable | None:
+        if _NO_ROOM.search(text):
+            return DiskFull(
+                f"{self.address} cannot be fetched or pushed: the disk of {self._folder} has no "
+                "room; free some"
+            )
+        return self._unreadable() if _NO_CLONE.search(text) else None
 
     def _run_git(
         self,
