@@ -107,26 +107,23 @@ class ParameterSetter:
             return
         self._called_at = REAL.monotonic()
         self._call = self._client.call_async(SetParameters.Request(parameters=wanted))
-        self._call.add_done_callback(
-            lambda call: self._take_answer(call, (endpoints, version), wanted)
-        )
 
-    def _take_answer(self, call: Any, state: tuple[Any, int], wanted: list[Any]) -> None:  # noqa: ANN401
-        if call is not self._call or call.exception() is not None:
-            return
-        self._call, self._set = None, state
-        names = [parameter.name for parameter in wanted]
-        refused = [
-            f"{name}: {result.reason or 'no reason given'}"
-            for name, result in zip(names, call.result().results, strict=False)
-            if not result.successful
-        ]
-        for line in refused:
-            self._node.get_logger().error(one_line(f"{self._target} refused {line}"))
-        self._node.get_logger().info(
-            f"set {len(names) - len(refused)} parameters of {self._target}"
-        )
-        self._changed.trigger()  # other parameters may be wanted by now
+        def take_answer(call: Any) -> None:  # noqa: ANN401
+            if call is not self._call or call.exception() is not None:
+                return
+            self._call, self._set = None, (endpoints, version)
+            names, logger = [parameter.name for parameter in wanted], self._node.get_logger()
+            refused = [
+                f"{name}: {result.reason or 'no reason given'}"
+                for name, result in zip(names, call.result().results, strict=False)
+                if not result.successful
+            ]
+            for line in refused:
+                logger.error(one_line(f"{self._target} refused {line}"))
+            logger.info(f"set {len(names) - len(refused)} parameters of {self._target}")
+            self._changed.trigger()  # other parameters may be wanted by now
+
+        self._call.add_done_callback(take_answer)
 
 
 def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401

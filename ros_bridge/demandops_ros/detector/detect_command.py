@@ -126,7 +126,22 @@ def detect(
     for option, given in (("--plot", plot is not None), ("--output", output != "text")):
         if given:
             raise click.UsageError(f"{option} needs --replay; add --replay, or leave {option} out")
-    _run(rules, ros_args)
+    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415 - a replay needs no ROS
+
+    from demandops_ros import ros_process  # noqa: PLC0415
+    from demandops_ros.detector.detector_node import DetectorNode  # noqa: PLC0415
+
+    with (
+        ros_process.stop_signals() as wait_for_signal,
+        ros_process.started(ros_args, SignalHandlerOptions.NO),
+    ):
+        node = DetectorNode(rules)
+        thread = ros_process.ExecutorThread(node)
+        wait_for_signal()
+        node.get_logger().info("stopping; the booked demands stay booked")
+        thread.close()
+        node.close()
+        node.destroy_node()
 
 
 def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
@@ -154,22 +169,3 @@ def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
         except OSError as error:
             problem = f"cannot be written: {error.strerror or error}"
             raise InvalidInput.at("", problem, file=str(plot)) from None
-
-
-def _run(rules: str | None, ros_args: list[str]) -> None:
-    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415 - a replay needs no ROS
-
-    from demandops_ros import ros_process  # noqa: PLC0415
-    from demandops_ros.detector.detector_node import DetectorNode  # noqa: PLC0415
-
-    with (
-        ros_process.stop_signals() as wait_for_signal,
-        ros_process.started(ros_args, SignalHandlerOptions.NO),
-    ):
-        node = DetectorNode(rules)
-        thread = ros_process.ExecutorThread(node)
-        wait_for_signal()
-        node.get_logger().info("stopping; the booked demands stay booked")
-        thread.close()
-        node.close()
-        node.destroy_node()

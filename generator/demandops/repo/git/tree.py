@@ -12,7 +12,7 @@ from pygit2.enums import FileMode, ObjectType, SortMode
 
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import quoted
-from demandops.repo.git.objects import Entries, NewObjects
+from demandops.repo.git.objects import NewObjects
 
 # Sync the files that libgit2 writes, so that a commit is on the disk before anybody learns of it.
 pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
@@ -198,7 +198,11 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
     here: dict[bytes, str | None] = {}
     for path, text in files.items():
         folder_name, _, inner_path = path.partition("/")
-        raw_name = _raw_name(folder_name, entries)
+        raw_name = folder_name.encode()
+        if raw_name not in entries and b"\\" in raw_name:
+            # a backslash may stand for a byte that is not UTF-8
+            names = (key.removesuffix(b"/") for key in entries)
+            raw_name = next((name for name in names if _printable(name) == folder_name), raw_name)
         if inner_path:
             below.setdefault(raw_name, {})[inner_path] = text
         else:
@@ -222,11 +226,3 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
             entries.pop(name, None)
             entries.pop(name + b"/", None)
     return objects.add_folder(entries) if entries else None
-
-
-def _raw_name(name: str, entries: Entries) -> bytes:
-    raw = name.encode()
-    if raw in entries or b"\\" not in raw:  # a backslash may stand for a byte that is not UTF-8
-        return raw
-    raw_names = (key.removesuffix(b"/") for key in entries)
-    return next((known for known in raw_names if _printable(known) == name), raw)

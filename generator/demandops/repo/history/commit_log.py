@@ -65,7 +65,9 @@ def parse(message: str) -> MessageText:
         if not colon or not _KEY.fullmatch(key):
             trailers.clear()  # a paragraph with any other line is text for people
             break
-        trailers.setdefault(key, []).append(_decoded(value))
+        if _QUOTED.fullmatch(value):
+            value = _ESCAPES.sub(_unescaped, value[1:-1])
+        trailers.setdefault(key, []).append(value)
     return MessageText(lines[0], next(whys, ""), trailers)
 
 
@@ -77,15 +79,9 @@ def _encoded(key: str, value: str) -> str:
     return f'"{_EDGES.sub(_SPACE, harmless(text))}"'
 
 
-def _decoded(text: str) -> str:
-    if not _QUOTED.fullmatch(text):
-        return text
-    return _ESCAPES.sub(
-        lambda escape: (
-            escape[0][1] if escape[0][1] in '\\"' else escape[0].encode().decode("unicode_escape")
-        ),
-        text[1:-1],
-    )
+def _unescaped(escape: re.Match[str]) -> str:
+    letter = escape[0][1]
+    return letter if letter in '\\"' else escape[0].encode().decode("unicode_escape")
 
 
 # ---- the history: commits with their trailers, and which commits changed a path ----

@@ -22,7 +22,7 @@ from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.demand.claim import Claim
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.ledger import ClaimChange, Ledger
-from demandops.model.ledger.records import Instance, RecentShutdowns, Steps
+from demandops.model.ledger.records import Instance, Steps
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log
 from demandops.repo.load import last_valid_config, ledger_files
@@ -119,7 +119,11 @@ def advance(
     config_changed = (
         world_changed or not before.is_rendered or _must_render_all(repo, before.commit, to)
     )
-    shutdowns, waits = _shutdowns(old, new, state.ledger), state.ledger.waiting
+    shutdowns, waits = state.ledger.shutdowns, state.ledger.waiting
+    for path, _ in trees.differences(old, new, (records.SHUTDOWNS_ROOT,)):
+        text = trees.read_text(new, path)
+        shutdown = records.read_shutdowns(text, path) if text is not None else None
+        shutdowns = shutdowns.replace(records.digest_in(path), shutdown)
     if trees.differ(old, new, (records.WAITING_ROOT,)):
         waits = records.read_all_waiting(trees.texts(new, (records.WAITING_ROOT,)))
     kept = state.ledger.kept
@@ -163,15 +167,6 @@ def advance(
     )
     subjects = dict.fromkeys(change.key.subject for change in changes)
     return Advance(snapshot, tuple(subjects), config_changed)
-
-
-def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
-    shutdowns = ledger.shutdowns
-    for path, _ in trees.differences(old, new, (records.SHUTDOWNS_ROOT,)):
-        text = trees.read_text(new, path)
-        shutdown = records.read_shutdowns(text, path) if text is not None else None
-        shutdowns = shutdowns.replace(records.digest_in(path), shutdown)
-    return shutdowns
 
 
 def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instance, Steps]]:

@@ -100,7 +100,17 @@ class ProposalBranches:
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
             try:
-                self._set_reference(reference, commit, expected)
+                references = self._repository.objects.references
+                now = str(references[reference].target) if reference in references else ""
+                if now != expected and (now or commit is not None):
+                    raise BranchMoved(branch)
+                if commit is None:
+                    if now:
+                        references.delete(reference)
+                elif now:
+                    references[reference].set_target(commit, "demandops")
+                else:
+                    references.create(reference, commit)
             except (GitError, OSError) as error:
                 raise self._why_denied(branch) or error from None
             return ""
@@ -131,20 +141,6 @@ class ProposalBranches:
             f"{self._repository.address} cannot have the branch {branch}, because it has a branch "
             f"{taken}; delete or rename {taken}, then try again"
         )
-
-    def _set_reference(self, reference: str, commit: Oid | None, expected: str) -> None:
-        references = self._repository.objects.references
-        now = str(references[reference].target) if reference in references else ""
-        if commit is None and not now:
-            return
-        if now != expected:
-            raise BranchMoved(reference.removeprefix(_HEADS))
-        if commit is None:
-            references.delete(reference)
-        elif now:
-            references[reference].set_target(commit, "demandops")
-        else:
-            references.create(reference, commit)
 
     def message(self, commit: str) -> str:
         try:
