@@ -164,10 +164,10 @@ def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: AN
 def _fields(
     data: Mapping[str, Any], names: Mapping[str, str], others: set[str], what: str
 ) -> dict[str, Any]:
-    known = {*others, *names}
+    allowed = {*others, *names}
     for name in data:
-        if name not in known:
-            raise ValueError(f"'{name}' is not a field of {what}{suggestion(name, known)}")
+        if name not in allowed:
+            raise ValueError(f"'{name}' is not a field of {what}{suggestion(name, allowed)}")
     return {field: data[name] for name, field in names.items() if name in data}
 
 

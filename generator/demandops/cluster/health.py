@@ -282,7 +282,7 @@ class Flux(HealthReader):
         # what does not exist or is suspended never fetches, and must not hold up the next request
         if kustomization is None or source is None:
             return True
-        if any((each.get("spec") or {}).get("suspend") for each in (kustomization, source)):
+        if any((item.get("spec") or {}).get("suspend") for item in (kustomization, source)):
             return True
         asked = (source["metadata"].get("annotations") or {}).get(REQUESTED_AT, "")
         handled = _handled(source)
@@ -310,7 +310,7 @@ class Flux(HealthReader):
             return Health("reconciled", str(ready.get("message", "")), name, failing=True)
         if not current or ready.get("status") != "True":
             return Health("reconciled", str(ready.get("message") or "is being installed"), name)
-        return worst([deployment_health(each) for each in self._deployments(target, objects)])
+        return worst([deployment_health(owned) for owned in self._deployments(target, objects)])
 
     def _service_state(self, status: Object) -> Object:
         return condition(status, "Ready")

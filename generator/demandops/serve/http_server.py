@@ -95,12 +95,12 @@ class _BoundedConnection(H11Protocol):
         self._since, self._bytes, self._pieces = self.loop.time(), 0, 0
         self._before: tuple[object, int] | None = None
         self._timer = self.loop.call_later(_STUCK_S, self._look)
-        opened = [each for each in self.connections if isinstance(each, _BoundedConnection)]
-        opened = [each for each in opened if not each.transport.is_closing()]
+        opened = [peer for peer in self.connections if isinstance(peer, _BoundedConnection)]
+        opened = [peer for peer in opened if not peer.transport.is_closing()]
         if len(opened) > self.most:
             # not the new one, so that a health check gets in while others hold all connections
-            waiting = [each for each in opened if each.waits_for_client()]  # this one too
-            min(waiting, key=lambda each: each._since).transport.abort()
+            waiting = [peer for peer in opened if peer.waits_for_client()]  # this one too
+            min(waiting, key=lambda peer: peer._since).transport.abort()
 
     def waits_for_client(self) -> bool:
         cycle = self.cycle

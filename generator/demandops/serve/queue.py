@@ -301,7 +301,7 @@ def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401
         return None
     headers = (app.get("header") for app in _items(goal, "apps"))
     subjects = [("demand", goal.get("demand"))]
-    subjects += [("application", each.get("id")) for each in headers if isinstance(each, dict)]
+    subjects += [("application", head.get("id")) for head in headers if isinstance(head, dict)]
     for kind in ("application", "connection"):
         subjects += [(kind, item.get("id")) for item in _items(goal, f"{kind}s")]
     subjects += [("requester", name) for name in _requesters(goal)]

@@ -58,7 +58,7 @@ class RecordedBag:
         if not self.topics:
             sources = file.sources.values()
             wanted = ", ".join(f"{source.topic} ({source.type})" for source in sources)
-            topics = sorted({f"{each.topic} ({each.msgtype})" for each in self._reader.connections})
+            topics = sorted({f"{item.topic} ({item.msgtype})" for item in self._reader.connections})
             recorded = ", ".join(topics) or "no topic"
             self.close()
             message = f"has no topic that the rules read: {wanted}; it has {recorded}"
@@ -73,7 +73,7 @@ class RecordedBag:
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
-        connections = [each for each in self._reader.connections if each.id in self._sources]
+        connections = [item for item in self._reader.connections if item.id in self._sources]
         messages = self._reader.messages(connections=connections)
         while True:
             try:

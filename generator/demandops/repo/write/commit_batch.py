@@ -192,7 +192,7 @@ class CommitBatch:
             applied = update_claims(old, state, subjects, now)
             touched = claim_changes(state.ledger, applied.ledger, applied.keys)
             state = state.with_ledger(applied.ledger, touched)
-            subjects = tuple(dict.fromkeys((*subjects, *(each.key.subject for each in touched))))
+            subjects = tuple(dict.fromkeys((*subjects, *(edit.key.subject for edit in touched))))
             change = changeset_of_edit(state, old, subjects, self.read)
             change = replace(change, files={**applied.files, **change.files})
         # an approved claim's lease starts only now, because else it could end before the approval

@@ -134,7 +134,7 @@ class Approvals:
     def add(self, ticket: Ticket, decision: Decision) -> None:
         """Add a demand to the proposal of the same demand, or to a new one, or answer it."""
         request, waiting = decision.request, self._waiting(decision.request)
-        owners = {name for each in waiting for name in each.requesters()}
+        owners = {name for old in waiting for name in old.requesters()}
         if owners and not owners & set(request.requesters()):
             message = f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; "
             message += "choose another demand id"
@@ -143,11 +143,11 @@ class Approvals:
         # What a person has seen on a branch never becomes another demand there. So a put with other
         # content gets a branch of its own, and replaces the earlier proposal.
         goal = json.dumps(ticket.goal)
-        proposal = next((each for each in waiting if goal in each.goals()), None)
+        proposal = next((old for old in waiting if goal in old.goals()), None)
         replaced = waiting if isinstance(request, Put) and proposal is None else []
         if proposal is None:
-            open_proposals = [each for each in self._proposals.values() if each.waits]
-            counts = Counter(name for each in open_proposals for name in each.requesters())
+            open_proposals = [other for other in self._proposals.values() if other.waits]
+            counts = Counter(name for other in open_proposals for name in other.requesters())
             names = request.requesters()
             full = next((name for name in names if counts[name] >= PROPOSAL_LIMIT), "")
             if full and not replaced:
@@ -162,7 +162,7 @@ class Approvals:
             if branch in self._proposals:
                 self._demands.fail([ticket], _belongs_to_another(branch))
                 return
-            replaces = next((each.record.as_replaced() for each in replaced), "")
+            replaces = next((old.record.as_replaced() for old in replaced), "")
             proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
@@ -219,7 +219,7 @@ class Approvals:
             is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
             if number and is_long and self._demands.has_queued:
                 # make another check due, which begins with the rest
-                unchecked = {each.branch: each for each in proposals[number:]}
+                unchecked = {later.branch: later for later in proposals[number:]}
                 self._proposals = unchecked | self._proposals
                 self._changed.append(proposal.branch)
                 break

@@ -149,8 +149,8 @@ class ForgeWorker:
                     self._last_error = str(error)
                     if error.asks_to_wait or error.status is None:
                         # notify the requesters now, not only once the forge answers again
-                        for each in (task, *self._tasks):
-                            self._remember(each, self._pull_requests.get(each.branch))
+                        for waiting in (task, *self._tasks):
+                            self._remember(waiting, self._pull_requests.get(waiting.branch))
                     if error.asks_to_wait:
                         self._tasks.appendleft(task)
                         self._runtime.sleep(_REST_S)

@@ -122,7 +122,9 @@ class Proposal:
     def wait_for(self, left: Decided) -> None:
         self.tickets = [ticket for ticket, _ in left]
         self.requests = [decision.request for _, decision in left]
-        self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
+        self.reasons = tuple(
+            dict.fromkeys(why for _, decision in left for why in decision.approval)
+        )
 
     def goals(self) -> list[str]:
         # as JSON, because in Python 1 equals true
@@ -135,10 +137,10 @@ class Proposal:
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
     # with the key and a requester of one of the demands; names all their subjects or is a Release
-    requesters = {name for each in pending for name in each.requesters()}
+    requesters = {name for other in pending for name in other.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False
-    subjects = {subject for each in pending for subject in each.subjects()}
+    subjects = {subject for other in pending for subject in other.subjects()}
     return isinstance(request, Release) or subjects <= set(request.subjects())
 
 
@@ -188,8 +190,8 @@ def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
 
 
 def parse_waiting_text(text: str) -> dict[str, str]:
-    branch, _, rest = text.removeprefix(_PREFIX).partition(" ")
-    link = rest.split(" ")[0] if rest.startswith("http") else ""
+    branch, _, link_and_why = text.removeprefix(_PREFIX).partition(" ")
+    link = link_and_why.split(" ")[0] if link_and_why.startswith("http") else ""
     return {"branch": branch, "link": link}
 
 
