@@ -37,11 +37,6 @@ _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
 _NO_COMMIT = "0" * 40
 
 
-def call_flux(url: str, secret: bytes | None) -> None:
-    # a Receiver ignores the body
-    _send(url, b"{}", secret, "X-Signature", {})
-
-
 def call_argocd(
     url: str, secret: bytes | None, repo: str, before: str, after: str, paths: Iterable[str] | None
 ) -> None:
@@ -282,7 +277,8 @@ class ReconcileTrigger:
             call_argocd(access.webhook, access.secret(), argocd.url, before, commit, paths)
             self._reported[name] = commit
         elif access.receiver and not argocd:
-            call_flux(access.receiver, access.secret())
+            # a Receiver ignores the body
+            _send(access.receiver, b"{}", access.secret(), "X-Signature", {})
         elif access.kubeconfig:
             if name not in self._apis:
                 self._apis[name] = access.api()

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from application_manager_interfaces.action import DeploymentRequest
-from demandops.base.errors import Fault, InvalidInput, fault
+from demandops.base.errors import InvalidInput, fault
 from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
@@ -48,18 +48,6 @@ def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class
         return getattr(import_module(f"{package}.msg"), name, None)
     except ModuleNotFoundError:
         return None
-
-
-def faults_of_types(file: RuleFile) -> list[Fault]:
-    return [
-        fault(
-            f"sources.{name}.type",
-            f"{source.type} is not installed; install its package, or start the detector in a "
-            "workspace that has it",
-        )
-        for name, source in file.sources.items()
-        if message_class(source.type) is None
-    ]
 
 
 class SourceSubscriptions:
@@ -429,8 +417,14 @@ class DetectorNode(Node):  # type: ignore[misc]
 
 
 def _read_rules(path: Path) -> tuple[RuleFile, str]:
-    name, text = read_input(path)
-    file = read(text, name)
-    if faults := faults_of_types(file):
-        raise InvalidInput(problem.within(name) for problem in faults)
+    place, text = read_input(path)
+    file = read(text, place)
+    remedy = "install its package, or start the detector in a workspace that has it"
+    faults = [
+        fault(f"sources.{name}.type", f"{source.type} is not installed; {remedy}")
+        for name, source in file.sources.items()
+        if message_class(source.type) is None
+    ]
+    if faults:
+        raise InvalidInput(problem.within(place) for problem in faults)
     return file, text

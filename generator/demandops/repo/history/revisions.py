@@ -96,7 +96,14 @@ def _commit_named(
     # a branch may be named like a time, such as 2026-01-31
     at = None if names or steps else parse_time(base, now, end=True)
     if at is not None:
-        return commit_at_time(repo, tip, at)
+        latest = int(at.timestamp())
+        for commit in commit_log.first_parents(repo, tip):
+            if commit.commit_time <= latest:
+                return commit
+        raise StateRepoError(
+            f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
+            f"{format_time(commit_log.time_of(commit))}"
+        )
     commits = {name: repo.references[name].peel(Commit) for name in names}
     if base == "HEAD":
         commits[base] = commit_of(repo, tip)
@@ -133,18 +140,6 @@ def _names(repo: Repository, base: str) -> list[str]:
     names = [name for name in valid if name in repo.references]
     tracked = f"refs/remotes/origin/{base}"  # as in a clone, or a checkout of another branch
     return names or [tracked for _ in valid[:1] if tracked in repo.references]
-
-
-def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
-    latest = int(at.timestamp())
-    for commit in commit_log.first_parents(repo, tip):
-        if commit.commit_time <= latest:
-            return commit
-    first = commit_log.time_of(commit)
-    raise StateRepoError(
-        f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
-        f"{format_time(first)}"
-    )
 
 
 def format_time(at: datetime) -> str:

@@ -228,15 +228,6 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
     return pending
 
 
-def readable_entries(path: Path) -> list[JournalEntry]:
-    pending: dict[str, JournalEntry] = {}
-    for line in path.read_bytes().split(b"\n"):
-        sealed = _SEALED.fullmatch(line)
-        with suppress(ValueError):
-            _replay(sealed[1] + b"}" if sealed else line, pending)
-    return list(pending.values())
-
-
 def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
     # the lines after one with the digest ``chain``, and the last digest
     lines = []
@@ -356,7 +347,12 @@ def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[Fou
                 with lock:
                     moved = file.rename(file.with_name(f"outbox-{now:%Y%m%dT%H%M%S}.damaged"))
                     sync_folder(file.parent)
-            yield FoundJournal(file, readable_entries(moved or file), str(damage), moved)
+            pending: dict[str, JournalEntry] = {}
+            for line in (moved or file).read_bytes().split(b"\n"):
+                sealed = _SEALED.fullmatch(line)
+                with suppress(ValueError):
+                    _replay(sealed[1] + b"}" if sealed else line, pending)
+            yield FoundJournal(file, [*pending.values()], str(damage), moved)
 
 
 def _lock(folder: Path) -> IO[str] | None:
