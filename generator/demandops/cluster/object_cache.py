@@ -157,7 +157,7 @@ class ObjectCache:
             return self._client
 
     def _read(self, selector: ObjectSelector) -> str:
-        """Read the selected objects into the cache; return the resource version of the list."""
+        # the result is the resource version of the list
         listed = self._api().list_namespaced_custom_object(
             **_request(selector), _request_timeout=(_CONNECT_S, _WATCH_S)
         )

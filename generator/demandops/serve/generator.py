@@ -140,16 +140,13 @@ class Generator:
         operation: str | None = None,
         listener: Listener = lambda stage, text: None,
     ) -> Ticket:
-        """Queue a demand and return its ticket at once.
+        """Queue a demand and return its ticket at once, with every error in the ticket's future.
 
-        Every error of the demand is in the ticket's future. One that was not accepted has
-        ``ShuttingDown``, ``QueueFull``, ``Refused`` or ``StateRepoError``, and its listener is not
-        called. If the generator ends before the demand is published or approved, the error is
-        ``ShuttingDown`` or ``Unsound``, and the next start resumes the demand.
-
-        ``operation`` is an id that no other demand ever had; without one, an id is generated.
-        ValueError is raised if its characters are not allowed. ``listener`` is called in the worker
-        thread.
+        One that was not accepted has ``ShuttingDown``, ``QueueFull``, ``Refused`` or
+        ``StateRepoError``, and its listener is not called. If the generator ends before the demand
+        is published or approved, the error is ``ShuttingDown`` or ``Unsound``, and the next start
+        resumes the demand. ``operation`` is an id that no other demand ever had. ``listener`` is
+        called in the worker thread.
         """
         operation = operation or self._runtime.fresh_id()
         if not _OPERATION.fullmatch(operation):
@@ -190,11 +187,9 @@ class Generator:
         """Refuse further demands, finish the queued ones and stop; return at once.
 
         After ``timeout`` seconds, demands that are unpublished or await approval stay in the
-        journal for the next start, and their futures raise ``ShuttingDown``. Only the timeout of
-        the first call counts.
-
-        The future returns whether everything was published, apart from demands that await approval.
-        It returns false if the threads have not ended :data:`_GRACE_S` after the timeout.
+        journal for the next start, and their futures raise ``ShuttingDown``. Only the first call's
+        timeout counts. The future returns whether everything was published, apart from demands that
+        await approval, and false if the threads have not ended :data:`_GRACE_S` after the timeout.
         """
         with self._stop_lock:
             if self._finished is not None:

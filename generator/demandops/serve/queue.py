@@ -42,11 +42,8 @@ State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """The outcome of a demand whose commit is published and durable.
-
-    If an earlier attempt or run published the demand, only the first four fields are known.
-    """
-
+    # of a demand whose commit is published and durable; if an earlier attempt or run published it,
+    # only the first four fields are known
     operation: str
     request_id: str
     outcome: Outcome
@@ -85,7 +82,7 @@ class Ticket:
 
     @property
     def name(self) -> str:
-        """The id that the goal names, even if the goal is not valid; empty if it names none."""
+        # the goal may be invalid, or name no id
         fields = self.goal if isinstance(self.goal, dict) else {}
         keys = ("id", "request", "demand", "name")
         return str(next((fields[key] for key in keys if fields.get(key)), ""))
@@ -184,10 +181,8 @@ class _Queued:
 
 
 class FairQueue:
-    """A queue of demands; not thread-safe.
-
-    With ``in_order``, demands leave in the order of their arrival, and requesters take no turns.
-    """
+    # Not thread-safe. With ``in_order``, demands leave in the order of their arrival, and requesters
+    # take no turns.
 
     def __init__(self, *, in_order: bool = False) -> None:
         self._in_order = in_order

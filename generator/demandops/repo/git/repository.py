@@ -40,10 +40,7 @@ def git_environment() -> dict[str, str]:
 
 
 class Unavailable(StateRepoError):
-    """Raised when the state repo cannot be read or written now, but perhaps later.
-
-    Then a generator keeps its demands in the journal and tries again.
-    """
+    """Raised when the state repo cannot be read or written now; demands stay in the journal."""
 
 
 class RemoteAway(Unavailable):
@@ -59,10 +56,7 @@ class FetchInterrupted(StateRepoError):
 
 
 class PushDenied(StateRepoError):
-    """Raised when a write fails for a reason that another attempt does not change.
-
-    Examples are a hook, a protected branch, missing rights and a read-only file system.
-    """
+    """Raised when a write fails for a lasting reason, such as a hook or a protected branch."""
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -140,11 +134,8 @@ def reading(address: str, objects: Repository) -> Iterator[None]:
 
 
 class StateRepository(ABC):
-    """A state repo: Git objects to read and write, and a tip.
-
-    :meth:`publish` only moves the tip forward. :meth:`refresh` may move it back, if somebody has
-    rewritten main.
-    """
+    # `publish` only moves the tip forward. `refresh` may move it back, if somebody has
+    # rewritten main.
 
     objects: Repository
     new: NewObjects

@@ -277,8 +277,6 @@ class PathChange:
 
 @dataclass(frozen=True, slots=True)
 class PathHistory:
-    """The commits that changed a path since it was added for the last time."""
-
     started: LogEntry | None  # added the path; None if it never existed
     newest: tuple[LogEntry, ...]  # changed it afterwards, newest first
     more: int  # older changes, which are not listed

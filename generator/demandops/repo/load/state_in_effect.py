@@ -62,7 +62,7 @@ def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
 
 
 def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
-    """Return the newest state that a commit records; the caller then follows people's changes."""
+    # the caller then follows people's later changes
     objects, tip = repository.objects, repository.tip()
     last_valid_config.refuse_other_render_version(objects, tip)
     return start_at(objects, tip, progress)
@@ -170,8 +170,7 @@ Faults = Mapping[Subject, tuple[Fault, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """The faults of people's changes with the new and with the old configuration, by subject."""
-
+    # of people's changes with the new and with the old configuration, by subject
     repo: Repository
     before: Snapshot
     advance: Advance

@@ -46,11 +46,7 @@ _MOST_SECONDS = 1800  # 5,000 releases take about 1,000 s
 
 @dataclass(frozen=True, slots=True)
 class RenderedCharts:
-    """Which charts helm rendered, for how many releases and examples, and the faults found.
-
-    A chart that is not used, or whose lint or schema has a fault, is in neither of the two.
-    """
-
+    # a chart that is not used, or whose lint or schema has a fault, is in neither of the two lists
     # each chart that helm tried to render, even if there were faults
     rendered: tuple[str, ...] = ()
     releases: int = 0

@@ -50,15 +50,11 @@ def branch_name(name: str, operation: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The newest commits of main, empty if there is none, and of the proposals' branches."""
-
-    main: str
-    branches: dict[str, str]
+    main: str  # empty if there is none
+    branches: dict[str, str]  # of the proposals
 
 
 class ProposalBranches:
-    """The branches ``demand/…`` of a state repo, on this disk or behind a URL."""
-
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
         self._remote = repository if isinstance(repository, RemoteRepository) else None
@@ -76,7 +72,7 @@ class ProposalBranches:
         return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
     def exists(self, branch: str) -> bool:
-        """Return whether any branch exists, also one that does not begin with ``demand/``."""
+        # any branch, also one that does not begin with ``demand/``
         reference = f"{_HEADS}{branch}"
         if self._remote is None:
             return reference in self._repository.objects.references

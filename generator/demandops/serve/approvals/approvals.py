@@ -374,7 +374,7 @@ class Approvals:
         return True
 
     def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
-        """Journal ``record`` for each demand; return false if a demand was withdrawn."""
+        # false if a demand was withdrawn
         proposal.record = record
         waiting = [self._demands.propose(ticket, record) for ticket in proposal.tickets]
         return all(waiting)

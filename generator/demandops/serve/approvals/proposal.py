@@ -45,8 +45,6 @@ class Verdict:
 
 @dataclass(eq=False)
 class Proposal:
-    """A demand that awaits approval on a branch, with all goals that ask for it."""
-
     record: ProposalRecord
     tickets: list[Ticket] = field(default_factory=list)
     requests: list[DemandRequest] = field(default_factory=list)
