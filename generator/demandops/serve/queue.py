@@ -181,8 +181,8 @@ class _Queued:
 
 
 class FairQueue:
-    # Not thread-safe. With ``in_order``, demands leave in the order of their arrival, and requesters
-    # take no turns.
+    # Not thread-safe. With ``in_order``, demands leave in the order of their arrival, and
+    # requesters take no turns.
 
     def __init__(self, *, in_order: bool = False) -> None:
         self._in_order = in_order
