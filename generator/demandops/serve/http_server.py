@@ -192,8 +192,8 @@ class PushWebhook:
     """The webhook's server, in a thread of its own; a request for ``/`` is a health check."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
-        # ``on_push`` must return at once. Without a secret, notifications need no signature, and the
-        # address must be a loopback address.
+        # ``on_push`` must return at once. Without a secret, notifications need no signature, and
+        # the address must be a loopback address.
         self._secret, self._on_push = secret, on_push
         self._warned = float("-inf")
         listening = bound(address, "--webhook")
