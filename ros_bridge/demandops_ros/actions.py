@@ -160,10 +160,7 @@ def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rcl
 
 
 class GoalSender:
-    """Sends goals of one action and waits for the answers; many threads may send at once.
-
-    A call of :meth:`send` may take ``timeout_s``.
-    """
+    """Sends goals of one action and waits for the answers; many threads may send at once."""
 
     def __init__(
         self,
@@ -202,15 +199,11 @@ class GoalSender:
         goal: Any,  # noqa: ANN401 - a generated class
         on_feedback: Callable[[Any], None] = lambda feedback: None,
     ) -> tuple[bool, Any, bool]:
-        """Send a goal and wait for its result.
+        """Send a goal and wait for its result, for ``timeout_s`` at most.
 
         Return whether the goal succeeded, its result, and whether an earlier attempt to send it got
-        no response. The node may have carried out that attempt too.
-
-        Raises:
-            DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
-                answer came in time.
-            ValueError: if ROS cannot carry a text of the goal, because it is not Unicode.
+        no response. The node may have carried out that attempt too. Raises DemandError with the
+        code ``no-server``, ``rejected`` or ``timeout``, and ValueError if a text is not Unicode.
         """
         deadline = REAL.monotonic() + self.timeout_s
         if not self._client.wait_for_server(timeout_sec=self.timeout_s):
@@ -280,12 +273,9 @@ class GoalSender:
 
 
 class LastingResults(ActionServer):  # type: ignore[misc]
-    """An action server that keeps results longer than goals, for clients that ask late.
-
-    With a version of rclpy that does not call the overridden methods, results are kept for ten
-    seconds.
-    """
-
+    # It keeps results longer than goals, for clients that ask late. With a version of rclpy that
+    # does not call the overridden methods, results are kept for ten seconds.
+    #
     # Whenever a goal changes, ROS publishes the status of all goals that it keeps. So each kept
     # goal slows down every other goal, in the server and in every client. Therefore ROS keeps a
     # goal only for its default of ten seconds, and this class keeps the goal's result for longer.

@@ -64,11 +64,8 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
 
 
 def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
-    """Return the commit that a text from outside names, or raise StateRepoError.
-
-    The text is a time, or the name of a branch or tag, or 4 to 40 digits of an id. A name or an id
-    may be followed by ``~N`` or ``^``, which count along the first parents. ``HEAD`` means ``tip``.
-    """
+    # The text is from outside: a time, the name of a branch or tag, or 4 to 40 digits of an id. A
+    # name or id may be followed by ``~N`` or ``^``, along the first parents. ``HEAD`` is ``tip``.
     # libgit2 never parses the text: its own grammar has searches, some of which crash it.
     text = text.strip(" ")
     is_plain = text.isprintable() and len(text.encode(errors="replace")) <= _LONGEST

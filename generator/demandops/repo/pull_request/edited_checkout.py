@@ -117,10 +117,7 @@ def _take(documents: list[Any], path: tuple[str, ...]) -> Any:  # noqa: ANN401
 def _merge_patch(
     old: dict[str, Any], new: dict[str, Any], names: dict[str, str], pins: dict[str, dict[str, str]]
 ) -> dict[str, Any]:
-    """Return the JSON merge patch (RFC 7386) that turns ``old`` into ``new``.
-
-    Changes of an image whose repository is in ``names`` go to ``pins`` instead.
-    """
+    # RFC 7386; changes of an image whose repository is in ``names`` go to ``pins`` instead
     patch: dict[str, Any] = {key: None for key in old if key not in new}  # None removes a key
     for key, value in new.items():
         was = old.get(key, ABSENT)
@@ -223,11 +220,8 @@ def _why_not_read(name: str, depth: int, status: os.stat_result) -> str:
 
 
 def base_of(folder: Path, revision: str | None) -> Base | None:
-    """Return the commit that an edit is compared with, if the folder is a checkout with a commit.
-
-    ``revision`` is the merge target; by default ``origin/main``, else ``main``. If there is
-    neither, the edit is compared with HEAD.
-    """
+    # ``revision`` is the merge target; by default ``origin/main``, else ``main``. If there is
+    # neither, the edit is compared with HEAD. None if the folder is no checkout with a commit.
     try:
         repo = Repository(str(folder))
     except pygit2.GitError as error:

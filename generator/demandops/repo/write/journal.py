@@ -48,7 +48,7 @@ class DamagedJournal(StateRepoError):
 
 @dataclass(frozen=True, slots=True)
 class ProposalRecord:
-    """The journal's record of a proposal: what a restarted process needs to continue it."""
+    # what a restarted process needs to continue a proposal
 
     branch: str
     # where the generator left the branch, newest last; two if the newest's push may have failed
@@ -278,11 +278,8 @@ _JOURNAL = "outbox.jsonl"
 
 
 class Slot:
-    """A folder for the journal and the clone of one process, locked while the process lives.
-
-    Several processes on one machine may serve one state repo. Each takes the first free slot and
-    takes over the journals of dead processes.
-    """
+    # Locked while its process lives. Several processes on one machine may serve one state repo.
+    # Each takes the first free slot, and takes over the journals of dead processes.
 
     def __init__(self, root: Path) -> None:
         """Take a slot below ``root``; raise StateRepoError, or OSError about the slot's folder."""
