@@ -37,7 +37,6 @@ from demandops_ros.ros_process import ExecutorThread
 #
 # An adapter turns goals into plain data, and stages and outcomes into messages.
 
-
 # The first kind that fits counts.
 _CODES: tuple[tuple[type[BaseException], str], ...] = (
     (Withdrawn, "withdrawn"),
@@ -49,32 +48,22 @@ _CODES: tuple[tuple[type[BaseException], str], ...] = (
 
 
 class DeploymentRequestAdapter:
-    """The adapter for the reference's action; its results and feedback are plain text."""
-
+    # of the reference's action, whose results and feedback are plain text
     action: Any = DeploymentRequest
 
     def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
         return message_to_data(goal)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
-        """Return the id of a goal for the log."""
         return str(goal.id)
 
     def answer_level(self, goal: Any) -> Level | None:  # noqa: ANN401
-        """Return the level at which to answer a goal; None if it names none."""
-        return None
+        return None  # it names none
 
     def feedback(self, stage: str, text: str) -> Any:  # noqa: ANN401
         return DeploymentRequest.Feedback(message=one_line(text))
 
     def result(self, outcome: Receipt | BaseException, reached: Level) -> Any:  # noqa: ANN401
-        """Return the result of a goal, as lines of text.
-
-        After success, the first line is ``<outcome>: <commit>``. A line follows for each placed
-        application, each warning and each listed item that was not held. After a refusal, each
-        fault has a line ``<code>: <field>: <remedy>``. After another error, the line is ``<code>:
-        <reason>``; for a canceled goal, only the reason.
-        """
         return DeploymentRequest.Result(message=_text(outcome))
 
 
@@ -103,6 +92,10 @@ class DemandAdapter(DeploymentRequestAdapter):
 
 
 def _text(outcome: Receipt | BaseException) -> str:
+    # After success, the first line is ``<outcome>: <commit>``. A line follows for each placed
+    # application, each warning and each listed item that was not held. After a refusal, each fault
+    # has a line ``<code>: <field>: <remedy>``. After another error, the line is ``<code>:
+    # <reason>``; for a canceled goal, only the reason.
     if isinstance(outcome, Receipt):
         warnings = (f"warning: {one_line(warning)}" for warning in outcome.warnings)
         head = [f"{outcome.outcome}: {outcome.commit}", *map(one_line, outcome.placed)]
@@ -129,9 +122,7 @@ def _code(outcome: Receipt | BaseException) -> str:
     return next(code for kind, code in _CODES if isinstance(outcome, kind))
 
 
-# ---- action endpoints ----
-#
-# Parts for ROS actions: a client that sends goals, a server, and a search for other servers.
+# ---- endpoints: a client that sends goals, a server, and a search for other servers ----
 
 # The length of the queues for goals, results, cancels and feedback. ROS's default of 10 is too
 # small for a burst, because a client's queue also gets the answers to other clients.
@@ -143,10 +134,8 @@ _UNHEARD_S = 5.0
 
 _ASK_AGAIN_S = 0.2
 
-# How long ROS keeps a goal that has ended.
-_GOAL_KEPT_S = 10
-# How long LastingResults keeps a result that ROS has forgotten.
-_RESULT_S = 900
+_GOAL_KEPT_S = 10  # how long ROS keeps a goal that has ended
+_RESULT_S = 900  # how long LastingResults keeps a result that ROS has forgotten
 # How many results it keeps; if there are more, it forgets the oldest ones earlier.
 _MOST_RESULTS = 2_000
 
@@ -164,20 +153,14 @@ class DemandError(Exception):
 
 
 def ask_the_node(client: ActionClient) -> Any:  # noqa: ANN401 - a future of rclpy
-    """Send the node a harmless request, and return the future of the node's answer.
-
-    The answer shows that the node has discovered the client.
-    """
-    # It asks to cancel a goal that does not exist.
+    # A harmless request, to cancel a goal that does not exist. Its answer shows that the node has
+    # discovered the client.
     nobodys = UUID(uuid=list(bytes.fromhex(REAL.fresh_id().replace("-", ""))))
     return ClientGoalHandle(client, nobodys, None).cancel_goal_async()
 
 
 class GoalSender:
-    """Sends goals of one action and waits for the answers; many threads may send at once.
-
-    A call of :meth:`send` may take ``timeout_s``.
-    """
+    """Sends goals of one action and waits for the answers; many threads may send at once."""
 
     def __init__(
         self,
@@ -216,15 +199,11 @@ class GoalSender:
         goal: Any,  # noqa: ANN401 - a generated class
         on_feedback: Callable[[Any], None] = lambda feedback: None,
     ) -> tuple[bool, Any, bool]:
-        """Send a goal and wait for its result.
+        """Send a goal and wait for its result, for ``timeout_s`` at most.
 
         Return whether the goal succeeded, its result, and whether an earlier attempt to send it got
-        no response. The node may have carried out that attempt too.
-
-        Raises:
-            DemandError: ``no-server`` or ``rejected`` if no node took the goal, ``timeout`` if no
-                answer came in time.
-            ValueError: if ROS cannot carry a text of the goal, because it is not Unicode.
+        no response. The node may have carried out that attempt too. Raises DemandError with the
+        code ``no-server``, ``rejected`` or ``timeout``, and ValueError if a text is not Unicode.
         """
         deadline = REAL.monotonic() + self.timeout_s
         if not self._client.wait_for_server(timeout_sec=self.timeout_s):
@@ -266,12 +245,10 @@ class GoalSender:
         on_feedback: Callable[[Any], None],
         deadline: float,
     ) -> Any:  # noqa: ANN401 - a future of rclpy
-        """Send a goal in the thread that also receives; return the future of the response."""
-        # rclpy 9.1 registers two futures for a goal, one after the other, and returns the second.
-        # If another thread sent the goal, a response could arrive between the two registrations. It
-        # would then resolve only the first future, for which nobody waits.
+        # In the thread that also receives: rclpy 9.1 registers two futures for a goal, one after
+        # the other, and returns the second. If another thread sent the goal, a response could
+        # arrive between the two, and would resolve only the first, for which nobody waits.
         sent: Future[Any] = Future()
-        done = REAL.event()
 
         def send() -> None:
             try:
@@ -282,32 +259,23 @@ class GoalSender:
                 )
             except Exception as error:  # the caller must get it, not the executor
                 sent.set_exception(error)
-            done.set()
 
         self._thread.call(send)
-        if not done.wait(max(0.0, deadline - REAL.monotonic())):
-            raise self._no_answer()
-        return sent.result()
+        return self._await(sent, deadline)
 
     def _await(self, future: Any, deadline: float) -> Any:  # noqa: ANN401
         done = REAL.event()
         future.add_done_callback(lambda _: done.set())
         if not done.wait(max(0.0, deadline - REAL.monotonic())):
-            raise self._no_answer()
+            text = f"no answer on {self._action_name} within {self.timeout_s:g} s"
+            raise DemandError("timeout", text)
         return future.result()
-
-    def _no_answer(self) -> DemandError:
-        text = f"no answer on {self._action_name} within {self.timeout_s:g} s"
-        return DemandError("timeout", text)
 
 
 class LastingResults(ActionServer):  # type: ignore[misc]
-    """An action server that keeps results longer than goals, for clients that ask late.
-
-    With a version of rclpy that does not call the overridden methods, results are kept for ten
-    seconds.
-    """
-
+    # It keeps results longer than goals, for clients that ask late. With a version of rclpy that
+    # does not call the overridden methods, results are kept for ten seconds.
+    #
     # Whenever a goal changes, ROS publishes the status of all goals that it keeps. So each kept
     # goal slows down every other goal, in the server and in every client. Therefore ROS keeps a
     # goal only for its default of ten seconds, and this class keeps the goal's result for longer.
@@ -338,18 +306,13 @@ class LastingResults(ActionServer):  # type: ignore[misc]
 
 
 class OtherServers:
-    """Finds other nodes that serve the same actions as ``node``."""
-
     def __init__(self, node: Node, actions: Iterable[str]) -> None:
         self._node = node
         self._own = f"{node.get_namespace().rstrip('/')}/{node.get_name()}"
         self._found = {node.resolve_service_name(action): list[str]() for action in actions}
 
     def find(self) -> dict[str, list[str]]:
-        """Return, for each action, the names of the other nodes that serve it; log changes.
-
-        A node that comes and goes between two calls is not seen.
-        """
+        # by action; changes are logged, but not of a node that comes and goes between two calls
         for action, others in self._found.items():
             publishers = self._node.get_publishers_info_by_topic(f"{action}/_action/status")
             now = sorted(f"{p.node_namespace.rstrip('/')}/{p.node_name}" for p in publishers)

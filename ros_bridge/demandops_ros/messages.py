@@ -18,10 +18,7 @@ from demandops_interfaces.action import Demand as DemandMessage
 
 
 def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-    """Return a message as mappings, lists and plain values, in the form that its YAML text has.
-
-    So a goal over ROS 2 equals the same goal in a file.
-    """
+    # in the form that its YAML text has, so that a goal over ROS 2 equals the same goal in a file
     fields = getattr(message, "get_fields_and_field_types", None)
     if fields is not None:
         return {name: message_to_data(getattr(message, name)) for name in fields()}
@@ -57,7 +54,6 @@ _ROUTE |= {name: name for name in RouteOptions.model_fields}
 
 
 def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
-    """Return a ``Demand.Goal`` as data for :func:`.demand_goal.parse`."""
     data = {
         "apiVersion": API_VERSION,
         "kind": "Demand",
@@ -168,11 +164,10 @@ def _data(message: Any, names: Mapping[str, str]) -> dict[str, Any]:  # noqa: AN
 def _fields(
     data: Mapping[str, Any], names: Mapping[str, str], others: set[str], what: str
 ) -> dict[str, Any]:
-    """Return the fields that ``names`` lists, under their names in the message; refuse others."""
-    known = {*others, *names}
+    allowed = {*others, *names}
     for name in data:
-        if name not in known:
-            raise ValueError(f"'{name}' is not a field of {what}{suggestion(name, known)}")
+        if name not in allowed:
+            raise ValueError(f"'{name}' is not a field of {what}{suggestion(name, allowed)}")
     return {field: data[name] for name, field in names.items() if name in data}
 
 
@@ -203,11 +198,8 @@ def _word(words: tuple[str, ...], number: int) -> str:
 
 
 def fill_message(message: Any, data: dict[str, Any]) -> Any:  # noqa: ANN401
-    """Fill a message from plain data and return it; missing fields keep ROS's defaults.
-
-    A field or value that the message cannot carry raises AttributeError, AssertionError or
-    TypeError.
-    """
+    # Missing fields keep ROS's defaults. A field or value that the message cannot carry raises
+    # AttributeError, AssertionError or TypeError.
     _checking(message)
     types = message.get_fields_and_field_types()
     for name, value in data.items():

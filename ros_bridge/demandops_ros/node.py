@@ -40,27 +40,7 @@ from demandops_ros.actions import (
 
 # ---- the bookkeeping over ROS 2, by a ROS service and on a latched topic ----
 #
-# The service and the topic carry the JSON that ``demandops bookkeeping --output json`` prints.
-
-
-def fill_response(generator: Generator, request: Any, response: Any) -> Any:  # noqa: ANN401
-    """Fill the response with the bookkeeping at a revision or time, and return it.
-
-    Without ``request.at``, that is the newest commit.
-    """
-    try:
-        snapshot = generator.snapshot_at(request.at) if request.at else generator.snapshot
-        response.commit, response.bookkeeping_json = _commit_and_json(snapshot)
-        response.ok = True
-    except DemandOpsError as error:
-        response.ok, response.message = False, str(error)
-    except Exception as error:  # the caller must get an answer
-        REAL.failed("bookkeeping", error)
-        response.ok, response.message = (
-            False,
-            one_line(f"internal error: {error!r}; see the node's log"),
-        )
-    return response
+# Both carry the JSON that ``demandops bookkeeping --output json`` prints.
 
 
 def _commit_and_json(snapshot: Snapshot) -> tuple[str, str]:
@@ -75,130 +55,29 @@ _SHORTEST_PAUSE_S = 1.0
 # 20th of the time, and changes during a pause share one message.
 _PAUSE_FACTOR = 20
 
-
-class BookkeepingTopic:
-    """Publishes the bookkeeping on the topic ``~/bookkeeping``: at the start and on change."""
-
-    def __init__(
-        self, node: Node, generator: Generator, in_executor: Callable[[Callable[[], None]], None]
-    ) -> None:
-        self._generator = generator
-        self._in_executor = in_executor
-        self._publisher = node.create_publisher(BookkeepingMessage, "~/bookkeeping", _LATCHED)
-        self._changed, self._closed = REAL.event(), REAL.event()
-        self._changed.set()
-        generator.on_publish(lambda config: self._changed.set())
-        REAL.keep_running("bookkeeping-topic", self._run)
-
-    def close(self) -> None:
-        self._closed.set()
-        self._changed.set()
-
-    def _run(self) -> None:
-        while self._changed.wait() and not self._closed.is_set():
-            self._changed.clear()
-            began = REAL.monotonic()
-            commit, text = _commit_and_json(self._generator.snapshot)
-            message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
-            self._in_executor(partial(self._publish, message))
-            took = REAL.monotonic() - began
-            self._closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
-
-    def _publish(self, message: Any) -> None:  # noqa: ANN401
-        if not self._closed.is_set():  # else the node may be destroyed already
-            self._publisher.publish(message)
-
-
 # ---- the node's status on ``/diagnostics``, for ROS 2's own tools ----
-#
-# The node publishes four statuses once a second: whether the state repo can be reached and written,
-# whether the configuration is valid, whether all parts of the generator work, and whether no other
-# node serves the node's actions.
 
 _PERIOD_S = 1.0
 _MOST_PROBLEMS = 20
 
 
-class Diagnostics:
-    def __init__(self, node: Node, generator: Generator, others: OtherServers) -> None:
-        self._node, self._generator, self._others = node, generator, others
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self._timer = node.create_timer(_PERIOD_S, self._publish)
-
-    def _publish(self) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        generator, address, statuses = self._generator, self._generator.address, []
-
-        remote, unpublished = generator.remote_status, generator.unpublished
-        level, text = DiagnosticStatus.OK, "reachable"
-        if remote.push_denied:
-            level, text = DiagnosticStatus.ERROR, remote.push_denied
-        if remote.unreachable:
-            # while no demand waits, an unreachable repo delays only people's changes
-            level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
-            text = remote.unreachable
-        values = {
-            "reachable": str(not remote.unreachable).lower(),
-            "away since": _time(remote.unreachable_since),
-            "last reached": _time(remote.last_reached),
-            "last push": _time(remote.last_push),
-            "unpublished demands": str(unpublished),
-            "commit": str(generator.snapshot.commit),
-        }
-        statuses.append(status("demandops: state repo", address, level, text, values))
-
-        problems = generator.snapshot.problems
-        level, text = DiagnosticStatus.OK, "all files are valid"
-        if problems:
-            level = DiagnosticStatus.WARN
-            text = f"{len(problems)} problems; the last valid version is in effect"
-        values = {"problems": str(len(problems))}
-        for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
-            values[f"problem {number}"] = str(problem)
-        statuses.append(status("demandops: configuration", address, level, text, values))
-
-        failures = generator.failures
-        level, text = DiagnosticStatus.OK, "all parts work"
-        if failures:
-            level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
-        statuses.append(status("demandops: generator", address, level, text, failures))
-
-        others = self._others.find()
-        level, text = DiagnosticStatus.OK, "no other node serves these actions"
-        if any(others.values()):
-            level, text = (
-                DiagnosticStatus.WARN,
-                "another node serves these actions too; see the log",
-            )
-        values = {action: ", ".join(nodes) for action, nodes in others.items()}
-        statuses.append(status("demandops: actions", address, level, text, values))
-
-        message.status = statuses
-        self._publisher.publish(message)
-
-
 def status(
     name: str, address: str, level: bytes, text: str, values: dict[str, str]
 ) -> DiagnosticStatus:
-    """Return a diagnostic status; its text, its keys and its values have no line breaks."""
     pairs = [KeyValue(key=one_line(key), value=one_line(value)) for key, value in values.items()]
-    message = one_line(text)
-    return DiagnosticStatus(
-        level=level, name=name, message=message, hardware_id=address, values=pairs
-    )
+    text = one_line(text)
+    return DiagnosticStatus(level=level, name=name, message=text, hardware_id=address, values=pairs)
 
 
 def _time(time: datetime | None) -> str:
     return time.isoformat(timespec="seconds") if time else "never"
 
 
-# ---- the ROS 2 node: action servers that submit demands to the generator ----
+# ---- the node: action servers that submit demands to the generator ----
 #
-# A goal is accepted once its demand is in the generator's journal. Many goals may be open without
-# blocking the executor, because events from the generator's threads are queued, and a guard
-# condition wakes the executor to handle them. The execute callback of a goal runs only once the
-# goal's outcome is known.
+# Many goals may be open without blocking the executor, because events from the generator's threads
+# are queued, and a guard condition wakes the executor to handle them. The execute callback of a
+# goal runs only once the goal's outcome is known.
 
 # How many answers ROS 2 queues for a client by default; if more arrive, the oldest are lost.
 _DEFAULT_DEPTH = 10
@@ -239,10 +118,7 @@ class DemandNode(Node):  # type: ignore[misc]
         timeout_s: float,
         status: RolloutWatcher | None,
     ) -> None:
-        """Start the servers.
-
-        ``level`` is that at which to answer a goal that names none. ``timeout_s`` limits a rollout.
-        """
+        # ``level`` is for goals that name none; ``timeout_s`` limits a rollout
         super().__init__("demandops")
         self._generator = generator
         self._level, self._timeout_s, self._status = level, timeout_s, status
@@ -266,9 +142,16 @@ class DemandNode(Node):  # type: ignore[misc]
             self._bookkeeping,
             callback_group=ReentrantCallbackGroup(),
         )
-        self._bookkeeping_topic = BookkeepingTopic(self, generator, self._in_executor)
-        others = OtherServers(self, (action_name, demand_action_name))
-        self._diagnostics = Diagnostics(self, generator, others)
+        self._bookkeeping_topic = self.create_publisher(
+            BookkeepingMessage, "~/bookkeeping", _LATCHED
+        )
+        self._has_news, self._is_closed = REAL.event(), REAL.event()
+        self._has_news.set()
+        generator.on_publish(lambda config: self._has_news.set())
+        REAL.keep_running("bookkeeping-topic", self._publish_bookkeeping)
+        self._others = OtherServers(self, (action_name, demand_action_name))
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self.create_timer(_PERIOD_S, self._report)
 
     def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> LastingResults:
         return LastingResults(
@@ -287,7 +170,8 @@ class DemandNode(Node):  # type: ignore[misc]
         )
 
     def close(self) -> None:
-        self._bookkeeping_topic.close()
+        self._is_closed.set()
+        self._has_news.set()
 
     @property
     def open_goals(self) -> int:
@@ -301,8 +185,19 @@ class DemandNode(Node):  # type: ignore[misc]
         before, done = self._last_reading, Future(executor=self.executor)
 
         def work() -> None:
-            filled = fill_response(self._generator, request, response)
-            self._in_executor(partial(done.set_result, filled))
+            try:
+                # at a revision or time; without one, at the newest commit
+                generator, at = self._generator, request.at
+                snapshot = generator.snapshot_at(at) if at else generator.snapshot
+                response.commit, response.bookkeeping_json = _commit_and_json(snapshot)
+                response.ok = True
+            except DemandOpsError as error:
+                response.ok, response.message = False, str(error)
+            except Exception as error:  # the caller must get an answer
+                REAL.failed("bookkeeping", error)
+                response.ok = False
+                response.message = one_line(f"internal error: {error!r}; see the node's log")
+            self._in_executor(partial(done.set_result, response))
 
         self._readers, self._last_reading = self._readers + 1, done
         try:
@@ -315,6 +210,72 @@ class DemandNode(Node):  # type: ignore[misc]
             if not done.done():  # the thread did not start
                 done.set_result(None)
 
+    def _publish_bookkeeping(self) -> None:
+        # at the start and after each publication
+        while self._has_news.wait() and not self._is_closed.is_set():
+            self._has_news.clear()
+            began = REAL.monotonic()
+            commit, text = _commit_and_json(self._generator.snapshot)
+            message = BookkeepingMessage(commit=commit, bookkeeping_json=text)
+
+            def publish(message: Any = message) -> None:  # noqa: ANN401
+                if not self._is_closed.is_set():  # else the node may be destroyed already
+                    self._bookkeeping_topic.publish(message)
+
+            self._in_executor(publish)
+            took = REAL.monotonic() - began
+            self._is_closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
+
+    def _report(self) -> None:
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        generator, address, statuses = self._generator, self._generator.address, []
+
+        remote, unpublished = generator.remote_status, generator.unpublished
+        level, text = DiagnosticStatus.OK, "reachable"
+        if remote.push_denied:
+            level, text = DiagnosticStatus.ERROR, remote.push_denied
+        if remote.unreachable:
+            # while no demand waits, an unreachable repo delays only people's changes
+            level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
+            text = remote.unreachable
+        values = {
+            "reachable": str(not remote.unreachable).lower(),
+            "away since": _time(remote.unreachable_since),
+            "last reached": _time(remote.last_reached),
+            "last push": _time(remote.last_push),
+            "unpublished demands": str(unpublished),
+            "commit": str(generator.snapshot.commit),
+        }
+        statuses.append(status("demandops: state repo", address, level, text, values))
+
+        problems = generator.snapshot.problems
+        level, text = DiagnosticStatus.OK, "all files are valid"
+        if problems:
+            level = DiagnosticStatus.WARN
+            text = f"{len(problems)} problems; the last valid version is in effect"
+        values = {"problems": str(len(problems))}
+        for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
+            values[f"problem {number}"] = str(problem)
+        statuses.append(status("demandops: configuration", address, level, text, values))
+
+        failures = generator.failures
+        level, text = DiagnosticStatus.OK, "all parts work"
+        if failures:
+            level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
+        statuses.append(status("demandops: generator", address, level, text, failures))
+
+        others = self._others.find()
+        level, text = DiagnosticStatus.OK, "no other node serves these actions"
+        if any(others.values()):
+            level = DiagnosticStatus.WARN
+            text = "another node serves these actions too; see the log"
+        values = {action: ", ".join(nodes) for action, nodes in others.items()}
+        statuses.append(status("demandops: actions", address, level, text, values))
+
+        message.status = statuses
+        self._diagnostics.publish(message)
+
     # ---- callbacks of the action server, in the executor's thread ----
 
     async def _accept_or_reject(
@@ -322,8 +283,8 @@ class DemandNode(Node):  # type: ignore[misc]
         adapter: DeploymentRequestAdapter,
         message: Any,  # noqa: ANN401
     ) -> GoalResponse:
-        """Accept a goal once its demand is in the journal, so that no crash loses it."""
-        # An invalid goal is accepted too, because a result can contain the reason, but a rejection
+        # A goal is accepted once its demand is in the journal, so that no crash loses it. An
+        # invalid goal is accepted too, because a result can contain the reason, but a rejection
         # cannot. Goals that arrive while the journal syncs share the next sync.
         goal = self._goals[id(message)] = _Goal(adapter, message)
         journaled = Future(executor=self.executor)
@@ -391,8 +352,6 @@ class DemandNode(Node):  # type: ignore[misc]
     # ---- an accepted goal, in the executor's thread ----
 
     def _after(self, goal: _Goal, future: Any, step: Callable[[_Goal, Any], None]) -> None:  # noqa: ANN401
-        """Make the executor call ``step`` with the goal and the future's result or error."""
-
         # a coroutine would be slower: rclpy's executor resumes all waiting ones at each event
         def take() -> None:
             try:
@@ -444,7 +403,15 @@ class DemandNode(Node):  # type: ignore[misc]
             goal.is_refused = True
             self.get_logger().error(f"{goal}: {_one_line(text)}")
         else:
-            self._in_executor(partial(_give_feedback, goal, goal.adapter.feedback(stage, text)))
+            feedback = goal.adapter.feedback(stage, text)
+
+            def give() -> None:
+                if goal.handle is None:
+                    goal.feedback.append(feedback)
+                elif goal.handle.is_active:
+                    goal.handle.publish_feedback(feedback)
+
+            self._in_executor(give)
 
     def _in_executor(self, event: Callable[[], None]) -> None:
         self._events.append(event)
@@ -460,10 +427,3 @@ class DemandNode(Node):  # type: ignore[misc]
 
 def _one_line(text: str) -> str:
     return one_line(text.replace("\n", "; "))
-
-
-def _give_feedback(goal: _Goal, feedback: Any) -> None:  # noqa: ANN401
-    if goal.handle is None:
-        goal.feedback.append(feedback)
-    elif goal.handle.is_active:
-        goal.handle.publish_feedback(feedback)

@@ -28,13 +28,12 @@ from rclpy.node import Node
 
 from demandops_ros.messages import ANSWER_LEVELS
 
-# ---- reads the parameters of the reference's node, and warns about those without effect ----
+# ---- the parameters of the reference's node, and warnings about those without effect ----
 #
 # A fleet may start our node with the parameter file of the reference's node. The file calls that
 # node ``application_manager``. Our node takes the action's name from the file. Brokers, topics,
 # namespaces and the image registry come from the state repo. If the file names one that the state
 # repo lacks, the node warns. The node also warns about parameters that it replaces by other means.
-
 
 _NODE = "application_manager"
 ACTION_NAME = "deployment_action_name"
@@ -52,7 +51,6 @@ _REPLACED = {
 
 
 def read_reference_parameters(ros_args: Sequence[str]) -> dict[str, Any]:
-    """Return the reference node's parameters, from ROS arguments and their parameter files."""
     # a rule that renames our node would rename the temporary one, and hide the file's section
     renames = {
         at
@@ -76,7 +74,6 @@ def read_reference_parameters(ros_args: Sequence[str]) -> dict[str, Any]:
 
 
 def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
-    """Yield a warning for each parameter in ``values`` that our node replaces by other means."""
     for name in dict.fromkeys(dotted.partition(".")[0] for dotted in values):
         if name in _REPLACED:
             yield f"parameter {name} of the reference is not used: {_REPLACED[name]}"
@@ -131,10 +128,7 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
 
 # ---- the node's parameters: their defaults, descriptions and ranges ----
 
-_CHOICES = {
-    "answer": ANSWER_LEVELS,
-    "log_level": ("debug", "info", "warn", "error", "fatal"),
-}
+_CHOICES = {"answer": ANSWER_LEVELS, "log_level": ("debug", "info", "warn", "error", "fatal")}
 DEFAULTS: dict[str, Any] = {
     "action_name": DEFAULT_ACTION_NAME,
     "demand_action_name": DEFAULT_DEMAND_ACTION_NAME,
@@ -158,13 +152,11 @@ _DESCRIPTIONS = {
     "log_level": "Lowest level of messages in the log.",
 }
 
-_RANGES = {
-    "answer_timeout": {
-        "floating_point_range": [FloatingPointRange(from_value=0.001, to_value=86_400.0)]
-    },
-    "requester_queue_limit": {
-        "integer_range": [IntegerRange(from_value=1, to_value=QUEUE_LIMIT, step=1)]
-    },
+_SECONDS = [FloatingPointRange(from_value=0.001, to_value=86_400.0)]
+_COUNT = [IntegerRange(from_value=1, to_value=QUEUE_LIMIT, step=1)]
+_RANGES: dict[str, Any] = {
+    "answer_timeout": {"floating_point_range": _SECONDS},
+    "requester_queue_limit": {"integer_range": _COUNT},
 }
 
 
@@ -202,7 +194,6 @@ def read_node_parameters(given: Mapping[str, str | None]) -> dict[str, Any]:
 
 
 def descriptor(name: str, *, read_only: bool = False) -> ParameterDescriptor:
-    """Return a parameter's descriptor; only ``fetch_interval`` may be of any type."""
     choices = _CHOICES.get(name)
     return ParameterDescriptor(
         description=_DESCRIPTIONS[name],

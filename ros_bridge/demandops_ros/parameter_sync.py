@@ -20,8 +20,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros import ros_process
 
-# ---- reads the parameters of a node from the text of a ROS parameter file ----
-
+# ---- the text of a ROS parameter file ----
 
 _EVERY_NODE = ("/**", "**", "/*", "*")
 _SECTION = "ros__parameters"
@@ -54,7 +53,7 @@ def _flat(section: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, A
             yield f"{prefix}{key}", value
 
 
-# ---- sets the parameters of another node, and sets them again after that node restarts ----
+# ---- the parameters of another node, set again after that node restarts ----
 #
 # A restarted node publishes its parameter events at a new endpoint, which the ROS graph shows.
 
@@ -82,10 +81,7 @@ class ParameterSetter:
         node.create_timer(_LOOK_S, self._set_if_needed)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
-        """Replace the parameters that the target must have; any thread may call this method.
-
-        A value that ROS cannot carry raises TypeError or ValueError, which names the parameter.
-        """
+        # any thread may call this; TypeError or ValueError names a value that ROS cannot carry
         wanted = [_parameter(name, value).to_parameter_msg() for name, value in parameters.items()]
         with self._lock:
             self._wanted, self._version = wanted, self._version + 1
@@ -111,26 +107,23 @@ class ParameterSetter:
             return
         self._called_at = REAL.monotonic()
         self._call = self._client.call_async(SetParameters.Request(parameters=wanted))
-        self._call.add_done_callback(
-            lambda call: self._take_answer(call, (endpoints, version), wanted)
-        )
 
-    def _take_answer(self, call: Any, state: tuple[Any, int], wanted: list[Any]) -> None:  # noqa: ANN401
-        if call is not self._call or call.exception() is not None:
-            return
-        self._call, self._set = None, state
-        names = [parameter.name for parameter in wanted]
-        refused = [
-            f"{name}: {result.reason or 'no reason given'}"
-            for name, result in zip(names, call.result().results, strict=False)
-            if not result.successful
-        ]
-        for line in refused:
-            self._node.get_logger().error(one_line(f"{self._target} refused {line}"))
-        self._node.get_logger().info(
-            f"set {len(names) - len(refused)} parameters of {self._target}"
-        )
-        self._changed.trigger()  # other parameters may be wanted by now
+        def take_answer(call: Any) -> None:  # noqa: ANN401
+            if call is not self._call or call.exception() is not None:
+                return
+            self._call, self._set = None, (endpoints, version)
+            names, logger = [parameter.name for parameter in wanted], self._node.get_logger()
+            refused = [
+                f"{name}: {result.reason or 'no reason given'}"
+                for name, result in zip(names, call.result().results, strict=False)
+                if not result.successful
+            ]
+            for line in refused:
+                logger.error(one_line(f"{self._target} refused {line}"))
+            logger.info(f"set {len(names) - len(refused)} parameters of {self._target}")
+            self._changed.trigger()  # other parameters may be wanted by now
+
+        self._call.add_done_callback(take_answer)
 
 
 def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401
@@ -146,7 +139,7 @@ def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401
         raise type(error)(f"parameter {name}: {error}") from None
 
 
-# ---- ``demandops parameter-sync``: keep a ROS node's parameters equal to those in a ConfigMap ----
+# ---- the command ----
 
 # The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
 # without its `period`, because a watch does not poll.

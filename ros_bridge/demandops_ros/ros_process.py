@@ -57,10 +57,7 @@ class ExecutorThread:
 
 @contextmanager
 def stop_signals() -> Iterator[Callable[[], None]]:
-    """Yield a function that waits for Ctrl-C or SIGTERM.
-
-    After the function has returned, a further signal ends the process at once.
-    """
+    # a function that waits for Ctrl-C or SIGTERM; after it, a further one ends the process at once
     over = REAL.event()
     numbers = (signal.SIGINT, signal.SIGTERM)
     before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
@@ -100,7 +97,6 @@ class RosLogHandler(logging.Handler):
 def started(
     arguments: Sequence[str], signals: SignalHandlerOptions = SignalHandlerOptions.ALL
 ) -> Iterator[list[str]]:
-    """Run the block with ROS initialized, and yield its arguments."""
     ros_args = list(arguments)
     if ros_args and ros_args[0] != "--ros-args":
         raise click.UsageError(
@@ -124,7 +120,6 @@ def started(
 
 
 def log_to(logger: RcutilsLogger, level: str) -> None:
-    """Pass the generator's log records of at least this level to a logger of ROS."""
     set_logger_level(logger.name, LoggingSeverity[level.upper()])
     library_log = logging.getLogger("demandops")
     library_log.handlers, library_log.propagate = [RosLogHandler(logger)], False

@@ -173,10 +173,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
 
 
 def _run(
-    generator: Generator,
-    settings: dict[str, Any],
-    status: RolloutWatcher | None,
-    signals: _Signals,
+    generator: Generator, settings: dict[str, Any], status: RolloutWatcher | None, signals: _Signals
 ) -> None:
     node = DemandNode(
         generator,
@@ -249,8 +246,7 @@ class _Signals:
             os._exit(ExitCode.PROGRAM_ERROR)  # an orderly exit could answer goals
 
     def wake(self) -> None:
-        """Make :meth:`wait` check again; any thread may call this."""
-        os.write(self._write, b"\0")
+        os.write(self._write, b"\0")  # any thread may call this
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.stopping:

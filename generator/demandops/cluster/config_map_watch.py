@@ -34,11 +34,8 @@ class ConfigMapWatch:
         kubeconfig: Path | None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Start to watch; ``on_data`` is called from the thread of the watch.
-
-        The ConfigMap need not exist yet. Without a kubeconfig, this process must be a pod in the
-        cluster.
-        """
+        # ``on_data`` is called from the thread of the watch. The ConfigMap need not exist yet.
+        # Without a kubeconfig, this process must be a pod in the cluster.
         self._name, self._on_data = f"ConfigMap {namespace}/{name}", on_data
         self._request = {"namespace": namespace, "field_selector": f"metadata.name={name}"}
         if kubeconfig is None:

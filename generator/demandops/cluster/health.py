@@ -1,7 +1,8 @@
 """The health of releases, from the objects of Flux or Argo CD. Pure.
 
-The reader is chosen for each :class:`ClusterDomain`, so a state repo may switch from one controller
-to the other while rollouts are followed.
+Objects are plain data as the Kubernetes API returns them. The reader is chosen for each
+:class:`ClusterDomain`, so a state repo may switch from one controller to the other while rollouts
+are followed.
 """
 
 from __future__ import annotations
@@ -14,7 +15,6 @@ from typing import Any, Literal, NamedTuple, Protocol
 from demandops.render.gitops import bootstrap_path
 
 # ---- the part that is the same for Flux and Argo CD ----
-
 
 Level = Literal["pushed", "reconciled", "healthy"]
 State = Literal["waiting", "reconciled", "healthy"]
@@ -72,11 +72,8 @@ class History(Protocol):
 
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or a descendant of ``other``."""
-        ...
 
-    def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` exists in two commits with equal content."""
-        ...
+    def unchanged(self, commit: str, other: str, path: str) -> bool: ...
 
 
 def worst(healths: list[Health]) -> Health:
@@ -92,12 +89,11 @@ class HealthReader(ABC):
     service_kind: str  # of the object that represents a service
 
     @abstractmethod
-    def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects on which the health of a domain and of its releases depends."""
+    def objects_to_watch(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]: ...
 
     def objects_to_confirm(self, domain: ClusterDomain) -> tuple[ObjectSelector, ...]:
-        """Return the objects to read again before a release counts as healthy."""
-        # in this order: a service object that is ready counts with Deployments read after it
+        # Read again before a release counts as healthy, in this order: a service object that is
+        # ready counts with Deployments that are read after it.
         kinds = (self.service_kind, "Deployment")
         return tuple(ObjectSelector(kind, domain.namespace) for kind in kinds)
 
@@ -108,7 +104,6 @@ class HealthReader(ABC):
         """Return ``waiting`` until a domain has applied ``commit``, then ``reconciled``."""
 
     def health(self, target: Target, commit: str, objects: Objects, history: History) -> Health:
-        """Return the health of a release: ``waiting`` until its domain has applied ``commit``."""
         domain = self.domain_health(target.domain, commit, objects, history)
         if domain.state == "waiting":
             return domain
@@ -156,16 +151,14 @@ class HealthReader(ABC):
     @abstractmethod
     def _service_health(
         self, target: Target, item: Object, commit: str, objects: Objects, history: History
-    ) -> Health:
-        """Return the health of a service whose object exists."""
+    ) -> Health: ...
 
     @abstractmethod
     def _service_state(self, status: Object) -> Object:
         """Return the part of a service object's status that has ``lastTransitionTime``."""
 
     @abstractmethod
-    def _owns(self, target: Target, deployment: Object) -> bool:
-        """Return whether a service's release owns a Deployment."""
+    def _owns(self, target: Target, deployment: Object) -> bool: ...
 
     def _why_not_removed(self, item: Object) -> str:
         """Return why the controller fails to remove a service; empty if no failure is known."""
@@ -182,13 +175,11 @@ class HealthReader(ABC):
 
 
 def name_of(key: Key) -> str:
-    """Return kind, namespace and name of an object as text: ``Deployment perception/od-edge``."""
     kind, namespace, name = key
     return f"{kind} {namespace}/{name}"
 
 
 def deployment_health(deployment: Object) -> Health:
-    """Return ``healthy`` if all replicas are available and run the current spec."""
     metadata, status = deployment["metadata"], deployment.get("status") or {}
     name = name_of(("Deployment", metadata.get("namespace"), metadata.get("name")))
     replicas = (deployment.get("spec") or {}).get("replicas")
@@ -206,7 +197,6 @@ def deployment_health(deployment: Object) -> Health:
 
 
 def why_unavailable(pods: Iterable[Any]) -> str:
-    """Return why pods do not run, as a container or the scheduler reports; empty if unknown."""
     for pod in pods:
         for container in pod.status.container_statuses or ():
             waiting = container.state.waiting if container.state else None
@@ -220,15 +210,14 @@ def why_unavailable(pods: Iterable[Any]) -> str:
 
 
 def condition(status: Object, kind: str) -> Object:
-    """Return the condition of type ``kind`` in a status; empty if there is none."""
     conditions = status.get("conditions") or ()
     return next((item for item in conditions if item.get("type") == kind), {})
 
 
-# ---- the health of releases, from Flux's objects. Pure ----
+# ---- Flux ----
 #
-# Objects are plain data as the Kubernetes API returns them. The field names are those of Flux 2.9
-# (kustomize.toolkit.fluxcd.io/v1, helm.toolkit.fluxcd.io/v2).
+# The field names are those of Flux 2.9 (kustomize.toolkit.fluxcd.io/v1,
+# helm.toolkit.fluxcd.io/v2).
 
 # The annotation that makes a controller reconcile an object now.
 REQUESTED_AT = "reconcile.fluxcd.io/requestedAt"
@@ -281,7 +270,6 @@ class Flux(HealthReader):
         return (labels.get(_APPLIED_IN), labels.get(_APPLIED_BY)) == self.follower(domain)[1:]
 
     def handled_request(self, domain: ClusterDomain, objects: Objects) -> str:
-        """Return the time stamp of the last fetch request that the source handled, or empty."""
         return _handled(self._source(domain, objects) or {})
 
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
@@ -294,7 +282,7 @@ class Flux(HealthReader):
         # what does not exist or is suspended never fetches, and must not hold up the next request
         if kustomization is None or source is None:
             return True
-        if any((each.get("spec") or {}).get("suspend") for each in (kustomization, source)):
+        if any((item.get("spec") or {}).get("suspend") for item in (kustomization, source)):
             return True
         asked = (source["metadata"].get("annotations") or {}).get(REQUESTED_AT, "")
         handled = _handled(source)
@@ -322,7 +310,7 @@ class Flux(HealthReader):
             return Health("reconciled", str(ready.get("message", "")), name, failing=True)
         if not current or ready.get("status") != "True":
             return Health("reconciled", str(ready.get("message") or "is being installed"), name)
-        return worst([deployment_health(each) for each in self._deployments(target, objects)])
+        return worst([deployment_health(owned) for owned in self._deployments(target, objects)])
 
     def _service_state(self, status: Object) -> Object:
         return condition(status, "Ready")
@@ -336,7 +324,7 @@ def _source_name(kustomization: Object) -> str:
 
 
 def _commit(revision: object) -> str:
-    """Return the commit of a Flux revision (``main@sha1:…``)."""
+    # Flux writes a revision as main@sha1:…
     return str(revision or "").rpartition(":")[2]
 
 
@@ -344,15 +332,14 @@ def _handled(source: Object) -> str:
     return str((source.get("status") or {}).get("lastHandledReconcileAt", ""))
 
 
-# ---- the health of releases, from Argo CD's objects. Pure ----
+# ---- Argo CD ----
 #
-# Objects are plain data as the Kubernetes API returns them. The field names are those of Argo CD
-# 3.2 (argoproj.io/v1alpha1). The status of an Application lags behind its spec. So a status counts
-# only if its ``sync.comparedTo`` holds the source of the current spec.
+# The field names are those of Argo CD 3.2 (argoproj.io/v1alpha1). The status of an Application lags
+# behind its spec. So a status counts only if its ``sync.comparedTo`` holds the source of the
+# current spec.
 
 _TRACKED_BY = "argocd.argoproj.io/tracking-id"
-# A reason lists at most this many objects on which a sync failed.
-_DETAILS = 3
+_DETAILS = 3  # a reason lists at most this many objects on which a sync failed
 
 
 class ArgoCd(HealthReader):
@@ -402,7 +389,22 @@ class ArgoCd(HealthReader):
             return Health("reconciled", "is being removed and will then be created again", name)
         outdated = _why_outdated(target.domain, item, commit, objects, history)
         if not outdated and _status(item, "sync").get("status") == "Synced":
-            return _synced_health(item, name, objects)
+            for resource in (item.get("status") or {}).get("resources") or ():
+                if resource.get("kind") != "Deployment":
+                    continue
+                namespace, deployment = resource.get("namespace", ""), resource.get("name", "")
+                key = ("Deployment", str(namespace), str(deployment))
+                if key not in objects:
+                    return Health("reconciled", "does not exist yet", name_of(key))
+                health = deployment_health(objects[key])
+                if health.state != "healthy":
+                    return health
+            reported = _status(item, "health")
+            level = reported.get("status")
+            if level == "Healthy":
+                return Health("healthy")
+            reason = str(reported.get("message") or f"its health is {level or 'not known yet'}")
+            return Health("reconciled", reason, name, failing=level == "Degraded")
         message, _ = _failure(item)
         if message:
             return Health("reconciled", message, name, failing=True)
@@ -465,24 +467,6 @@ def _why_outdated(
     return "has not applied the commit's chart yet"
 
 
-def _synced_health(app: Object, name: str, objects: Objects) -> Health:
-    for item in (app.get("status") or {}).get("resources") or ():
-        if item.get("kind") != "Deployment":
-            continue
-        key = ("Deployment", str(item.get("namespace", "")), str(item.get("name", "")))
-        if key not in objects:
-            return Health("reconciled", "does not exist yet", name_of(key))
-        health = deployment_health(objects[key])
-        if health.state != "healthy":
-            return health
-    reported = _status(app, "health")
-    if reported.get("status") == "Healthy":
-        return Health("healthy")
-    level = reported.get("status")
-    reason = str(reported.get("message") or f"its health is {level or 'not known yet'}")
-    return Health("reconciled", reason, name, failing=level == "Degraded")
-
-
 def _failure(app: Object) -> tuple[str, str]:
     """Return why an Application fails, or an empty text, and for which commit, if it is known."""
     operation = _status(app, "operationState")
@@ -501,7 +485,6 @@ def _failure(app: Object) -> tuple[str, str]:
 
 
 def _sync_message(operation: Object) -> str:
-    """Return the message of a failed sync, with those of failed objects that it lacks."""
     message = str(operation.get("message", ""))
     failed = [
         item
@@ -517,7 +500,6 @@ def _sync_message(operation: Object) -> str:
 
 
 def _error(app: Object) -> str:
-    """Return the first error among the conditions of an Application, or an empty text."""
     for item in (app.get("status") or {}).get("conditions") or ():  # the others are warnings
         if str(item.get("type", "")).endswith("Error"):
             return f"{item['type']}: {item.get('message', '')}"
@@ -533,7 +515,6 @@ def _requested_sync(operation: Object) -> Object:
 
 
 def _same(source: object, other: object) -> bool:
-    """Return whether two sources are equal apart from empty fields."""
     try:  # Argo CD may omit an empty field or write it
         return _without_empty(source) == _without_empty(other)
     except RecursionError:  # nothing that the generator renders is nested so deeply
@@ -549,13 +530,5 @@ def _without_empty(value: object) -> object:
     return value
 
 
-# ---- the health of releases, computed from a cluster's objects. Pure ----
-#
-# Flux and Argo CD each have a reader. The reader is chosen for each :class:`ClusterDomain`, so a
-# state repo may switch from one controller to the other while rollouts are followed.
-
-_ARGOCD, _FLUX = ArgoCd(), Flux()
-
-
 def health_reader(domain: ClusterDomain) -> HealthReader:
-    return _ARGOCD if domain.application else _FLUX
+    return ArgoCd() if domain.application else Flux()

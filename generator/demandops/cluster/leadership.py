@@ -21,10 +21,8 @@ from demandops.cluster.clusters_file import own_cluster_api
 
 log = logging.getLogger("demandops")
 
-# How long a Lease is valid if nobody renews it.
-_LEASE_S = 15
-# A leader that has not renewed its Lease for so long ends its process.
-_RENEW_WITHIN_S = 10
+_LEASE_S = 15  # how long a Lease is valid if nobody renews it
+_RENEW_WITHIN_S = 10  # a leader that has not renewed its Lease for so long ends its process
 # How long a call of the API may take. A renewal has two calls, and must end before the Lease does:
 # _RENEW_WITHIN_S + 2 * _CALL_S < _LEASE_S.
 _CALL_S = 2
@@ -50,9 +48,8 @@ class Leadership:
         """
         name = _NAME.fullmatch(lease)
         if name is None:
-            raise InvalidInput.at(
-                "--leader-lease", f"{quoted(lease)} names no Lease; write NAMESPACE/NAME"
-            )
+            message = f"{quoted(lease)} names no Lease; write NAMESPACE/NAME"
+            raise InvalidInput.at("--leader-lease", message)
         self._request = {
             "group": "coordination.k8s.io",
             "version": "v1",
@@ -96,7 +93,6 @@ class Leadership:
             self._require_renewed()  # a renewal that begins now could end too late
 
     def _compete(self) -> None:
-        """Renew the Lease, or become the leader if it is free and this process may lead."""
         lease = self._read()
         spec = lease.get("spec") or {}
         holder = spec.get("holderIdentity") or ""

@@ -60,7 +60,6 @@ class ObjectCache:
             return dict(self._objects)
 
     def why_unknown(self, wanted: Iterable[ObjectSelector]) -> str:
-        """Return why some of the ``wanted`` objects are unknown now; empty if all are known."""
         with self._lock:
             for selector in wanted:
                 if selector in self._errors:
@@ -70,7 +69,6 @@ class ObjectCache:
         return ""
 
     def unknown_health(self, domain: ClusterDomain) -> Health | None:
-        """Return a health that says why a domain's objects are unknown, if they are."""
         reason = self.why_unknown(health_reader(domain).objects_to_watch(domain))
         if not reason:
             return None
@@ -94,14 +92,12 @@ class ObjectCache:
             self._unread = reason
 
     def refresh(self, wanted: Iterable[ObjectSelector]) -> None:
-        """Read the ``wanted`` objects now; the errors of the library are raised."""
         # one after the other, because watches lag behind each other: the objects that the caller
         # names last are then the newest
         for selector in wanted:
             self._read(selector)
 
     def pods(self, namespace: str, deployment: str) -> list[Any]:
-        """Read the pods of a Deployment in the cache; the errors of the library are raised."""
         from kubernetes import client  # noqa: PLC0415 - slow (half a second), so only on use
 
         item = self.objects().get(("Deployment", namespace, deployment)) or {}
@@ -135,7 +131,19 @@ class ObjectCache:
                 ):
                     if self._closed.is_set():
                         return
-                    self._apply(selector, event)
+                    if event["type"] not in ("ADDED", "MODIFIED", "DELETED"):
+                        continue
+                    item = event["object"]
+                    key = (selector.kind, selector.namespace, item["metadata"]["name"])
+                    with self._lock:
+                        cached = self._objects.get(key)
+                        if cached is not None and _version(item) < _version(cached):
+                            continue  # `refresh` has read a newer version
+                        if event["type"] == "DELETED":
+                            self._objects.pop(key, None)
+                        else:
+                            self._objects[key] = item
+                    self._on_change()
                 pause = _FIRST_PAUSE_S
             except Exception as error:  # the library raises errors of many kinds
                 self._set_error(selector, _reason(selector, error))
@@ -149,7 +157,7 @@ class ObjectCache:
             return self._client
 
     def _read(self, selector: ObjectSelector) -> str:
-        """Read the selected objects into the cache; return the resource version of the list."""
+        # the result is the resource version of the list
         listed = self._api().list_namespaced_custom_object(
             **_request(selector), _request_timeout=(_CONNECT_S, _WATCH_S)
         )
@@ -164,21 +172,6 @@ class ObjectCache:
             self._known.add(selector)
         return str(listed["metadata"]["resourceVersion"])
 
-    def _apply(self, selector: ObjectSelector, event: dict[str, Any]) -> None:
-        item = event["object"]
-        if event["type"] not in ("ADDED", "MODIFIED", "DELETED"):
-            return
-        key = (selector.kind, selector.namespace, item["metadata"]["name"])
-        with self._lock:
-            cached = self._objects.get(key)
-            if cached is not None and _version(item) < _version(cached):
-                return  # `refresh` has read a newer version
-            if event["type"] == "DELETED":
-                self._objects.pop(key, None)
-            else:
-                self._objects[key] = item
-        self._on_change()
-
     def _set_error(self, selector: ObjectSelector, reason: str) -> None:
         with self._lock:
             is_new = reason and reason not in self._errors.values()
@@ -192,17 +185,16 @@ class ObjectCache:
 
 
 def _request(selector: ObjectSelector) -> dict[str, str]:
-    names = ("group", "version", "plural")
-    request = {
-        **dict(zip(names, _KINDS[selector.kind], strict=True)),
-        "namespace": selector.namespace,
-    }
-    # a call for one object needs fewer rights than a call for all objects of a namespace
-    return request | ({"field_selector": f"metadata.name={selector.name}"} if selector.name else {})
+    group, version, plural = _KINDS[selector.kind]
+    request = {"group": group, "version": version, "plural": plural}
+    request["namespace"] = selector.namespace
+    if selector.name:  # a call for one object needs fewer rights than for a whole namespace
+        request["field_selector"] = f"metadata.name={selector.name}"
+    return request
 
 
 def _is_answer(error: Exception) -> bool:
-    """Return whether the cluster answered with this error, so that it is reachable."""
+    # the library gives the HTTP status only of an error with which the cluster answered
     return bool(getattr(error, "status", None))
 
 

@@ -32,25 +32,16 @@ from demandops.render.gitops import domain_folder, domains_in_use, project_of
 # A call to Argo CD is a push event in GitHub's format. Argo CD compares the repository of the event
 # with the source of each Application.
 
-
 _TIMEOUT_S = 5.0
 _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
 _NO_COMMIT = "0" * 40
 
 
-def call_flux(url: str, secret: bytes | None) -> None:
-    # a Receiver ignores the body
-    _send(url, b"{}", secret, "X-Signature", {})
-
-
 def call_argocd(
     url: str, secret: bytes | None, repo: str, before: str, after: str, paths: Iterable[str] | None
 ) -> None:
-    """Report to Argo CD that a repository's main branch moved, or raise NoAnswer.
-
-    Argo CD fetches the state repo from ``repo``. ``before`` is the commit of the last call, if
-    there was one. With None as ``paths``, Argo CD refreshes all Applications of the repo.
-    """
+    # Argo CD fetches the state repo from ``repo``. ``before`` is the commit of the last call, if
+    # there was one. With None as ``paths``, Argo CD refreshes all Applications of the repo.
     event = {
         "ref": f"refs/heads/{MAIN_BRANCH}",
         "before": before or _NO_COMMIT,
@@ -81,7 +72,7 @@ def web_address(repo: str) -> str:
 
 
 def signature(secret: bytes, body: bytes) -> str:
-    """Return the HMAC of a body, in the format that Flux and Argo CD expect."""
+    # in the format that Flux and Argo CD expect
     return f"sha256={hmac.new(secret, body, hashlib.sha256).hexdigest()}"
 
 
@@ -96,9 +87,7 @@ def _send(
         raise NoAnswer(f"it answered {answer.status}")
 
 
-# ---- reconcile trigger ----
-#
-# Wakes Flux or Argo CD after a push, so that it fetches at once and not at its next interval.
+# ---- the calls after a push ----
 #
 # Waking is optional and blocks nothing. If a cluster does not answer, the trigger logs the failure
 # and tries again for a minute. After that, the controller fetches at its next interval.
@@ -171,7 +160,6 @@ class ReconcileTrigger:
         self._thread = runtime.keep_running("wake", self._run)
 
     def __call__(self, config: Config) -> None:
-        """Plan to wake the clusters after a push; return at once."""
         self._config = config
         self._pushed = True
         self._changed.set()
@@ -234,9 +222,8 @@ class ReconcileTrigger:
                     flux.is_idle(_on_cluster(wake, domain), objects, wake.handled.get(domain.name))
                     for domain in wake.domains
                 )
-            except (
-                Exception
-            ) as error:  # an odd object must not keep other clusters from being woken
+            # an odd object must not keep other clusters from being woken
+            except Exception as error:
                 log.debug("the objects of cluster '%s' cannot be read: %r", wake.cluster, error)
         if not is_idle:
             wake.idle_from = inf
@@ -282,13 +269,16 @@ class ReconcileTrigger:
             if paths is not None:
                 # Name a file in each domain's folder too: Argo CD refreshes only Applications
                 # with changed files, and only a refreshed Application reports the new commit.
-                paths = [path for path in paths if _concerns(path, name)]
+                # Files of the ledger and of other clusters concern no Application of this cluster.
+                own, others = f"clusters/{name}/", ("clusters/", "ledger/")
+                paths = [p for p in paths if p.startswith(own) or not f"{p}/".startswith(others)]
                 folders = [domain_folder(name, domain) for domain in wake.domains]
                 paths += [f"{folder}/_domain.yaml" for folder in folders]
             call_argocd(access.webhook, access.secret(), argocd.url, before, commit, paths)
             self._reported[name] = commit
         elif access.receiver and not argocd:
-            call_flux(access.receiver, access.secret())
+            # a Receiver ignores the body
+            _send(access.receiver, b"{}", access.secret(), "X-Signature", {})
         elif access.kubeconfig:
             if name not in self._apis:
                 self._apis[name] = access.api()
@@ -317,16 +307,9 @@ class ReconcileTrigger:
 
 
 def _followed(domains: tuple[AccessDomain, ...]) -> list[ObjectSelector]:
-    """Return the objects that show whether Flux is busy."""
     kinds = ("GitRepository", "Kustomization")
     return [ObjectSelector(kind, domain.namespace) for domain in domains for kind in kinds]
 
 
 def _on_cluster(wake: _Wake, domain: AccessDomain) -> ClusterDomain:
     return ClusterDomain(wake.cluster, domain.name, domain.namespace)
-
-
-def _concerns(path: str, cluster: str) -> bool:
-    # files of the ledger and of other clusters do not
-    first, _, rest = path.partition("/")
-    return rest.startswith(f"{cluster}/") if first == "clusters" else first != "ledger"

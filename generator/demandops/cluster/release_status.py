@@ -19,7 +19,7 @@ from demandops.cluster.health import (
 from demandops.cluster.object_cache import ObjectCache
 from demandops.render.gitops import bootstrap_path, digest_in, digest_of
 
-# ---- the clusters whose bootstrap file is older than the one in the state repo ----
+# ---- bootstrap files that are older on a cluster than in the state repo ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -42,7 +42,6 @@ def old_bootstraps(
     caches: Mapping[str, ObjectCache],
     read: Callable[[str], str | None],
 ) -> list[OldBootstrap]:
-    """Return the clusters without the current bootstrap file; skip domains that cannot be read."""
     clusters = []
     for cluster in sorted({domain.cluster for domain in domains} & caches.keys()):
         path = bootstrap_path(cluster)
@@ -61,7 +60,7 @@ def old_bootstraps(
     return clusters
 
 
-# ---- objects that a GitOps controller created and no longer removes, because it forgot them ----
+# ---- objects that a GitOps controller created and forgot, so that it never removes them ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,7 +95,6 @@ def orphans(
     caches: Mapping[str, ObjectCache],
     history: History,
 ) -> Iterator[Orphan]:
-    """Yield the objects that are left on clusters, sorted by cluster, domain and key."""
     needed = {(target.domain, health_reader(target.domain).key(target)) for target in targets}
     for domain in sorted(domains, key=lambda domain: (domain.cluster, domain.name)):
         store = caches.get(domain.cluster)
@@ -118,7 +116,7 @@ def orphans(
                 yield Orphan(domain.cluster, kind, namespace, name)
 
 
-# ---- the status of releases as their clusters report it, for the command line and the page ----
+# ---- the status of releases, for the command line and the page ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,8 +132,6 @@ class ReleaseStatus:
 
 
 _NO_ACCESS = ReleaseStatus(Health("waiting", "no access to this cluster"))
-
-
 # Returns the paths in which two commits differ, if that is known.
 ChangedPaths = Callable[[str, str], "Collection[str] | None"]
 

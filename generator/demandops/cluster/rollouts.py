@@ -18,7 +18,6 @@ from demandops.cluster.health import (
     History,
     Level,
     ObjectName,
-    Objects,
     Target,
     health_reader,
     why_unavailable,
@@ -36,18 +35,15 @@ from demandops.model.ledger.ledger import World
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import domains_in_use, project_of
 
-# ---- the releases that a demand needs or removes, as targets whose rollout can be followed ----
+# ---- the targets whose rollout can be followed ----
 
 
 def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]:
-    """Return the targets of the releases that a demand needs, changes or removes.
-
-    A release that only other demands need is left out, even if they share a subject with this one.
-    """
+    # of the releases that a demand needs, changes or removes; what only other demands need is left
+    # out, even if they share a subject with this one
     after, request = decision.state, decision.request
     active = without_suspended(after)
     claims = [*active.ledger.claims_of_demand(request.demand)]
-
     for demanded in request.demanded if request.adds_claims else ():
         for requester in demanded.requesters:
             claims += active.ledger.claims_held_by(requester, demanded.held.subject)
@@ -65,7 +61,6 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
 
 
 def targets_of_state(state: State) -> list[tuple[Release, Target]]:
-    """Return every release of a state with its target, sorted by cluster and name."""
     releases = []
     for key in all_keys(state):
         release = plan(state, key)
@@ -76,7 +71,6 @@ def targets_of_state(state: State) -> list[tuple[Release, Target]]:
 
 
 def domains_of_state(state: State) -> list[ClusterDomain]:
-    """Return every access domain of each cluster, including domains without releases."""
     settings = state.config.repo_settings
     return [
         cluster_domain(cluster, domain, settings)
@@ -96,7 +90,7 @@ def target_of(release: Release, repository: RepoSettings, *, wanted: bool = True
     return Target(domain, release.name, isinstance(release, ServiceRelease), wanted)
 
 
-# ---- follows releases on their clusters until they are reconciled or healthy, as requested ----
+# ---- following until a release is reconciled or healthy, as requested ----
 #
 # One thread evaluates the rollouts whenever a watch reports a change. An unreachable cluster delays
 # only its own rollouts.
@@ -127,10 +121,7 @@ class _Rollout:
 
 class RolloutWatcher:
     def __init__(
-        self,
-        clusters: Mapping[str, ClusterAccess],
-        history: History,
-        runtime: Runtime = REAL,
+        self, clusters: Mapping[str, ClusterAccess], history: History, runtime: Runtime = REAL
     ) -> None:
         """Start; a domain is watched from its first rollout on, if its cluster has a kubeconfig."""
         self._history, self._runtime = history, runtime
@@ -146,7 +137,6 @@ class RolloutWatcher:
         self._thread = runtime.keep_running("status", self._run)
 
     def why_unreachable(self, domains: Iterable[ClusterDomain]) -> str:
-        """Return why releases in these domains cannot be followed; empty if they can."""
         missing = sorted({domain.cluster for domain in domains} - set(self._caches))
         return f"no access to cluster {', '.join(missing)}" if missing else ""
 
@@ -161,8 +151,7 @@ class RolloutWatcher:
         """Follow releases of a published commit; return at once.
 
         :meth:`why_unreachable` must be empty for their domains. The future has the health when it
-        reaches ``level``, after the timeout in seconds, or at :meth:`close`. If the health is not
-        at ``level`` then, it says why. ``on_progress`` is called from the status thread.
+        reaches ``level``, or when the time is over or this watcher is closed; it then says why.
         """
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))
@@ -176,7 +165,6 @@ class RolloutWatcher:
         return rollout.future
 
     def close(self) -> None:
-        """Stop all watches, and resolve the open futures with the current health."""
         self._closed = True
         self._changed.set()
         self._thread.join(5)
@@ -201,9 +189,15 @@ class RolloutWatcher:
             if rollout.busy and not last:
                 continue
             try:
-                health = worst(
-                    [self._health(rollout, target, objects) for target in rollout.targets]
-                )
+                healths = list[Health]()
+                for target in rollout.targets:
+                    domain = target.domain
+                    reader, there = health_reader(domain), objects[domain.cluster]
+                    healths.append(
+                        self._caches[domain.cluster].unknown_health(domain)
+                        or reader.health(target, rollout.commit, there, self._history)
+                    )
+                health = worst(healths)
             except Exception as error:  # an odd object must not keep other rollouts from an answer
                 log.debug("a status cannot be read: %r", error)
                 health = Health("waiting", "the status on the cluster cannot be read", failing=True)
@@ -212,7 +206,15 @@ class RolloutWatcher:
             if health.reaches("healthy") and not (rollout.confirmed or last):
                 self._in_background(rollout, self._confirm)
                 continue
-            self._report(rollout, health)
+            states = [
+                (level, level) for level in ("reconciled", "healthy") if health.reaches(level)
+            ]
+            if health.failing:
+                states.append(("failing", f"{health.object}: {health.reason}"))
+            for state, text in states:
+                if text not in rollout.reported:
+                    rollout.reported.add(text)
+                    rollout.on_progress(state, text)
             rollout.failed = health if health.failing else rollout.failed
             if health.reaches(rollout.level) or last:
                 self._resolve(rollout, health)
@@ -263,19 +265,3 @@ class RolloutWatcher:
                 return
             self._open.remove(rollout)
         rollout.future.set_result(health)
-
-    def _health(self, rollout: _Rollout, target: Target, objects: Mapping[str, Objects]) -> Health:
-        domain = target.domain
-        return self._caches[domain.cluster].unknown_health(domain) or health_reader(domain).health(
-            target, rollout.commit, objects[domain.cluster], self._history
-        )
-
-    @staticmethod
-    def _report(rollout: _Rollout, health: Health) -> None:
-        states = [(level, level) for level in ("reconciled", "healthy") if health.reaches(level)]
-        if health.failing:
-            states.append(("failing", f"{health.object}: {health.reason}"))
-        for state, text in states:
-            if text not in rollout.reported:
-                rollout.reported.add(text)
-                rollout.on_progress(state, text)

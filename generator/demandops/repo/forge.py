@@ -186,7 +186,6 @@ class Gitea(Forge):
 
 
 def forge_for(proposals: Proposals, token_file: Path | None) -> Forge | None:
-    """Return the GitHub or Gitea that ``demandops.yaml`` names; None if it names neither."""
     if proposals.forge not in ("github", "gitea") or proposals.url is None:
         return None
     if token_file is None:

@@ -25,8 +25,7 @@ from demandops.repo.git.signing import Signer
 from demandops.repo.history import commit_log, commit_message
 from demandops.templating.evaluator import EVALUATE
 
-# ---- the files of a new state repo: the skeleton, the appdefs and the rendered files ----
-
+# ---- the files: the skeleton, the appdefs and the rendered files ----
 
 EXAMPLE_URL = "https://git.example/fleet/state-repo.git"
 
@@ -40,10 +39,8 @@ _FIRST_STEP = (
 def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True) -> dict[str, str]:
     """Return the files of a new state repo, as path → text.
 
-    Args:
-        gitops: the GitOps controller, ``flux`` or ``argocd``.
-        url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
-        example: whether to include the fleet and the application of the paper's experiment.
+    Clusters fetch the repo from ``url``; if it is empty, no cluster can fetch it yet. The example
+    is the fleet and the application of the paper's experiment.
     """
     contents = _read_folder(data_folder("skeleton"), "")
     contents |= _read_folder(data_folder("appdefs"), "appdefs/")
@@ -62,7 +59,6 @@ def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True)
 
 
 def files_of_library(folder: str) -> dict[str, str]:
-    """Return the files of the library chart that ``init`` puts into ``folder``, as path → text."""
     appdefs = _read_folder(data_folder("appdefs"), "appdefs/")
     return {path: text for path, text in appdefs.items() if path.startswith(f"{folder}/")}
 
@@ -94,7 +90,7 @@ def _read_folder(folder: Path, prefix: str) -> dict[str, str]:
     }
 
 
-# ---- ``demandops init``: makes a new state repo from the skeleton, with its rendered files ----
+# ---- the repository with its first commit ----
 
 
 def init(  # noqa: PLR0913 - what a state repo begins with
@@ -108,18 +104,9 @@ def init(  # noqa: PLR0913 - what a state repo begins with
     schemas: Mapping[str, str] | None = None,
     signer: Signer | None = None,
 ) -> str:
-    """Make a state repo and return the id of its first commit, or make nothing.
+    """Make a state repo with the :func:`files`, and return its first commit, or make nothing.
 
-    Args:
-        target: the folder of the state repo; it must be empty or not exist.
-        bare: whether to make a bare repository, which the generator can use in place.
-        gitops: the GitOps controller, ``flux`` or ``argocd``.
-        url: the URL from which clusters fetch the repo; if empty, no cluster can fetch it yet.
-        example: whether to include the fleet and the application of the paper's experiment.
-        schemas: name → JSON Schema, which is written to the folder ``schemas/``.
-        signer: signs the first commit.
-
-    Raises InvalidInput if clusters cannot fetch from ``url``.
+    ``schemas`` are JSON Schemas by name. Raises InvalidInput if clusters cannot fetch from ``url``.
     """
     target = target.resolve()
     if target.exists() and (not target.is_dir() or any(target.iterdir())):

@@ -41,7 +41,6 @@ class Reader:
 
     @classmethod
     def of(cls, address: str, *, only_read: bool = True) -> Reader:
-        """Return a reader of the state repo at an address; of a checkout only if ``only_read``."""
         try:
             # The clone of a URL stays on the disk for later readers. It is in a folder of readers,
             # so that none takes over a generator's journal.
@@ -59,12 +58,10 @@ class Reader:
             raise
 
     def close(self) -> None:
-        """Release the clone of a URL, so that another process may use it."""
         if self._slot is not None:
             self._slot.close()
 
     def refresh(self) -> str:
-        """Fetch and return the newest commit, and let this reader read that commit from now on."""
         try:
             self._tip = self.repository.refresh()
         except (pygit2.GitError, KeyError, OSError) as error:
@@ -72,7 +69,7 @@ class Reader:
         return str(self._tip)
 
     def for_another_thread(self) -> Reader:
-        """Return a new reader at the same commit, without a fetch, for use in another thread."""
+        # at the same commit, without a fetch
         other = Reader(self.repository, self._tip)
         try:
             other._objects = self.repository.reopened()
@@ -84,7 +81,6 @@ class Reader:
         last_valid_config.refuse_other_render_version(self._objects, self._tip)
 
     def commit(self, revision: str | None = None) -> str:
-        """Return the id of the commit that a revision or a time names; by default the newest."""
         if not revision:
             return str(self._tip)
         return str(revisions.resolve(self._objects, self._tip, revision, REAL.now()).id)
@@ -92,10 +88,6 @@ class Reader:
     def snapshot(
         self, revision: str | None = None, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Return the state in effect at a commit (:func:`state_in_effect.snapshot_at`).
-
-        The faults of the InvalidInput that this may raise have the numbers of their lines.
-        """
         commit = self.commit(revision)
         try:
             return state_in_effect.snapshot_at(self._objects, commit, progress)
@@ -105,17 +97,13 @@ class Reader:
     def last_valid_snapshot(
         self, revision: str, progress: Progress = lambda done, total: None
     ) -> Snapshot:
-        """Return the snapshot of a commit, with the last valid versions of invalid files.
-
-        Unlike :meth:`snapshot`, this works before a generator has quarantined the files.
-        """
+        # unlike `snapshot`, this works before a generator has quarantined the invalid files
         try:
             return self.snapshot(revision, progress)
         except InvalidInput:
             return state_in_effect.state_at(self._objects, self.commit(revision), progress)
 
     def snapshot_after(self, before: Snapshot) -> Snapshot:
-        """Return :meth:`last_valid_snapshot` of the newest commit, if possible from ``before``."""
         is_recorded = state_in_effect.record_at(self._objects, self._tip).first("In-Force")
         if before.problems or is_recorded:
             return self.last_valid_snapshot(str(self._tip))
@@ -130,11 +118,9 @@ class Reader:
         )
 
     def problems_of(self, snapshot: Snapshot) -> tuple[last_valid_config.Problem | Fault, ...]:
-        """Return the problems that the generator reports, else those found while loading."""
         return self.problems(str(snapshot.commit)) or snapshot.problems
 
     def not_rendered(self, snapshot: Snapshot) -> frozenset[str]:
-        """Return the paths of the generated files that a generator has yet to write or remove."""
         # only a person's commit may leave such files, and rendering everything takes time
         commit = trees.commit_of(self._objects, snapshot.commit)
         if commit_log.is_by_generator(self._objects, commit):
@@ -154,7 +140,6 @@ class Reader:
         )
 
     def edited_files(self, before: str, after: Snapshot) -> list[str]:
-        """Return the files that differ between two commits and are more than demands, sorted."""
         # Files that are as rendered from the claims are left out, whoever committed them: anybody
         # can commit under the generator's name.
         old, new = self._tree(before), self._tree(str(after.commit))
@@ -182,11 +167,7 @@ class Reader:
         return last_valid_config.config_at(self._tree())
 
     def log(self, spec: str | None = None, path: str | None = None) -> Iterator[LogEntry]:
-        """Yield commits, newest first.
-
-        ``spec`` is ``REV`` for the commits up to REV, ``A..B`` for those after A up to B, or None
-        for all. With ``path``, yield only the commits that changed this file or folder.
-        """
+        # newest first; the commits up to REV, after A up to B in ``A..B``, or all
         since, until = self._sides(spec or "")
         if path is not None:
             changes = commit_log.changes_to(self._objects, until, path, since)
@@ -194,11 +175,7 @@ class Reader:
         return (entry for _, entry in commit_log.commits(self._objects, until, since))
 
     def revisions(self, spec: str | None) -> list[str]:
-        """Return the ids of the commits that ``spec`` names, oldest first.
-
-        ``spec`` is ``REV`` for one commit, ``A..B`` for the commits after A up to B, or None for
-        the newest commit.
-        """
+        # oldest first; the commit REV, those after A up to B in ``A..B``, or the newest one
         since, until = self._sides(spec or "")
         if since is None:
             return [until]
@@ -220,7 +197,6 @@ class Reader:
         whole: bool = False,
         progress: Progress = lambda done, total: None,
     ) -> list[Verdict]:
-        """Return a verdict on the files and the signature of each of ``commits``, oldest first."""
         verdicts = list[Verdict]()
         for verdict in verification.verify(self._objects, commits, whole=whole):
             verdicts.append(verdict)
@@ -241,7 +217,7 @@ class Reader:
         return sorted(path for path, _ in changed)
 
     def base_of(self, commit: str) -> str:
-        """Return the commit at which another commit, of a proposal, left main."""
+        # the commit at which another one, of a proposal, left main
         base = self._objects.merge_base(self._tip, trees.commit_of(self._objects, commit).id)
         return str(base or self._tip)
 
@@ -261,7 +237,6 @@ class Reader:
         return ledger_files.changes_node(self._objects, commit, node)
 
     def person_commits_behind(self, entry: LogEntry, most: int) -> list[LogEntry]:
-        """Return the newest commits by people that the generator's commit ``entry`` renders."""
         since, follows = entry.first("Since"), entry.first("Follows")
         if not (entry.by_generator and since and follows):
             return []
@@ -277,7 +252,7 @@ class Reader:
 
 @contextmanager
 def opened(address: str, *, only_read: bool = True) -> Iterator[Reader]:
-    """Yield a reader, and raise StateRepoError or Unsound also for errors during the block."""
+    # errors during the block become StateRepoError or Unsound too
     with (
         closing(Reader.of(address, only_read=only_read)) as reader,
         reading(address, reader.repository.objects),

@@ -42,8 +42,7 @@ from demandops.templating.evaluator import EVALUATE
 
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
-# The first render version whose claims mark the further topics of a source.
-_FIRST_WITH_MARKS = 2
+_FIRST_WITH_MARKS = 2  # the first render version whose claims mark the further topics of a source
 # How many parts the path ``clusters/<cluster>/<access domain>`` has.
 _FOLDER_DEPTH = 3
 _NAMES = {"flux": "Flux", "argocd": "Argo CD"}
@@ -51,27 +50,20 @@ _NAMES = {"flux": "Flux", "argocd": "Argo CD"}
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
-    """What an upgrade changes, besides rendering everything again."""
-
-    # the new GitOps controller; None keeps the current one
-    gitops: str | None = None
+    gitops: str | None = None  # the new GitOps controller; None keeps the current one
     # where a controller without a section in demandops.yaml fetches; None: as the current one does
     url: str | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Upgrade:
-    """The files that an upgrade changes, and the configuration before and after it."""
-
-    # of the upgrade, or the tip if no commit was made
-    commit: str
+    commit: str  # of the upgrade, or the tip if no commit was made
     old: Config
     new: Config
     files: Mapping[str, str | None]
 
     @property
     def switches(self) -> bool:
-        """Whether another GitOps controller reads the state repo from now on."""
         return self.old.repo_settings.gitops != self.new.repo_settings.gitops
 
 
@@ -81,7 +73,6 @@ def plan(
     now: datetime,
     progress: Progress = lambda done, total: None,
 ) -> Upgrade:
-    """Return what :func:`upgrade` would do, and write nothing."""
     with reader.opened(address) as repo:
         return _plan(repo.repository, request, now, progress)[0]
 
@@ -93,11 +84,7 @@ def upgrade(
     progress: Progress = lambda done, total: None,
     signer: Signer | None = None,
 ) -> Upgrade:
-    """Render everything again, and publish all changed files, if any, in one commit.
-
-    Raises InvalidInput if the state repo is not valid, or the request cannot be fulfilled.
-    ``progress`` is called with (files read, all files) while the ledger is read.
-    """
+    # InvalidInput is raised if the state repo is not valid, or the request cannot be fulfilled
     with reader.opened(address) as repo:
         repository = repo.repository
         repository.signer = signer
@@ -122,7 +109,7 @@ def upgrade(
 def _plan(
     repository: StateRepository, request: UpgradeRequest, now: datetime, progress: Progress
 ) -> tuple[Upgrade, CommitBatch, State, tuple[ClaimKey, ...]]:
-    """Return the upgrade, the batch and the state to commit, and the claims that may change."""
+    # the upgrade, the batch and the state to commit, and the claims that may change
     objects, tip = repository.objects, repository.tip()
     snapshot = snapshots.load(objects, tip, progress)
     batch, old = CommitBatch(repository, snapshot), snapshot.state.config
@@ -168,7 +155,6 @@ def _plan(
 
 
 def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    """Return the claim files and markers that change if this program writes them."""
     written = {}
     for path, text in files.items():
         new = text
@@ -183,7 +169,6 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
 
 
 def _root(text: str, config: Config, request: UpgradeRequest) -> str:
-    """Return the text of ``demandops.yaml`` with this render version and the requested changes."""
     repository = config.repo_settings
     gitops = request.gitops or repository.gitops
     try:

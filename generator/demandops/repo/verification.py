@@ -33,18 +33,12 @@ from demandops.repo.load.snapshot import changed_kept_replicas
 # A commit of the generator may change generated files, reports, and the claims that its message
 # names. Some operations may change further files.
 
-
 _OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
 # Operations that may record or forget recent shutdowns.
 _RECORDING = ("shutdown", "join", "rollback")
 # The folders of the ledger that have records, such as recent shutdowns, instead of claims.
 _RECORDS = tuple(
-    f"{root}/"
-    for root in (
-        records.MARKERS_ROOT,
-        records.SHUTDOWNS_ROOT,
-        records.REPLICAS_ROOT,
-    )
+    f"{root}/" for root in (records.MARKERS_ROOT, records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT)
 )
 # Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
@@ -53,11 +47,8 @@ _ENDING = ("follow", "upgrade", "expire-override")
 
 
 def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
-    """Yield the files that a commit of the generator changed, but was not allowed to change.
-
-    These are files that people write, claims of demands that the message does not name, claims in
-    another format than the generator's, and records that the commit's operation must not change.
-    """
+    # These are files that people write, claims of demands that the message does not name, claims in
+    # another format than the generator's, and records that the commit's operation must not change.
     if not commit.parents:  # `demandops init` writes everything
         return
     before, operation = commit.parents[0].tree, entry.first("Operation")
@@ -84,7 +75,7 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
 
 
 def _only_rewrites(commit: Commit, path: str) -> bool:
-    """Return whether a commit changed at most the schema of a claim and the start of its lease."""
+    # at most the schema of a claim and the start of its lease
     before, after = (
         ledger_files.valid_claim_at(tree, path) for tree in (commit.parents[0].tree, commit.tree)
     )
@@ -117,19 +108,16 @@ def _may_record(commit: Commit, path: str, operation: str) -> bool:
     return operation not in (*_REWRITING, *_ENDING) and (not text or is_canonical)
 
 
-# ---- verification ----
-#
-# Verifies commits: renders their generated files again, and compares them with the committed ones.
+# ---- rendering the files again, and comparing them with the committed ones ----
 #
 # A commit is verified whole or by differences. To verify a commit whole, the program loads and
 # renders everything. It does so for the first and the last commit, for each commit that records
 # invalid files, and for each commit whose configuration differs from that of the commit before.
 #
-# To verify a commit by differences, the program starts from the commit that it verified before. It
-# assumes that equal object ids mean equal files, and that plans and rendered files depend only on
-# their input. It does not rely on the generator's choice of the affected releases. Instead, it
-# plans and renders a release again if any input of the release's plan changed
-# (:mod:`.traced_plan`). Then it compares the ids of all generated files.
+# By differences, the program starts from the commit that it verified before. It assumes that equal
+# object ids mean equal files, and that plans and rendered files depend only on their input. It does
+# not rely on the generator's choice of the affected releases, but renders a release again if any
+# input of its plan changed (:class:`.TracedPlan`). Then it compares the ids of all generated files.
 
 _CHARTS = "/_charts/"
 
@@ -138,26 +126,19 @@ _CHARTS = "/_charts/"
 class Verdict:
     commit: str
     summary: str
-    # whether no fault was found, also in a commit that was skipped
-    holds: bool
-    # why the commit was not rendered again
-    skipped: str = ""
-    # the error of reading or rendering the commit again
-    fault: str = ""
-    # the generated files that differ from the rendered ones
-    differing: tuple[str, ...] = ()
+    holds: bool  # whether no fault was found, also in a commit that was skipped
+    skipped: str = ""  # why the commit was not rendered again
+    fault: str = ""  # the error of reading or rendering the commit again
+    differing: tuple[str, ...] = ()  # the generated files that differ from the rendered ones
     # the files that the commit changed, but was not allowed to change
     touched: tuple[str, ...] = ()
-    # whether the commit has a signature, valid or not
-    signed: bool = False
-    # who signed, if a signature is required and valid; else why it is not
-    signer: str = ""
+    signed: bool = False  # whether the commit has a signature, valid or not
+    signer: str = ""  # who signed, if a signature is required and valid; else why it is not
     signature: str = ""
 
 
 class _Proof:
-    """The files that a commit should have, rendered again to compare with its committed files."""
-
+    # the files that a commit should have, rendered again to compare with its committed files
     def __init__(self, state: State, commit: Commit) -> None:
         self.state, self._commit = state, commit
         self._plan = TracedPlan(state.config)
@@ -198,7 +179,6 @@ class _Proof:
         self._render(changes, kept)
 
     def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
-        """Render what changed claims, or changed kept replicas of instances, affect."""
         for key, release in self._plan.advance(self.state.ledger, changes, kept).items():
             self._planned.pop(key, None)
             self._held.pop(key, None)
@@ -231,7 +211,6 @@ class _Proof:
 
 
 def verify(repo: Repository, commits: Sequence[str], *, whole: bool = False) -> Iterator[Verdict]:
-    """Yield a verdict on each of ``commits``, whose oldest is first."""
     proof: _Proof | None = None
     for place, revision in enumerate(commits, 1):
         commit = trees.commit_of(repo, revision)
@@ -308,13 +287,10 @@ def _blob(text: str) -> Oid:
     return pygit2.hash(text.encode())
 
 
-# ---- commit signatures ----
-#
-# Checks the signatures of the commits that ``demandops verify`` judges; adds to its verdicts.
+# ---- signatures ----
 
 
 def with_signatures(repo: Repository, verdicts: Iterable[Verdict]) -> list[Verdict]:
-    """Return the verdicts; one of a generator's commit fails if it lacks a required signature."""
     pairs = [(verdict, trees.commit_of(repo, verdict.commit)) for verdict in verdicts]
     checks = signing.checks(repo, [commit for _, commit in pairs if entry_of(commit).by_generator])
     signed = []

@@ -110,7 +110,6 @@ class Demands:
 
     @property
     def must_not_wait(self) -> bool:
-        """Whether no wait or fetch may go on, as a demand is queued or the generator stops."""
         return self.has_queued or self._closed
 
     # ---- waiting for demands ----
@@ -125,25 +124,18 @@ class Demands:
         self._arrival.set()
 
     def wake(self) -> None:
-        """End the worker's wait even if no demand has arrived; any thread may call this."""
         with self._changed:
             self._woken = True
             self._changed.notify()
 
     def wait(self, timeout: float | None) -> bool:
-        """Wait until a demand is queued, :meth:`wake` or :meth:`close` is called, or time runs out.
-
-        Return false if no demand is queued and none will be.
-        """
+        """Wait for a demand, :meth:`wake` or :meth:`close`; false once no demand will come."""
         with self._changed:
             self._wait(timeout, self.must_not_wait)
             return self.has_queued or not self._closed
 
     def new_demands(self, timeout: float) -> list[Ticket]:
-        """Return the demands accepted since the last call of this method or of :meth:`take`.
-
-        If there are none, wait for one, up to ``timeout`` seconds.
-        """
+        """Return the demands accepted since this or :meth:`take` was called; wait if none is."""
         with self._changed:
             self._wait(timeout, bool(self._new))
             # after a failed write the state of the journal is unknown, so the process must end
@@ -157,7 +149,6 @@ class Demands:
         self._woken = False
 
     def take(self, batch: list[Ticket], limit: int) -> None:
-        """Journal the demands that arrived, and fill ``batch`` up to ``limit`` demands."""
         self._take_in()
         with self._changed:
             self._journal.require_sound()
@@ -166,11 +157,8 @@ class Demands:
             batch += [self._queue.popleft() for _ in range(room)]
 
     def put_back(self, batch: list[Ticket], served: Collection[Ticket]) -> None:
-        """Move the demands of a batch back to the front of the queue, and empty the batch.
-
-        The next batch then takes turns between these demands and the demands that other requesters
-        sent meanwhile. The requesters of ``served``, the demands that were evaluated, come last.
-        """
+        # The next batch takes turns between these demands and those that others sent meanwhile. The
+        # requesters of ``served``, the demands that were evaluated, come last.
         with self._changed:
             # `answer_withdrawn` answers the withdrawn ones
             left = [ticket for ticket in batch if ticket not in self._taken_back]
@@ -196,7 +184,6 @@ class Demands:
             self._take_in()
 
     def _take_in(self) -> None:
-        """Journal the demands that arrived; refuse those that cannot be accepted or journaled."""
         if not self._arrived:
             return
         taken, refused = list[Ticket](), list[tuple[Ticket, DemandOpsError]]()
@@ -258,15 +245,11 @@ class Demands:
         return None
 
     def commit(self, ticket: Ticket) -> bool:
-        """Mark a demand as committed; return whether it is, as it may be withdrawn already."""
         with self._changed:
             return _change(ticket, "committed")
 
     def propose(self, ticket: Ticket, record: ProposalRecord) -> bool:
-        """Journal the proposal of a demand and mark the demand as proposed.
-
-        Return whether it is: it may be withdrawn or answered already.
-        """
+        """Journal the proposal of a demand; false if it is withdrawn or answered already."""
         with self._changed:
             if not _may_become(ticket, "proposed"):
                 return False
@@ -276,7 +259,6 @@ class Demands:
             return _change(ticket, "proposed")
 
     def requeue(self, tickets: Iterable[Ticket]) -> None:
-        """Queue demands that were proposed but no longer need approval."""
         with self._changed:
             for ticket in tickets:
                 ticket.mark_maybe_published(ticket.base)  # a person may have merged it meanwhile
@@ -287,7 +269,6 @@ class Demands:
             self._changed.notify()
 
     def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand that is not committed or answered; return whether it is withdrawn."""
         self._take_in()
         with self._changed:
             ticket = self._tickets.get(operation)
@@ -320,10 +301,7 @@ class Demands:
         self.wake()  # the worker answers the demand even while nothing can be published
 
     def answer_withdrawn(self, batch: list[Ticket]) -> None:
-        """Answer the demands that were withdrawn while queued, and remove them from the batch.
-
-        Those that were withdrawn while proposed are answered after their branch is deleted.
-        """
+        # those that were withdrawn while proposed are answered after their branch is deleted
         with self._changed:
             withdrawn, self._taken_back = self._taken_back, []
             if not withdrawn:
@@ -335,7 +313,7 @@ class Demands:
     def answer(
         self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
     ) -> None:
-        """Answer each demand that has no answer; the journal forgets it unless ``keep`` is set."""
+        """Answer each demand without an answer; the journal forgets it unless ``keep`` is set."""
         results = list(results)
         # Notify before the journal forgets the demand. In the reverse order, a crash could lose
         # the refusal, because a refused demand has no commit.
@@ -377,11 +355,9 @@ class Demands:
                 ticket.future.set_exception(result)
 
     def fail(self, batch: Iterable[Ticket], error: DemandOpsError, keep: bool = False) -> None:
-        """Answer every demand with ``error``; with ``keep``, the demands stay in the journal."""
         self.answer([(ticket, error) for ticket in batch], keep)
 
     def end(self, error: Unsound) -> None:
-        """Accept no more demands, and answer all open ones with an error; keep the journal."""
         self.close()
         with self._changed:
             left = list(self._tickets.values())

@@ -31,12 +31,10 @@ from demandops.templating.evaluator import DEMAND_S, processor_time
 # evaluated on the newest tip, so a rollback works while others write. What others book until then
 # counts as newer than the commit to roll back to.
 
-
 _KIND = "Rollback"
 
 
 def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
-    """Return the goal to book the claims of the commit ``to`` again."""
     return {
         "apiVersion": API_VERSION,
         "kind": _KIND,
@@ -54,7 +52,6 @@ def is_rollback(goal: object) -> bool:
 def to_restoration(
     goal: dict[str, Any], repository: StateRepository, head: Snapshot
 ) -> Restoration:
-    """Return the restoration that a goal requests; Refused if ``head`` lacks its commit."""
     to = str(goal["to"])
     if not repository.includes(str(head.commit), to):
         message = f"commit {to} is not in the history of the state repo; roll back to one that is"
@@ -64,9 +61,7 @@ def to_restoration(
     return restoration(repository.objects, to, **more, by=by, email=email)
 
 
-# ---- evaluates one demand on top of the commits of its batch ----
-#
-# A demand that fails gets the error as its answer. The other demands of the batch continue.
+# ---- one demand; if it fails, the others of the batch continue ----
 
 log = logging.getLogger("demandops")
 
@@ -87,8 +82,7 @@ class Evaluator:
         """Decide a demand, commit it on the commit batch and return its result.
 
         A demand that needs approval gets no commit; its result is the decision. A receipt is true
-        only once the commit batch is published. Unavailable, PushDenied and Unsound are raised:
-        they concern all demands.
+        only once the batch is published. Errors that concern all demands are raised.
         """
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
@@ -152,16 +146,12 @@ class Evaluator:
             return internal(error)
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
-        """Return the results, oldest first, of the unanswered demands that main records already.
-
-        They have no answer because the process or the connection ended after the remote accepted
-        the push, or because an fsync failed.
-        """
+        # Oldest first, the results of those demands that main records already. They have no answer
+        # because the process or the connection ended after the push, or because an fsync failed.
         sought = {ticket.operation: ticket for ticket in batch if ticket.maybe_published}
         bases = dict.fromkeys(ticket.base for ticket in sought.values())
-        histories = [
-            (base, operations_since(self._repository.objects, tip, base)) for base in bases
-        ]
+        objects = self._repository.objects
+        histories = [(base, operations_since(objects, tip, base)) for base in bases]
         # all bases are ancestors of the tip, so the most outcomes are those since the oldest base
         since, recorded = max(histories, key=lambda history: len(history[1]), default=("", {}))
         published = [operation for operation in reversed(recorded) if operation in sought]

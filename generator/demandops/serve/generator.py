@@ -56,11 +56,7 @@ class Generator:
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Open the state repo, start the worker and resume the demands in the journal.
-
-        StateRepoError or InvalidInput is raised if the state repo, the key or the journal cannot be
-        used, and Unsound if a disk failed.
-        """
+        """Open the state repo, start the worker and resume the demands in the journal."""
         heartbeat = Heartbeat(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
         try:
@@ -96,6 +92,8 @@ class Generator:
             fetch_interval,
             heartbeat,
         )
+        self.fetch_now, self.withdraw = self._worker.fetch_now, self._demands.withdraw
+        self.includes, self.unchanged = repository.includes, repository.unchanged
         self._finished: Future[bool] | None = None
         self._stop_lock = runtime.lock()
         for operation in self.operations:
@@ -110,11 +108,9 @@ class Generator:
         return self._worker.snapshot
 
     def snapshot_at(self, revision: str) -> Snapshot:
-        """Return the state in effect at a commit or a time, without a fetch; this may take seconds.
+        """Return the state in effect at a commit or a time, without a fetch; it may take seconds.
 
-        Raises:
-            InvalidInput, StateRepoError: if there is no such commit, or it has files that are not
-                valid and that no generator has quarantined.
+        Raises InvalidInput or StateRepoError if there is none.
         """
         objects = self._repository.reopened()  # as libgit2's objects belong to one thread
         tip, now = self.snapshot.commit, self._runtime.now()
@@ -138,25 +134,19 @@ class Generator:
     def failures(self) -> dict[str, str]:
         return self._runtime.failures
 
-    def fetch_now(self) -> None:
-        self._worker.fetch_now()
-
     def submit(
         self,
         goal: object,
         operation: str | None = None,
         listener: Listener = lambda stage, text: None,
     ) -> Ticket:
-        """Queue a demand and return its ticket at once.
+        """Queue a demand and return its ticket at once, with every error in the ticket's future.
 
-        Every error of the demand is in the ticket's future. One that was not accepted has
-        ``ShuttingDown``, ``QueueFull``, ``Refused`` or ``StateRepoError``, and its listener is not
-        called. If the generator ends before the demand is published or approved, the error is
-        ``ShuttingDown`` or ``Unsound``, and the next start resumes the demand.
-
-        ``operation`` is an id that no other demand ever had; without one, an id is generated.
-        ValueError is raised if its characters are not allowed. ``listener`` is called in the worker
-        thread.
+        One that was not accepted has ``ShuttingDown``, ``QueueFull``, ``Refused`` or
+        ``StateRepoError``, and its listener is not called. If the generator ends before the demand
+        is published or approved, the error is ``ShuttingDown`` or ``Unsound``, and the next start
+        resumes the demand. ``operation`` is an id that no other demand ever had. ``listener`` is
+        called in the worker thread.
         """
         operation = operation or self._runtime.fresh_id()
         if not _OPERATION.fullmatch(operation):
@@ -184,39 +174,22 @@ class Generator:
         self._demands.arrive(ticket)
         return ticket
 
-    def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``other`` is ``commit`` or an ancestor; false if either is unknown."""
-        return self._repository.includes(commit, other)
-
-    def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` exists in two known commits with equal content."""
-        return self._repository.unchanged(commit, other, path)
-
     def changes_since(self, since: str) -> tuple[str, list[str] | None]:
-        """Return the newest published commit, and the paths that changed from ``since`` to it.
-
-        The paths are None if the commit ``since`` is unknown.
-        """
+        # the newest published commit, and the changed paths, None if ``since`` is unknown
         commit = str(self.snapshot.commit)
         return commit, self._repository.changed_paths(since, commit)
 
-    def withdraw(self, operation: str) -> bool:
-        """Withdraw a demand that is not committed or answered; return whether it is withdrawn."""
-        return self._demands.withdraw(operation)
-
     def on_publish(self, listener: Callable[[Config], None]) -> None:
-        """Have the worker call a listener, which must return at once, after each publication."""
+        # the worker calls it, so it must return at once
         self._worker.listeners.append(listener)
 
     def stop(self, timeout: float = _STOP_TIMEOUT_S) -> Future[bool]:
         """Refuse further demands, finish the queued ones and stop; return at once.
 
         After ``timeout`` seconds, demands that are unpublished or await approval stay in the
-        journal for the next start, and their futures raise ``ShuttingDown``. Only the timeout of
-        the first call counts.
-
-        The future returns whether everything was published, apart from demands that await approval.
-        It returns false if the threads have not ended :data:`_GRACE_S` after the timeout.
+        journal for the next start, and their futures raise ``ShuttingDown``. Only the first call's
+        timeout counts. The future returns whether everything was published, apart from demands that
+        await approval, and false if the threads have not ended :data:`_GRACE_S` after the timeout.
         """
         with self._stop_lock:
             if self._finished is not None:

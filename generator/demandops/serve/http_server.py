@@ -24,13 +24,12 @@ from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 
-# ---- the server of the webhook and of the page, which no slow or busy client can fill ----
+# ---- the server of the webhook and of the page ----
 #
 # Anyone who reaches the address may connect. A client that neither sends nor reads is cut off, and
 # so is one that sends in tiny pieces, because each piece costs as much as a large one. When too
 # many connections are open, the oldest that waits for its client gives way, so a health check gets
 # in.
-
 
 _PORT = re.compile(r"[0-9]{1,5}")
 _REMEDIES = {
@@ -96,15 +95,14 @@ class _BoundedConnection(H11Protocol):
         self._since, self._bytes, self._pieces = self.loop.time(), 0, 0
         self._before: tuple[object, int] | None = None
         self._timer = self.loop.call_later(_STUCK_S, self._look)
-        opened = [each for each in self.connections if isinstance(each, _BoundedConnection)]
-        opened = [each for each in opened if not each.transport.is_closing()]
+        opened = [peer for peer in self.connections if isinstance(peer, _BoundedConnection)]
+        opened = [peer for peer in opened if not peer.transport.is_closing()]
         if len(opened) > self.most:
             # not the new one, so that a health check gets in while others hold all connections
-            waiting = [each for each in opened if each.waits_for_client()]  # this one too
-            min(waiting, key=lambda each: each._since).transport.abort()
+            waiting = [peer for peer in opened if peer.waits_for_client()]  # this one too
+            min(waiting, key=lambda peer: peer._since).transport.abort()
 
     def waits_for_client(self) -> bool:
-        """Return whether the client has to send or to read before anything goes on."""
         cycle = self.cycle
         is_asked = cycle is not None and not (cycle.response_complete or cycle.more_body)
         return not is_asked or self.flow.write_paused
@@ -138,23 +136,18 @@ class _BoundedConnection(H11Protocol):
 
 
 def bound(address: str, option: str) -> socket.socket:
-    """Return a socket that listens on ``host:port``; a fault of the address names the option."""
     host, colon, port = address.rpartition(":")
     if not colon or not host or not _PORT.fullmatch(port) or int(port) > 0xFFFF:
-        raise InvalidInput.at(
-            option,
-            f"{quoted(address)} is not an address to listen on; write one like 127.0.0.1:8090",
-        )
+        message = f"{quoted(address)} is not an address to listen on; write one like 127.0.0.1:8090"
+        raise InvalidInput.at(option, message)
     host = host.removeprefix("[").removesuffix("]")  # of an IPv6 address
     try:
         family, *_, resolved = socket.getaddrinfo(
             host, int(port), type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
         )[0]
     except (OSError, UnicodeError):
-        raise InvalidInput.at(
-            option,
-            f"'{address}': host '{host}' cannot be resolved; write an address of this machine",
-        ) from None
+        message = f"'{address}': host '{host}' cannot be resolved; write an address of this machine"
+        raise InvalidInput.at(option, message) from None
     listening = socket.socket(family)
     try:
         # a restart need not wait until the kernel has forgotten the last connections
@@ -164,9 +157,8 @@ def bound(address: str, option: str) -> socket.socket:
     except OSError as error:
         listening.close()
         remedy = _REMEDIES.get(error.errno or 0, "choose another port")
-        raise InvalidInput.at(
-            option, f"cannot listen on '{address}': {error.strerror}; {remedy}"
-        ) from None
+        message = f"cannot listen on '{address}': {error.strerror}; {remedy}"
+        raise InvalidInput.at(option, message) from None
     return listening
 
 
@@ -190,8 +182,7 @@ _PATH = "/push"
 _AT_ONCE = 32
 # The largest body that GitHub sends, in bytes; a body is hashed and not stored.
 _MAX_BODY = 25 << 20
-# Anyone may send requests, and a line for each could fill the log.
-_WARN_EVERY_S = 60.0
+_WARN_EVERY_S = 60.0  # anyone may send requests, and a line for each could fill the log
 
 _SIGNATURES = ("X-Hub-Signature-256", "X-Gitea-Signature", "X-Forgejo-Signature")
 _TOKEN = "X-Gitlab-Token"  # noqa: S105 - a header's name
@@ -201,11 +192,8 @@ class PushWebhook:
     """The webhook's server, in a thread of its own; a request for ``/`` is a health check."""
 
     def __init__(self, address: str, secret: bytes, on_push: Callable[[], None]) -> None:
-        """Start the server; port 0 picks a free port, and ``on_push`` must return at once.
-
-        With an empty secret, notifications need no signature, and the address must be a loopback
-        address.
-        """
+        # ``on_push`` must return at once. Without a secret, notifications need no signature, and
+        # the address must be a loopback address.
         self._secret, self._on_push = secret, on_push
         self._warned = float("-inf")
         listening = bound(address, "--webhook")
@@ -241,7 +229,12 @@ class PushWebhook:
                 digest.update(chunk)
         except ClientDisconnect:
             return PlainTextResponse("the body is not complete\n", 400)
-        if self._secret and not self._is_signed(request, digest.hexdigest()):
+        # GitHub, Gitea and Forgejo sign the body; GitLab sends the secret itself
+        given = [request.headers.get(name, "").removeprefix("sha256=") for name in _SIGNATURES]
+        own = digest.hexdigest().encode()
+        signed = [hmac.compare_digest(_bytes(signature), own) for signature in given]
+        token = hmac.compare_digest(_bytes(request.headers.get(_TOKEN, "")), self._secret)
+        if self._secret and not (any(signed) or token):
             if REAL.monotonic() - self._warned > _WARN_EVERY_S:
                 self._warned = REAL.monotonic()
                 log.warning(
@@ -252,13 +245,6 @@ class PushWebhook:
             return PlainTextResponse("not signed with the secret\n", 403)
         self._on_push()
         return PlainTextResponse("fetching\n", 202)
-
-    def _is_signed(self, request: Request, digest: str) -> bool:
-        # GitHub, Gitea and Forgejo sign the body; GitLab sends the secret itself
-        signatures = [request.headers.get(name, "").removeprefix("sha256=") for name in _SIGNATURES]
-        signed = [hmac.compare_digest(_bytes(s), digest.encode()) for s in signatures]
-        token = hmac.compare_digest(_bytes(request.headers.get(_TOKEN, "")), self._secret)
-        return any(signed) or token
 
 
 async def _health(request: Request) -> PlainTextResponse:

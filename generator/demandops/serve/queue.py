@@ -19,7 +19,6 @@ from demandops.repo.write.journal import JournalEntry, ProposalRecord
 
 # ---- a demand under way, from its submission to its receipt ----
 
-
 log = logging.getLogger("demandops")
 
 # What a demand's listener is told.
@@ -43,11 +42,8 @@ State = Literal["arrived", "queued", "committed", "proposed", "withdrawn", "done
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
-    """The outcome of a demand whose commit is published and durable.
-
-    If an earlier attempt or run published the demand, only the first four fields are known.
-    """
-
+    # of a demand whose commit is published and durable; if an earlier attempt or run published it,
+    # only the first four fields are known
     operation: str
     request_id: str
     outcome: Outcome
@@ -86,21 +82,20 @@ class Ticket:
 
     @property
     def name(self) -> str:
-        """The id that the goal names, even if the goal is not valid; empty if it names none."""
+        # the goal may be invalid, or name no id
         fields = self.goal if isinstance(self.goal, dict) else {}
         keys = ("id", "request", "demand", "name")
         return str(next((fields[key] for key in keys if fields.get(key)), ""))
 
     def refuse(self, error: DemandOpsError) -> None:
-        """Answer a demand that is not in the journal yet with an error."""
+        # only a demand that is not in the journal yet
         self.state = "done"
         self.future.set_exception(error)
         self.journaled.set_result(False)
 
     def notify(self, stage: Stage, text: str) -> None:
-        """Report a stage to the listener once, or ``proposed`` once for each text."""
-        # a demand is evaluated again after each lost race, which must not repeat its stages; a
-        # proposal has another text once its pull request is known
+        # A stage is reported once, although a demand is evaluated again after each lost race. But a
+        # proposal has another text once its pull request is known.
         key = text if stage == "proposed" else stage
         if key in self.notified:
             return
@@ -111,7 +106,6 @@ class Ticket:
             log.exception("a listener failed")
 
     def mark_maybe_published(self, base: str) -> None:
-        """Record that a push on top of ``base`` may have succeeded although it seemed to fail."""
         if not self.maybe_published:  # the oldest base counts, because any try may have succeeded
             self.base, self.maybe_published = base, True
 
@@ -142,7 +136,6 @@ def reason_of(error: DemandOpsError) -> str:
 
 
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    """Return a ticket whose listener logs what becomes of the demand."""
     ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
     demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"
 
@@ -188,10 +181,8 @@ class _Queued:
 
 
 class FairQueue:
-    """A queue of demands; not thread-safe.
-
-    With ``in_order``, demands leave in the order of their arrival, and requesters take no turns.
-    """
+    # Not thread-safe. With ``in_order``, demands leave in the order of their arrival, and
+    # requesters take no turns.
 
     def __init__(self, *, in_order: bool = False) -> None:
         self._in_order = in_order
@@ -239,14 +230,12 @@ class FairQueue:
         self._queued = again | self._queued
 
     def remove(self, tickets: Collection[Ticket]) -> None:
-        """Remove those of the demands that are in the queue."""
         for ticket in tickets:
             queued = self._queued.pop(ticket, None)
             if queued is not None:
                 queued.has_left = True
 
     def popleft(self) -> Ticket:
-        """Remove and return the next demand; the queue must not be empty."""
         while True:
             requester = next(iter(self._lanes))
             lane = self._lanes.pop(requester)
@@ -295,7 +284,6 @@ def requester_of(goal: Any) -> str:  # noqa: ANN401 - plain data
 
 
 def _requesters(goal: dict[str, Any]) -> Iterator[Any]:
-    """Yield the requesters of a goal of the reference's action."""
     bodies = (app.get("object_detection_fusion_app") for app in _items(goal, "apps"))
     for item in (*bodies, *_items(goal, "connections")):
         names = item.get("requester_ids") if isinstance(item, dict) else None
@@ -308,7 +296,7 @@ def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401
         return None
     headers = (app.get("header") for app in _items(goal, "apps"))
     subjects = [("demand", goal.get("demand"))]
-    subjects += [("application", each.get("id")) for each in headers if isinstance(each, dict)]
+    subjects += [("application", head.get("id")) for head in headers if isinstance(head, dict)]
     for kind in ("application", "connection"):
         subjects += [(kind, item.get("id")) for item in _items(goal, f"{kind}s")]
     subjects += [("requester", name) for name in _requesters(goal)]

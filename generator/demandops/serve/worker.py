@@ -46,8 +46,7 @@ from demandops.serve.timing.timers import (
 )
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
-# ---- records whether the remote can be reached, for logs and diagnostics ----
-
+# ---- whether the remote can be reached, for logs and diagnostics ----
 
 log = logging.getLogger("demandops")
 
@@ -62,8 +61,7 @@ class RemoteStatus:
 
 
 class RemoteMonitor:
-    """Records and logs whether the remote can be reached; any thread may read ``status``."""
-
+    # any thread may read ``status``
     def __init__(self, address: str, runtime: Runtime) -> None:
         self._address, self._runtime = address, runtime
         self.status = RemoteStatus()
@@ -97,7 +95,7 @@ class RemoteMonitor:
         self.status = replace(self.status, push_denied=reason)
 
 
-# ---- logs each problem of the state repo once, until it is mended ----
+# ---- the log of the state repo's problems: each once, until it is mended ----
 
 
 class FaultLog:
@@ -116,7 +114,6 @@ class FaultLog:
         self._logged = frozenset(current)
 
     def warn_if_unsigned(self, snapshot: Snapshot) -> None:
-        """Warn once if the state repo lists who may sign and this generator has no key."""
         if self._repository.signer is not None or self._warned_of_signers:
             return
         if signing.are_listed(self._repository.objects, snapshot.commit):
@@ -129,27 +126,22 @@ class FaultLog:
             )
 
 
-# ---- the worker: follows the state repo, and publishes the demands as commits ----
+# ---- the worker ----
 #
 # The worker runs in one thread, the only one that writes to the state repo. Demands go first, so a
 # fetch stops when a demand arrives. The push of the demand finds new commits just as the fetch
 # would.
-
 
 # How many new Git packs to collect before git joins them; each publication or fetch adds one.
 _TIDY_EVERY = 50
 # How often to carry out a change by a person while other generators, which do the same, are faster.
 _TRIES = 5
 _LONGEST_PAUSE_S = 0.05
-# The thread's name, under which a health check reports its failure.
-_NAME = "writer"
+_NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
 class Worker:
-    """Follows the state repo and turns batches of demands into published commits.
-
-    Any thread may read ``remote`` and ``snapshot`` (the newest published state).
-    """
+    # Any thread may read ``remote`` and ``snapshot`` (the newest published state).
 
     def __init__(
         self,
@@ -183,7 +175,6 @@ class Worker:
     # ---- from any thread ----
 
     def fetch_now(self) -> None:
-        """Have the worker fetch as soon as no demand is queued, even if no fetch is due."""
         self._timer.request()
         self._demands.wake()
 
@@ -268,8 +259,7 @@ class Worker:
     def _publish(self, batch: list[Ticket]) -> None:
         """Publish a batch, the demands that arrive during retries, and the ends of leases.
 
-        The batch is empty afterwards; demands that there was no time to evaluate are queued again.
-        If an error is raised, the demands are still in the batch.
+        The batch is empty afterwards, unless an error is raised.
         """
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
@@ -292,8 +282,18 @@ class Worker:
                 wait = backoff.unreachable()
             if wait is None:
                 continue
-            # wait before the fetch, not after it, because the push must follow the fetch closely
-            self._wait_to_retry(batch, wait)
+            # Wait before the fetch, not after it, because the push must follow the fetch closely.
+            # Meanwhile answer withdrawn demands, and tell the others what they wait for.
+            end, to_notify = self._runtime.monotonic() + wait, list(batch)
+            while not self._ends_soon.is_set():
+                unreachable = self.remote.status.unreachable
+                for ticket in to_notify if unreachable else ():
+                    ticket.notify("away", f"waiting: {unreachable}")
+                self._demands.answer_withdrawn(batch)
+                seconds = end - self._runtime.monotonic()
+                if seconds <= 0:
+                    break
+                to_notify = self._demands.new_demands(seconds)
             self._require_not_ending()
             self._demands.take(batch, self._batch_limit)
 
@@ -305,10 +305,7 @@ class Worker:
             )
 
     def _attempt(self, batch: list[Ticket], backoff: Backoff) -> float | None:
-        """Evaluate and publish a part of a batch.
-
-        Return the seconds to wait before the next attempt, or None to continue at once.
-        """
+        # the seconds to wait before the next attempt, or None to continue at once
         # fetch before a demand is committed, because after that it can no longer be withdrawn
         if self._must_fetch or self.remote.status.unreachable:
             self._repository.refresh()
@@ -371,7 +368,6 @@ class Worker:
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended, to release its claims."""
         if self._rest or self._demands.has_queued:  # a queued demand may renew a lease
             return []
         return self._lease_expiry.tickets(snapshot.state.ledger)
@@ -379,12 +375,9 @@ class Worker:
     def _publish_commits(
         self, commits: CommitBatch, results: list[Result], independent: int
     ) -> bool:
-        """Publish a commit batch and answer its demands.
-
-        Return false, without answers, if another writer was first or locks main. The first
-        ``independent`` results were decided before the batch had a commit, so they do not depend on
-        the push.
-        """
+        # False, without answers, if another writer was first or locks main. The first
+        # ``independent`` results were decided before the batch had a commit, so they do not depend
+        # on the push.
         try:
             published = commits.publish()
         except PushDenied as error:
@@ -406,24 +399,9 @@ class Worker:
                 self._approvals.add(ticket, result)
         return True
 
-    def _wait_to_retry(self, batch: list[Ticket], seconds: float) -> None:
-        """Wait; meanwhile answer withdrawn demands, and tell the others what they wait for."""
-        end = self._runtime.monotonic() + seconds
-        to_notify = list(batch)
-        while not self._ends_soon.is_set():
-            unreachable = self.remote.status.unreachable
-            for ticket in to_notify if unreachable else ():
-                ticket.notify("away", f"waiting: {unreachable}")
-            self._demands.answer_withdrawn(batch)
-            left = end - self._runtime.monotonic()
-            if left <= 0:
-                return
-            to_notify = self._demands.new_demands(left)
-
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        """Fetch if a fetch is due, carry out people's changes, and do the work that is due."""
         is_due = self._own_work.is_due(self.snapshot.state)
         try:
             if self._timer.start_if_due():
@@ -474,10 +452,7 @@ class Worker:
         return False  # other generators are faster, and they carry out the same changes
 
     def _new_commit_batch(self) -> CommitBatch:
-        """Return a commit batch on the newest known tip.
-
-        Its first commits render people's changes, and do the work of :class:`OwnWork` that is due.
-        """
+        # its first commits render people's changes, and do the own work that is due
         tip = self._repository.tip()
         before = self.snapshot
         if tip == before.commit and not before.problems and before.is_rendered:

@@ -16,8 +16,7 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
-# ---- the detector's parameters: their defaults, descriptions and ranges ----
-
+# ---- the detector's parameters ----
 
 # Each parameter: its default, its description and, if it is a number, its range.
 PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
@@ -58,7 +57,6 @@ LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
 def declare(node: Node, rules: str | None) -> dict[str, Any]:
-    """Declare all parameters of a node, where ``rules`` is a default, and return their values."""
     values = {}
     for name, (default, description, span) in PARAMETERS.items():
         described = ParameterDescriptor(description=description, read_only=True)
@@ -80,7 +78,7 @@ def declare(node: Node, rules: str | None) -> dict[str, Any]:
     return values
 
 
-# ---- ``demandops detect``: run the event detector, or try its rules on a recorded bag ----
+# ---- the command ----
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -128,7 +126,22 @@ def detect(
     for option, given in (("--plot", plot is not None), ("--output", output != "text")):
         if given:
             raise click.UsageError(f"{option} needs --replay; add --replay, or leave {option} out")
-    _run(rules, ros_args)
+    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415 - a replay needs no ROS
+
+    from demandops_ros import ros_process  # noqa: PLC0415
+    from demandops_ros.detector.detector_node import DetectorNode  # noqa: PLC0415
+
+    with (
+        ros_process.stop_signals() as wait_for_signal,
+        ros_process.started(ros_args, SignalHandlerOptions.NO),
+    ):
+        node = DetectorNode(rules)
+        thread = ros_process.ExecutorThread(node)
+        wait_for_signal()
+        node.get_logger().info("stopping; the booked demands stay booked")
+        thread.close()
+        node.close()
+        node.destroy_node()
 
 
 def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
@@ -156,22 +169,3 @@ def _replay(rules: str, bag: Path, plot: Path | None, output: str) -> None:
         except OSError as error:
             problem = f"cannot be written: {error.strerror or error}"
             raise InvalidInput.at("", problem, file=str(plot)) from None
-
-
-def _run(rules: str | None, ros_args: list[str]) -> None:
-    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415 - a replay needs no ROS
-
-    from demandops_ros import ros_process  # noqa: PLC0415
-    from demandops_ros.detector.detector_node import DetectorNode  # noqa: PLC0415
-
-    with (
-        ros_process.stop_signals() as wait_for_signal,
-        ros_process.started(ros_args, SignalHandlerOptions.NO),
-    ):
-        node = DetectorNode(rules)
-        thread = ros_process.ExecutorThread(node)
-        wait_for_signal()
-        node.get_logger().info("stopping; the booked demands stay booked")
-        thread.close()
-        node.close()
-        node.destroy_node()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from importlib import import_module
 from math import inf
@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from application_manager_interfaces.action import DeploymentRequest
-from demandops.base.errors import Fault, InvalidInput, fault
+from demandops.base.errors import InvalidInput, fault
 from demandops.base.quoting import one_line, quoted
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
@@ -37,7 +37,6 @@ from demandops_ros.node import status
 #
 # Topics may appear and vanish at any time.
 
-
 # A subscription is reliable if all publishers that it finds are. The queue is deep, because many
 # entities may share a topic.
 _QOS = QoSProfile(depth=1000, reliability=QoSReliabilityPolicy.BEST_AVAILABLE)
@@ -49,19 +48,6 @@ def message_class(type_name: str) -> Any:  # noqa: ANN401 - a generated class
         return getattr(import_module(f"{package}.msg"), name, None)
     except ModuleNotFoundError:
         return None
-
-
-def faults_of_types(file: RuleFile) -> list[Fault]:
-    """Return a fault for each source whose message type is not installed."""
-    return [
-        fault(
-            f"sources.{name}.type",
-            f"{source.type} is not installed; install its package, or start the detector in a "
-            "workspace that has it",
-        )
-        for name, source in file.sources.items()
-        if message_class(source.type) is None
-    ]
 
 
 class SourceSubscriptions:
@@ -83,7 +69,6 @@ class SourceSubscriptions:
         return len(self._subscriptions)  # a topic counts once for each source that reads it
 
     def refresh(self) -> None:
-        """Subscribe to new topics, and leave those that nobody publishes any longer."""
         published: Mapping[str, list[str]] = dict(self._node.get_topic_names_and_types())
         for name, source in self._file.sources.items():
             for topic, types in published.items():
@@ -124,7 +109,7 @@ class SourceSubscriptions:
             self._node.get_logger().warning(one_line(text))
 
 
-# ---- sends the demands of events in separate threads, and sends a failed demand again ----
+# ---- the demands of events, sent in separate threads and again after a failure ----
 
 # How many goals are sent at the same time; the node publishes such goals together.
 _THREADS = 8
@@ -134,8 +119,6 @@ Log = Callable[[str, str], None]  # of a level, `info` or `warning`, and a text
 
 
 class DemandSender:
-    """Keeps the demands of the current events booked: sends, retries and renews them."""
-
     def __init__(
         self, action_name: str, demand_action_name: str, timeout_s: float, log: Log
     ) -> None:
@@ -164,11 +147,8 @@ class DemandSender:
         self._requests.close()
 
     def want(self, wants: Iterable[Want], booked: Mapping[Key, Goal] | None = None) -> None:
-        """Record the demands that events need from now on, and send the goals for them.
-
-        ``booked`` has the events whose demands were booked before the detector started, each with a
-        goal that can end the demand.
-        """
+        # ``booked`` has the events whose demands were booked before the detector started, each with
+        # a goal that can end the demand
         with self._changed:
             for key, goal in (booked or {}).items():
                 self._wanted.hold(key, goal)
@@ -177,10 +157,8 @@ class DemandSender:
             self._changed.notify_all()
 
     def summary(self) -> tuple[int, int, list[tuple[Key, str]]]:
-        """Return how many events want or hold a demand, and how many of these have no answer yet.
-
-        The third value has the events whose last goal failed, each with the reason.
-        """
+        # how many events want or hold a demand, how many of these have no answer yet, and why the
+        # last goal of others failed
         with self._changed:
             return len(self._wanted), self._wanted.unanswered(), list(self._wanted.refusals())
 
@@ -200,7 +178,6 @@ class DemandSender:
                 self._log("info", f"rule {rule}: {what}: {outcome.message}")
 
     def _take(self) -> Sending | None:
-        """Wait for a goal to send; return None once the sender is closed."""
         with self._changed:
             while not self._is_closed:
                 now = REAL.monotonic()
@@ -229,69 +206,13 @@ class DemandSender:
             return Outcome("fault", one_line(repr(error)))
 
 
-# ---- the detector's status on ``/diagnostics``: its rules, its data and its demands ----
-
-_MOST_REFUSALS = 20
-
-
-class DetectorDiagnostics:
-    def __init__(self, node: Node, rules: str) -> None:
-        self._node, self._rules = node, rules
-        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
-
-    def publish(
-        self,
-        problems: Sequence[str],
-        detector: Detector,
-        topics: SourceSubscriptions,
-        sender: DemandSender,
-        is_started: bool,
-    ) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = self._node.get_clock().now().to_msg()
-        statuses = []
-
-        level, text = DiagnosticStatus.OK, "valid"
-        if problems:
-            level = DiagnosticStatus.WARN
-            text = "the file cannot be read or is invalid; the last valid rules are in effect"
-        values = {"rules": str(len(detector.file.rules))}
-        values |= {f"problem {at}": problem for at, problem in enumerate(problems, start=1)}
-        statuses.append(status("demandops_detector: rules", self._rules, level, text, values))
-
-        level, text = DiagnosticStatus.OK, "detecting"
-        if not is_started:
-            level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping or /clock"
-        values = {
-            "topics": str(topics.topics),
-            "entities": str(detector.entities),
-            "messages": str(topics.messages),
-            "messages left out": str(topics.unreadable),
-        }
-        statuses.append(status("demandops_detector: data", self._rules, level, text, values))
-
-        _, unanswered, refusals = sender.summary()
-        level, text = DiagnosticStatus.OK, "every demand is answered"
-        if unanswered:
-            text = f"{unanswered} demands have no answer yet"
-        if refusals:
-            level = DiagnosticStatus.WARN
-            text = f"{len(refusals)} demands failed and are tried again"
-        values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
-        for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
-            values[" ".join((rule, *subjects))] = why
-        statuses.append(status("demandops_detector: demands", self._rules, level, text, values))
-
-        message.status = statuses
-        self._publisher.publish(message)
-
-
-# ---- the node of the event detector, which watches topics and sends demands ----
+# ---- the node ----
 #
 # The node's decisions depend only on events, not on which services are deployed. The node reads the
 # latched bookkeeping only at its start, to find the demands of its earlier run. So a restart does
 # not end these demands.
 
+_MOST_REFUSALS = 20  # that the diagnostics list
 _DISCOVERY_S = 0.5
 _RELOAD_S = 1.0
 _PATIENCE_S = 10.0
@@ -308,7 +229,8 @@ class DetectorNode(Node):  # type: ignore[misc]
         super().__init__("demandops_detector")
         settings = detect_command.declare(self, rules)
         ros_process.log_to(self.get_logger(), settings["log_level"])
-        self._path, self._settle_s = Path(settings["rules"]), float(settings["settling_time"])
+        self._rules, self._settle_s = settings["rules"], float(settings["settling_time"])
+        self._path = Path(self._rules)
         file, self._text = _read_rules(self._path)
         self._last_now, self._last_look = self._now(), REAL.monotonic()
         self._detector = Detector(file, self._last_now)
@@ -336,12 +258,11 @@ class DetectorNode(Node):  # type: ignore[misc]
         self.create_timer(settings["period"], self._step)
         self.create_timer(_DISCOVERY_S, self._refresh)
         self.create_timer(_RELOAD_S, self._reload_if_changed)
-        self._diagnostics = DetectorDiagnostics(self, settings["rules"])
+        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._problems: tuple[str, ...] = ()
         self.create_timer(1.0, self._report)
 
     def close(self) -> None:
-        """Stop the node; its demands stay booked, those with a lease until it ends."""
         self._topics.close()
         self._sender.close()
 
@@ -379,19 +300,6 @@ class DetectorNode(Node):  # type: ignore[misc]
             return
         self._bookkeeping = bookkeeping
 
-    def _start(self, bookkeeping: Mapping[str, Any], now: float) -> None:
-        booked = booked_events(self._detector.file, bookkeeping)
-        self._sender.want(self._detector.resume(booked, now, self._settle_s), booked)
-        self._is_started = True
-        self._last_now, self._last_look = now, REAL.monotonic()
-        if self._books is not None:
-            self.destroy_subscription(self._books)
-        self._log(
-            "info",
-            f"detecting; rules: {len(self._detector.file.rules)}, demands booked before "
-            f"the start: {len(booked)}",
-        )
-
     def _say_what_is_missing(self) -> None:
         self._patience.cancel()
         if self._is_started:
@@ -414,7 +322,17 @@ class DetectorNode(Node):  # type: ignore[misc]
         if not self._is_started:
             if self._bookkeeping is None or now == _UNHEARD_CLOCK:
                 return
-            self._start(self._bookkeeping, now)
+            booked = booked_events(self._detector.file, self._bookkeeping)
+            self._sender.want(self._detector.resume(booked, now, self._settle_s), booked)
+            self._is_started = True
+            self._last_now, self._last_look = now, REAL.monotonic()
+            if self._books is not None:
+                self.destroy_subscription(self._books)
+            self._log(
+                "info",
+                f"detecting; rules: {len(self._detector.file.rules)}, demands booked before "
+                f"the start: {len(booked)}",
+            )
         observations = [self._observations.popleft() for _ in range(len(self._observations))]
         # if the clock was set since the last step, the detector's times are moved with it
         look, passed = REAL.monotonic(), now - self._last_now
@@ -430,7 +348,7 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._sender.want([want])
 
     def _reload_if_changed(self) -> None:
-        """If the file is invalid, keep the last valid rules; log the problems if they changed."""
+        # while the file is invalid, the last valid rules stay in effect
         try:
             _, text = read_input(self._path)
         except InvalidInput as error:
@@ -459,15 +377,54 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._problems = problems
 
     def _report(self) -> None:
-        self._diagnostics.publish(
-            self._problems, self._detector, self._topics, self._sender, self._is_started
-        )
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        statuses, rules, detector = [], self._rules, self._detector
+
+        level, text = DiagnosticStatus.OK, "valid"
+        if self._problems:
+            level = DiagnosticStatus.WARN
+            text = "the file cannot be read or is invalid; the last valid rules are in effect"
+        values = {"rules": str(len(detector.file.rules))}
+        values |= {f"problem {at}": problem for at, problem in enumerate(self._problems, start=1)}
+        statuses.append(status("demandops_detector: rules", rules, level, text, values))
+
+        level, text = DiagnosticStatus.OK, "detecting"
+        if not self._is_started:
+            level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping or /clock"
+        values = {
+            "topics": str(self._topics.topics),
+            "entities": str(detector.entities),
+            "messages": str(self._topics.messages),
+            "messages left out": str(self._topics.unreadable),
+        }
+        statuses.append(status("demandops_detector: data", rules, level, text, values))
+
+        _, unanswered, refusals = self._sender.summary()
+        level, text = DiagnosticStatus.OK, "every demand is answered"
+        if unanswered:
+            text = f"{unanswered} demands have no answer yet"
+        if refusals:
+            level = DiagnosticStatus.WARN
+            text = f"{len(refusals)} demands failed and are tried again"
+        values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
+        for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
+            values[" ".join((rule, *subjects))] = why
+        statuses.append(status("demandops_detector: demands", rules, level, text, values))
+
+        message.status = statuses
+        self._diagnostics.publish(message)
 
 
 def _read_rules(path: Path) -> tuple[RuleFile, str]:
-    """Return the rules in a file, whose message types are installed, and the file's text."""
-    name, text = read_input(path)
-    file = read(text, name)
-    if faults := faults_of_types(file):
-        raise InvalidInput(problem.within(name) for problem in faults)
+    place, text = read_input(path)
+    file = read(text, place)
+    remedy = "install its package, or start the detector in a workspace that has it"
+    faults = [
+        fault(f"sources.{name}.type", f"{source.type} is not installed; {remedy}")
+        for name, source in file.sources.items()
+        if message_class(source.type) is None
+    ]
+    if faults:
+        raise InvalidInput(problem.within(place) for problem in faults)
     return file, text

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from html import escape
@@ -22,8 +22,7 @@ from demandops.detect.rule_file import Goal, RuleFile
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
-# ---- reads a recorded bag, MCAP or sqlite3, without ROS; only this module imports rosbags ----
-
+# ---- a recorded bag, MCAP or sqlite3, read without ROS ----
 
 # Stands in `left_out` for the damaged end of a bag, whose topics are unknown. Its count is 1, as
 # the lost messages cannot be counted.
@@ -57,8 +56,9 @@ class RecordedBag:
                 else:
                     self.unread[connection.topic] = connection.msgtype
         if not self.topics:
-            wanted = ", ".join(f"{each.topic} ({each.type})" for each in file.sources.values())
-            topics = sorted({f"{each.topic} ({each.msgtype})" for each in self._reader.connections})
+            sources = file.sources.values()
+            wanted = ", ".join(f"{source.topic} ({source.type})" for source in sources)
+            topics = sorted({f"{item.topic} ({item.msgtype})" for item in self._reader.connections})
             recorded = ", ".join(topics) or "no topic"
             self.close()
             message = f"has no topic that the rules read: {wanted}; it has {recorded}"
@@ -69,11 +69,11 @@ class RecordedBag:
 
     @property
     def span(self) -> tuple[float, float]:
-        """The times of the first and the last message of all topics, in seconds since 1970."""
+        # of the first and the last message of all topics, in seconds since 1970
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
-        connections = [each for each in self._reader.connections if each.id in self._sources]
+        connections = [item for item in self._reader.connections if item.id in self._sources]
         messages = self._reader.messages(connections=connections)
         while True:
             try:
@@ -99,7 +99,7 @@ class RecordedBag:
         self.left_out[key] = self.left_out.get(key, 0) + 1
 
 
-# ---- draws a replay as a picture ----
+# ---- the picture of a replay ----
 #
 # The upper part of the picture is a map with tracks and areas. In the lower part, each event, up to
 # the 200th, has a row that shows when the event lasted.
@@ -113,7 +113,6 @@ Span = tuple[float, float]
 
 
 def svg(replay: Replay) -> str:
-    colors = _Colors()
     spans: dict[Key, list[Span]] = {}  # of each event; the end of one that lasts is inf
     for event, _ in replay.events:
         if event.starts:
@@ -122,34 +121,16 @@ def svg(replay: Replay) -> str:
             spans[event.key][-1] = spans[event.key][-1][0], event.at
     rows = [*spans.items()][:_MOST_ROWS]
     height = _MAP + _ROW * (len(rows) + 3)
-    parts = [*_map(replay, colors), *_times(replay, rows, colors)]
+    colors: dict[str, str] = {}
+
+    def color_of(entity: str) -> str:
+        return colors.setdefault(entity, _COLORS[len(colors) % len(_COLORS)])
+
+    parts = [*_map(replay, color_of), *_times(replay, rows, color_of)]
     return (
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" style="{_STYLE}">'
         f'<rect width="{_WIDTH}" height="{height}" fill="white"/>\n{"".join(parts)}</svg>\n'
     )
-
-
-class _Colors:
-    def __init__(self) -> None:
-        self._by_entity: dict[str, str] = {}
-
-    def color(self, entity: str) -> str:
-        next_color = _COLORS[len(self._by_entity) % len(_COLORS)]
-        return self._by_entity.setdefault(entity, next_color)
-
-
-class _Scale:
-    """Converts positions in metres to positions in the picture, where y grows downwards."""
-
-    def __init__(self, xs: list[float], ys: list[float]) -> None:
-        self._x, self._y = min(xs, default=0.0), max(ys, default=0.0)
-        width, height = max(xs, default=1.0) - self._x, self._y - min(ys, default=0.0)
-        room = _WIDTH - 2 * _EDGE, _MAP - 2 * _EDGE
-        self.factor = min(room[0] / (width or 1), room[1] / (height or 1))
-        self.metres = _round(width or height or 1)
-
-    def at(self, x: float, y: float) -> tuple[float, float]:
-        return _EDGE + (x - self._x) * self.factor, _EDGE + (self._y - y) * self.factor
 
 
 def _round(span: float) -> float:
@@ -158,7 +139,7 @@ def _round(span: float) -> float:
     return max((step for step in steps if step <= span / 4), default=steps[0])
 
 
-def _map(replay: Replay, colors: _Colors) -> Iterator[str]:
+def _map(replay: Replay, color_of: Callable[[str], str]) -> Iterator[str]:
     areas = [
         (rule.name, rule.condition)
         for rule in replay.file.rules
@@ -171,46 +152,51 @@ def _map(replay: Replay, colors: _Colors) -> Iterator[str]:
         low_x, low_y, high_x, high_y = condition.area.bounds
         xs += (low_x - around, high_x + around)
         ys += (low_y - around, high_y + around)
-    scale = _Scale(xs, ys)
+    # positions in metres become positions in the picture, where y grows downwards
+    left, top = min(xs, default=0.0), max(ys, default=0.0)
+    width, height = max(xs, default=1.0) - left, top - min(ys, default=0.0)
+    factor = min((_WIDTH - 2 * _EDGE) / (width or 1), (_MAP - 2 * _EDGE) / (height or 1))
+
+    def at(x: float, y: float) -> tuple[float, float]:
+        return _EDGE + (x - left) * factor, _EDGE + (top - y) * factor
+
     labels: dict[tuple[float, float], list[str]] = {}
     for name, condition in areas:
-        yield from _area(scale, condition)
-        labels.setdefault(scale.at(*condition.area.corners[0]), []).append(name)
+        corners = [at(*corner) for corner in condition.area.corners]
+        x, y = corners[0]
+        labels.setdefault((x, y), []).append(name)
+        if len(corners) > 1:
+            points = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
+            yield f'<polygon points="{points}" fill="#0001" stroke="#666"/>\n'
+            continue
+        if isinstance(condition, Near):
+            radii = [condition.start, condition.stop]
+        else:
+            radii = [condition.radius]
+        for radius, dash in zip(radii, ("none", "6 4"), strict=False):
+            yield (
+                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius * factor:.1f}" '
+                f'fill="#0001" stroke="#666" stroke-dasharray="{dash}"/>\n'
+            )
     for (x, y), names in labels.items():
         for line, name in enumerate(names):
             yield _text(x + 4, y + 14 * line, name, "#444")
     for (_, entity), track in replay.tracks.items():
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in (scale.at(*point) for point in track))
-        color = colors.color(entity)
+        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in (at(*point) for point in track))
+        color = color_of(entity)
         yield f'<polyline points="{points}" fill="none" stroke="{color}" stroke-width="2"/>\n'
-        x, y = scale.at(*track[0])
+        x, y = at(*track[0])
         yield f'<circle cx="{x:.1f}" cy="{y:.1f}" r="4" fill="{color}"/>\n'
         yield _text(x + 6, y - 6, entity, color)
-    length = scale.metres * scale.factor
+    metres = _round(width or height or 1)
+    length = metres * factor
     yield f'<path d="M{_EDGE} {_MAP - 12}h{length:.1f}" stroke="black" stroke-width="3"/>\n'
-    yield _text(_EDGE, _MAP - 18, f"{scale.metres:g} m", "black")
+    yield _text(_EDGE, _MAP - 18, f"{metres:g} m", "black")
 
 
-def _area(scale: _Scale, condition: Near | Count) -> Iterator[str]:
-    corners = [scale.at(*corner) for corner in condition.area.corners]
-    x, y = corners[0]
-    if len(corners) > 1:
-        points = " ".join(f"{x:.1f},{y:.1f}" for x, y in corners)
-        yield f'<polygon points="{points}" fill="#0001" stroke="#666"/>\n'
-    else:
-        radii = (
-            [condition.radius]
-            if isinstance(condition, Count)
-            else [condition.start, condition.stop]
-        )
-        for radius, dash in zip(radii, ("none", "6 4"), strict=False):
-            yield (
-                f'<circle cx="{x:.1f}" cy="{y:.1f}" r="{radius * scale.factor:.1f}" '
-                f'fill="#0001" stroke="#666" stroke-dasharray="{dash}"/>\n'
-            )
-
-
-def _times(replay: Replay, rows: list[tuple[Key, list[Span]]], colors: _Colors) -> Iterator[str]:
+def _times(
+    replay: Replay, rows: list[tuple[Key, list[Span]]], color_of: Callable[[str], str]
+) -> Iterator[str]:
     start, end = replay.span
     factor = (_WIDTH - _LEFT - _RIGHT) / ((end - start) or 1)
     bottom = _MAP + _ROW * (len(rows) + 1)
@@ -222,7 +208,7 @@ def _times(replay: Replay, rows: list[tuple[Key, list[Span]]], colors: _Colors) 
             yield _text(x, bottom + 14, f"{tick * step:g} s", "black")
     for number, ((rule, subjects), spans) in enumerate(rows, start=1):
         y = _MAP + _ROW * number
-        color = colors.color(subjects[0]) if subjects else "#444"
+        color = color_of(subjects[0]) if subjects else "#444"
         yield _text(_EDGE, y, f"{rule} {' '.join(subjects)}", "black")
         for since, until in spans:
             x, width = _LEFT + (since - start) * factor, (min(until, end) - since) * factor
@@ -236,12 +222,11 @@ def _text(x: float, y: float, text: str, color: str) -> str:
     return f'<text x="{x:.1f}" y="{y:.1f}" fill="{color}">{escape(text)}</text>\n'
 
 
-# ---- tries rules on a recorded bag, and shows which demands they would make, and when ----
+# ---- the replay, and its output ----
 
 # How many messages the detector gets at a time; the number does not change the events.
 _TOGETHER = 1_000
-# The least distance in metres between two points of an entity's track in the plot.
-_TRACK_M = 0.5
+_TRACK_M = 0.5  # the least distance in metres between two points of an entity's track in the plot
 
 
 @dataclass
@@ -259,7 +244,6 @@ class Replay:
 
 
 def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
-    """Return the events that rules make from a bag, at the times when messages were recorded."""
     start, end = bag.span
     detector = Detector(file, start)
     replay = Replay(name, file, (start, end), sorted(bag.topics))
@@ -285,14 +269,8 @@ def replayed(name: str, bag: RecordedBag, file: RuleFile) -> Replay:
 
 
 def show(replay: Replay, output: str) -> None:
-    columns = [
-        Column("Second"),
-        Column("Change"),
-        Column("Rule"),
-        Column("Entities"),
-        Column("Why", rank=2, wraps=True),
-        Column("Demand", rank=1),
-    ]
+    columns = [Column(name) for name in ("Second", "Change", "Rule", "Entities")]
+    columns += [Column("Why", rank=2, wraps=True), Column("Demand", rank=1)]
     rows = [
         (
             f"{event.at - replay.span[0]:.1f}",

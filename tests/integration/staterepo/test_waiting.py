@@ -153,7 +153,7 @@ def test_a_round_ends_with_a_demand_whose_template_takes_too_long(
         turns = WaitingTurns(generator._repository.runtime)
         with processor_time(0.1):
             turns.book_due(CommitBatch(generator._repository, generator.snapshot))
-        assert turns.has_more
+        assert turns.left
         person.change({TEMPLATE: template}, "An end")
         rig.book(generator, link(2))
         rig.wait_until(lambda: _runs(bare)[-3:] == ["of-a", "of-b", "of-c"], "all to be booked")

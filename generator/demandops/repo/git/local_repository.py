@@ -28,8 +28,7 @@ from demandops.repo.git.repository import (
     unopened,
 )
 
-# ---- the state repo as a bare repository on this disk, written in place and fsynced ----
-
+# ---- a bare repository on this disk ----
 
 # From this age on, a branch's lock counts as left behind by a killed process: Git locks a branch
 # only for milliseconds.
@@ -115,7 +114,6 @@ class LocalRepository(StateRepository):
             raise self._unreadable(f"its commit {self.tip()} is missing")
 
     def tip(self) -> Oid:
-        """Return the newest commit of main, or raise StateRepoError if main is no plain branch."""
         main = self.objects.references.get(self.main_reference)
         if main is None:
             raise missing_main(self.address)
@@ -168,10 +166,7 @@ class LocalRepository(StateRepository):
             raise reason from None
 
     def _break_stale_lock(self) -> None:
-        """Remove the branch's lock if it is so old that a killed process must have left it.
-
-        The age counts from the time when this process first saw the lock, by the monotonic clock.
-        """
+        # its age counts from when this process first saw it, by the monotonic clock
         lock = Path(self.objects.path) / f"{MAIN}.lock"
         try:
             status = lock.lstat()
@@ -192,7 +187,7 @@ class LocalRepository(StateRepository):
                 ) from None
 
 
-# ---- state repos that are only read: a person's checkout, and the last fetch of a URL ----
+# ---- what is only read: a person's checkout, and the last fetch of a URL ----
 
 
 def is_checkout(folder: Path) -> bool:
@@ -200,7 +195,6 @@ def is_checkout(folder: Path) -> bool:
 
 
 def checkout_around(folder: Path) -> Path | None:
-    """Return the nearest checkout of a state repo, from ``folder`` upwards."""
     return next(filter(is_checkout, (folder, *folder.parents)), None)
 
 
@@ -245,7 +239,7 @@ class LastFetch(LocalRepository):
         pass  # the process that made the clone has checked it
 
 
-# ---- opens a state repo by its address: a folder, or a URL that Git can clone ----
+# ---- addresses: a folder, or a URL that Git can clone ----
 
 _SCHEME = re.compile(r"^([A-Za-z][A-Za-z0-9+.-]*)(://|::)")
 _SCP = re.compile(r"^([^/\s:]+:(?!:)|[^/\s:]+@\[[^\]/]+\]:)")
@@ -254,7 +248,6 @@ _ALLOWED = ("https", "http", "ssh", "git", "file", "git+ssh")
 
 
 def is_url(address: str) -> bool:
-    """Return whether an address is a Git URL (``https://…``, ``ssh://…``, ``user@host:path``)."""
     try:
         exists = Path(address).exists()
     except OSError:  # the address is too long, or in a folder that this user cannot read
@@ -271,15 +264,10 @@ def connect(
     allow_offline: bool = False,
     only_read: bool = False,
 ) -> StateRepository:
-    """Return the state repo at an address.
+    """Return the state repo at an address: a URL, or a folder where main is not checked out.
 
-    Args:
-        address: the folder of a repository in which main is not checked out, such as a bare one,
-            or a URL.
-        folder: the folder in which the clone of a URL is made.
-        notify: called with a text before work that takes a while.
-        allow_offline: whether an existing clone may be used if its remote cannot be reached.
-        only_read: whether the address may also be the folder of a checkout.
+    The clone of a URL is made in ``folder``; with ``allow_offline``, an existing one is used if its
+    remote is away. With ``only_read``, the address may also be the folder of a checkout.
     """
     if is_url(address):
         _check_url(address)

@@ -23,33 +23,34 @@ import pygit2
 from pygit2 import Oid, Repository, Tree
 from pygit2.enums import ObjectType
 
-# ---- writes and syncs a pack and its index in Git's format ----
+# ---- a pack and its index in Git's format ----
 #
 # Each object is compressed and stored whole, not as a delta, because the search for deltas would
 # take longer than the rest of a demand's commit. Git's housekeeping makes deltas later.
 
-
 _KINDS = {ObjectType.COMMIT: 1, ObjectType.TREE: 2, ObjectType.BLOB: 3}
-# The level of compression. A pack is short-lived, so speed counts more than size.
-_LEVEL = 1
-# An index has a separate table for offsets of at least this value.
-_SHORT_OFFSETS = 1 << 31
+_LEVEL = 1  # of compression; a pack is short-lived, so speed counts more than size
+_SHORT_OFFSETS = 1 << 31  # an index has a separate table for offsets of at least this value
 
 
 class Packed(NamedTuple):
-    """An object in a pack: its id, and the checksum and the offset of its packed bytes."""
-
     oid: bytes
-    crc: int
+    crc: int  # of the packed bytes, as the offset is
     offset: int
 
 
 def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -> Path:
-    """Write a pack and its index into a folder, sync both, and return the pack's path."""
     parts = [b"PACK" + struct.pack(">II", 2, len(objects))]
     packed, offset = list[Packed](), len(parts[0])
     for oid, kind, data in objects:
-        part = _header(_KINDS[kind], len(data)) + zlib.compress(data, _LEVEL)
+        # 4 bits of the size are beside the type, 7 in each further byte; the top bit means more
+        byte, size = _KINDS[kind] << 4 | len(data) & 0xF, len(data) >> 4
+        header = bytearray()
+        while size:
+            header.append(byte | 0x80)
+            byte, size = size & 0x7F, size >> 7
+        header.append(byte)
+        part = bytes(header) + zlib.compress(data, _LEVEL)
         packed.append(Packed(oid.raw, zlib.crc32(part), offset))
         parts.append(part)
         offset += len(part)
@@ -60,19 +61,8 @@ def write_pack(folder: Path, objects: Sequence[tuple[Oid, ObjectType, bytes]]) -
     return path
 
 
-def _header(kind: int, size: int) -> bytes:
-    # 4 bits of the size are beside the type, and 7 in each further byte; the top bit means more
-    byte, size = kind << 4 | size & 0xF, size >> 4
-    header = bytearray()
-    while size:
-        header.append(byte | 0x80)
-        byte, size = size & 0x7F, size >> 7
-    header.append(byte)
-    return bytes(header)
-
-
 def index_of(packed: Iterable[Packed], checksum: bytes) -> list[bytes]:
-    """Return the bytes of the index (version 2) of a pack with this checksum, in parts."""
+    # version 2 of the format
     packed = sorted(packed)
     firsts = [item.oid[0] for item in packed]
     far = [item.offset for item in packed if item.offset >= _SHORT_OFFSETS]
@@ -106,19 +96,17 @@ def _write_synced(path: Path, parts: Iterable[bytes]) -> None:
         os.fsync(handle)
 
 
-# ---- new objects of a state repo: kept in memory, then written to the disk as one pack ----
+# ---- new objects: kept in memory, then written to the disk as one pack ----
 #
 # A pack needs a few syncs for all commits of a batch. Loose objects would need some syncs each.
 # Every new object that the commits need goes into the pack, even if the repository already has a
 # loose copy of the object. The copy may not be on the disk yet, or git may soon prune it.
 
 _TYPES = {ObjectType.COMMIT: b"commit", ObjectType.TREE: b"tree", ObjectType.BLOB: b"blob"}
-# The prefix of the folders in which packs are built.
-UNFINISHED = "demandops-pack-"
+UNFINISHED = "demandops-pack-"  # the prefix of the folders in which packs are built
 # The errors raised if a file system has no hard links, or a file has too many.
 _NO_LINKS = (errno.EPERM, errno.ENOTSUP, errno.ENOSYS, errno.EMLINK)
-# The first bytes of the index of a pack.
-_INDEX = b"\xfftOc"
+_INDEX = b"\xfftOc"  # the first bytes of the index of a pack
 
 # An entry of a tree object: the mode, the name and the raw id.
 _ENTRY = re.compile(rb"(([0-7]+) ([^\0]+)\0.{20})", re.DOTALL)
@@ -153,14 +141,12 @@ class NewObjects(pygit2.OdbBackend):
         return repo
 
     def add(self, kind: ObjectType, data: bytes) -> Oid:
-        """Keep an object in memory until it is packed, and return its id."""
         content = b"%s %d\0%s" % (_TYPES[kind], len(data), data)
         oid = Oid(raw=hashlib.sha1(content).digest())  # noqa: S324 - Git's object ids
         self._unpacked[oid] = (kind, data)
         return oid
 
     def folder(self, oid: Oid) -> Entries:
-        """Return the entries of a folder, to change and pass to :meth:`add_folder`."""
         remembered = self._folders.pop(oid, None)
         if remembered is not None:
             return remembered
@@ -170,10 +156,7 @@ class NewObjects(pygit2.OdbBackend):
         }
 
     def add_folder(self, entries: Entries) -> Oid:
-        """Keep a folder in memory until it is packed, and return its id.
-
-        The caller must not change ``entries`` afterwards.
-        """
+        # ``entries`` are kept, so the caller must not change them afterwards
         oid = self.add(ObjectType.TREE, b"".join(map(entries.__getitem__, sorted(entries))))
         self._folders[oid] = entries
         if len(self._folders) > _REMEMBERED:
@@ -190,7 +173,19 @@ class NewObjects(pygit2.OdbBackend):
         While the block runs, git's housekeeping does not remove the pack, although no reference
         leads to its commits yet.
         """
-        needed = self._needed_by(commit)
+        unpacked = {oid.raw: oid for oid in self._unpacked}
+        needed, queue = dict[Oid, None](), [commit]
+        while queue:
+            oid = queue.pop()
+            if oid in needed or oid not in self._unpacked:
+                continue
+            needed[oid] = None
+            kind, data = self._unpacked[oid]
+            if kind is ObjectType.COMMIT:
+                parsed = self.repo[oid].peel(pygit2.Commit)
+                queue += [parsed.tree_id, *parsed.parent_ids]
+            elif kind is ObjectType.TREE:
+                queue += [unpacked[raw] for raw in _ID.findall(data) if raw in unpacked]
         if not needed:
             yield
             return
@@ -204,16 +199,33 @@ class NewObjects(pygit2.OdbBackend):
     def packed_anew(self, commit: Oid, since: str) -> Iterator[None]:
         """Write a new synced pack with the objects that ``commit`` has and ``since`` lacks.
 
-        If ``since`` is no commit of the repository, the pack has all objects of ``commit``. The
-        repository has these objects, but an earlier sync of them may have failed.
+        If ``since`` is unknown here, the pack has all objects of ``commit``. The repository has
+        them already, but an earlier sync of them may have failed.
         """
         without = f"^{since}\n" if since and since in self.repo else ""
-        with self._placed(lambda folder: self._copy_to_pack(folder, f"{commit}\n{without}")):
+
+        def copy(folder: Path) -> Path:
+            done = subprocess.run(
+                # packing each object anew reads and checks it
+                ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
+                 "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
+                cwd=self.repo.path,
+                input=f"{commit}\n{without}",
+                capture_output=True,
+                text=True,
+                check=False,
+            )  # fmt: skip
+            if done.returncode:
+                raise pygit2.GitError(done.stderr.strip())
+            # iterdir, because glob would hide that the folder cannot be read
+            (pack,) = [path for path in folder.iterdir() if path.suffix == ".pack"]
+            return pack
+
+        with self._placed(copy):
             yield
 
     @contextmanager
     def _placed(self, build: Callable[[Path], Path]) -> Iterator[None]:
-        """Build a pack, move it into place, and protect it from git while the block runs."""
         packs = self._packs
         with _locked(packs, fcntl.LOCK_SH), _new_folder(self.repo.path) as folder:
             built = build(folder)
@@ -237,7 +249,7 @@ class NewObjects(pygit2.OdbBackend):
         return Path(self.repo.path) / "objects" / "pack"
 
     def clean(self) -> None:
-        """Remove files that killed processes left, unless another process writes a pack now."""
+        # of what killed processes left, unless another process writes a pack now
         with suppress(OSError), _locked(self._packs, fcntl.LOCK_EX | fcntl.LOCK_NB):
             for folder in Path(self.repo.path).glob(f"{UNFINISHED}*"):
                 shutil.rmtree(folder, ignore_errors=True)
@@ -246,39 +258,6 @@ class NewObjects(pygit2.OdbBackend):
                     is_ours = file.read(len(_INDEX)) == _INDEX
                 if is_ours:
                     keep.unlink()
-
-    def _copy_to_pack(self, folder: Path, revisions: str) -> Path:
-        done = subprocess.run(
-            # packing each object anew reads and checks it
-            ["git", "-c", "core.fsync=committed", "pack-objects", "--revs", "--quiet",
-             "--no-reuse-delta", "--no-reuse-object", f"{folder}/pack"],
-            cwd=self.repo.path,
-            input=revisions,
-            capture_output=True,
-            text=True,
-            check=False,
-        )  # fmt: skip
-        if done.returncode:
-            raise pygit2.GitError(done.stderr.strip())
-        # iterdir, because glob would hide that the folder cannot be read
-        (pack,) = [path for path in folder.iterdir() if path.suffix == ".pack"]
-        return pack
-
-    def _needed_by(self, commit: Oid) -> list[Oid]:
-        unpacked = {oid.raw: oid for oid in self._unpacked}
-        needed, queue = dict[Oid, None](), [commit]
-        while queue:
-            oid = queue.pop()
-            if oid in needed or oid not in self._unpacked:
-                continue
-            needed[oid] = None
-            kind, data = self._unpacked[oid]
-            if kind is ObjectType.COMMIT:
-                parsed = self.repo[oid].peel(pygit2.Commit)
-                queue += [parsed.tree_id, *parsed.parent_ids]
-            elif kind is ObjectType.TREE:
-                queue += [unpacked[raw] for raw in _ID.findall(data) if raw in unpacked]
-        return list(needed)
 
     # ---- called by libgit2 ----
 

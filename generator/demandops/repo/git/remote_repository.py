@@ -89,8 +89,7 @@ _REMEDIES = (
 _AMBIGUOUS = re.compile(r"dst refspec \S+ matches more than one")
 _POLL_S = 0.02
 _DOING = {"fetch": "fetching", "push": "pushing to", "fsck": "checking the clone of"}
-# Git ends an idle HTTP transfer much earlier.
-_CLONE_TIMEOUT_S = 3600
+_CLONE_TIMEOUT_S = 3600  # Git ends an idle HTTP transfer much earlier
 # This machine's disk, not the server's, whose errors begin with ``remote:``.
 _NO_ROOM = re.compile(r"^(?!remote:).*No space left on device", re.MULTILINE)
 # Git's errors about its own clone: unreadable, or without the remote ``origin``.
@@ -205,10 +204,7 @@ class RemoteRepository(StateRepository):
         partial.rename(self._folder)
 
     def _fetch(
-        self,
-        repo: git.Repo,
-        urgent: Callable[[], bool] = lambda: False,
-        timeout: float = TIMEOUT_S,
+        self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False, timeout: float = TIMEOUT_S
     ) -> None:
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.
@@ -238,39 +234,27 @@ class RemoteRepository(StateRepository):
         try:
             self.objects.references.create(_REMOTE_MAIN, commit, force=True)
         except (pygit2.GitError, OSError) as error:  # the next fetch moves the reference
-            log.warning(
-                "commit %s was pushed, but the clone %s cannot record this: %s",
-                commit,
-                self._folder,
-                error,
-            )
+            text = "commit %s was pushed, but the clone %s cannot record this: %s"
+            log.warning(text, commit, self._folder, error)
         return True
 
     def list_references(self, *patterns: str) -> dict[str, str]:
-        """Return the remote's references that match ``patterns``, as name → commit.
-
-        The patterns are those of ``git ls-remote``. Raises Unavailable if git cannot read now.
-        """
+        # name → commit; the patterns are those of ``git ls-remote``
         out = self._read_remote(self._git, ("ls-remote",), *patterns)
         pairs = (line.split("\t", 1) for line in out.splitlines() if "\t" in line)
         return {name: commit for commit, name in pairs}
 
     def fetch_branches(self, prefix: str) -> None:
-        """Fetch the branches whose names begin with ``prefix``, or raise Unavailable.
-
-        If the remote has deleted such a branch, this clone deletes its copy of the branch.
-        """
+        # what the remote has deleted, this clone deletes too
         spec = f"+refs/heads/{prefix}*:refs/remotes/origin/{prefix}*"
         self._read_remote(self._git, ("fetch", "--no-tags", "--prune"), spec)
 
     def push(self, spec: str, lease: str, options: Sequence[str] = ()) -> str:
         """Push one reference and return git's output, or raise GitCommandError.
 
-        Args:
-            spec: ``<commit>:<reference>``, or ``:<reference>`` to delete it.
-            lease: ``<reference>:<commit>``: the remote's reference must have this commit; if the
-                commit is empty, the reference must not exist.
-            options: options for the server (``git push --push-option``).
+        ``spec`` is ``<commit>:<reference>``, or ``:<reference>`` to delete it. ``lease`` is
+        ``<reference>:<commit>``: the commit that the remote's reference must have; if it is empty,
+        the reference must not exist. ``options`` are those of ``git push --push-option``.
         """
         push_options = [f"--push-option={option}" for option in options]
         command = ("push", "--porcelain", *push_options, f"--force-with-lease={lease}", "origin")
@@ -293,10 +277,8 @@ class RemoteRepository(StateRepository):
     def push_error(self, error: git.GitCommandError) -> StateRepoError:
         """Return PushDenied if another attempt at a push would fail too, else Unavailable."""
         text = without_secrets(f"{error.stdout}\n{error.stderr}")
-        if _NO_ROOM.search(text):
-            return self._disk_full()
-        if _NO_CLONE.search(text):
-            return self._unreadable()
+        if error_here := self._error_of_clone(text):
+            return error_here
         rejected, reason = _REMOTE_REJECTED.search(text), _reason(text)
         if rejected:
             message = " ".join(line.strip(" '") for line in _REMOTE_MESSAGE.findall(text)).strip()
@@ -323,10 +305,8 @@ class RemoteRepository(StateRepository):
             text = without_secrets(str(error.stderr))
         if "couldn't find remote ref" in text:
             raise missing_main(self.address)
-        if _NO_ROOM.search(text):
-            raise self._disk_full()
-        if _NO_CLONE.search(text):
-            raise self._unreadable()
+        if error_here := self._error_of_clone(text):
+            raise error_here
         failed = "read" if command[0] == "ls-remote" else "fetched"
         reason = _reason(text)
         remediable = _NO_FILE.sub("", reason)  # credentials do not make a file readable
@@ -339,11 +319,13 @@ class RemoteRepository(StateRepository):
             "check the clone's owner and disk, then start again, which replaces a damaged clone"
         )
 
-    def _disk_full(self) -> DiskFull:
-        return DiskFull(
-            f"{self.address} cannot be fetched or pushed: the disk of {self._folder} has no room; "
-            "free some"
-        )
+    def _error_of_clone(self, text: str) -> Unavailable | None:
+        if _NO_ROOM.search(text):
+            return DiskFull(
+                f"{self.address} cannot be fetched or pushed: the disk of {self._folder} has no "
+                "room; free some"
+            )
+        return self._unreadable() if _NO_CLONE.search(text) else None
 
     def _run_git(
         self,
@@ -400,7 +382,6 @@ class RemoteRepository(StateRepository):
 
 
 def _terminate(process: subprocess.Popen[bytes]) -> tuple[bytes, bytes]:
-    """End git and its children, and return git's standard output and error output."""
     # first by SIGTERM, so that git can remove its locks
     for number, patience in ((signal.SIGTERM, 1.0), (signal.SIGKILL, None)):
         with suppress(ProcessLookupError):

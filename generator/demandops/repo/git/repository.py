@@ -1,8 +1,4 @@
-"""The base class of state repos: Git objects, and a tip that only moves forward.
-
-A state repo is on this disk or behind a URL. Each of the two has a subclass, and
-:mod:`.open_repository` chooses between them.
-"""
+"""The base class of state repos, on this disk or behind a URL, and the errors of both."""
 
 from __future__ import annotations
 
@@ -44,10 +40,7 @@ def git_environment() -> dict[str, str]:
 
 
 class Unavailable(StateRepoError):
-    """Raised when the state repo cannot be read or written now, but perhaps later.
-
-    Then a generator keeps its demands in the journal and tries again.
-    """
+    """Raised when the state repo cannot be read or written now; demands stay in the journal."""
 
 
 class RemoteAway(Unavailable):
@@ -63,10 +56,7 @@ class FetchInterrupted(StateRepoError):
 
 
 class PushDenied(StateRepoError):
-    """Raised when a write fails for a reason that another attempt does not change.
-
-    Examples are a hook, a protected branch, missing rights and a read-only file system.
-    """
+    """Raised when a write fails for a lasting reason, such as a hook or a protected branch."""
 
 
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
@@ -116,11 +106,8 @@ def unopened(folder: Path, error: Exception) -> StateRepoError | None:
 
 
 def access_error(error: Exception, address: str, objects: Repository | None = None) -> Exception:
-    """Return the error to raise if reading or writing ``address`` failed with ``error``.
-
-    An error that is neither of the system nor of libgit2 is returned unchanged. With ``objects``,
-    the text names the file and the commit of an object that cannot be read.
-    """
+    # An error that is neither of the system nor of libgit2 is returned unchanged. With ``objects``,
+    # the text names the file and the commit of an object that cannot be read.
     is_missing = isinstance(error, KeyError) and isinstance(error.args[0], Oid)
     if not (is_missing or isinstance(error, OSError | pygit2.GitError)):
         return error
@@ -147,11 +134,8 @@ def reading(address: str, objects: Repository) -> Iterator[None]:
 
 
 class StateRepository(ABC):
-    """A state repo: Git objects to read and write, and a tip.
-
-    :meth:`publish` only moves the tip forward. :meth:`refresh` may move it back, if somebody has
-    rewritten main.
-    """
+    # `publish` only moves the tip forward. `refresh` may move it back, if somebody has
+    # rewritten main.
 
     objects: Repository
     new: NewObjects
@@ -160,8 +144,7 @@ class StateRepository(ABC):
     runtime: Runtime = REAL
     # called again and again while this waits for git
     while_waiting: Callable[[], object] = staticmethod(lambda: None)
-    # whether the tip needs no fetch, as in a repository on this disk
-    always_current: bool
+    always_current: bool  # whether the tip needs no fetch, as in a repository on this disk
     _tidying: subprocess.Popen[bytes] | None = None
     # of the tip: main, its remote-tracking branch, or HEAD of a checkout
     main_reference = MAIN
@@ -169,7 +152,6 @@ class StateRepository(ABC):
     branches = "refs/heads/"
 
     def tip(self) -> Oid:
-        """Return the newest published commit that is known here, without asking the remote."""
         target = self.objects.references[self.main_reference].target
         assert isinstance(target, Oid)  # noqa: S101 - a branch points to a commit
         return target
@@ -179,8 +161,7 @@ class StateRepository(ABC):
         """Fetch and return the newest published commit.
 
         If ``urgent`` returns true before the fetch ends, git is ended and FetchInterrupted is
-        raised, so that a demand need not wait. Raises Unavailable if git cannot fetch now, and
-        StateRepoError if the state repo has no main.
+        raised, so that a demand need not wait.
         """
 
     @abstractmethod
@@ -188,13 +169,8 @@ class StateRepository(ABC):
         """Make ``commit``, a descendant of ``expected``, the tip, durably, and return true.
 
         If the current tip is not ``expected``, or another writer holds the lock of main, change
-        nothing and return false.
-
-        Raises:
-            Unavailable: the commit was not published, or nobody knows whether the remote got it. So
-                look for the commit before you publish it again.
-            PushDenied: the commit was not published, and another attempt would fail too.
-            Unsound: the disk failed, and nobody knows whether the commit was published.
+        nothing and return false. After Unavailable, nobody knows whether the remote got the commit,
+        so look for it before you publish it again. After PushDenied, it is not published.
         """
 
     def write_anew(self, since: str) -> None:  # noqa: B027 - a remote confirms what it stored
@@ -214,7 +190,6 @@ class StateRepository(ABC):
             return False
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether ``path`` exists and is equal in two commits that are known here."""
         pair = self._trees(commit, other)
         if pair is None:
             return False
@@ -223,7 +198,6 @@ class StateRepository(ABC):
         return trees.entry(pair[0], path) is not None and not trees.differ(*pair, (path,))
 
     def changed_paths(self, since: str, commit: str) -> list[str] | None:
-        """Return the sorted paths of the files that differ; None if a commit is unknown here."""
         pair = self._trees(since, commit)
         return None if pair is None else sorted(path for path, _ in trees.differences(*pair))
 
@@ -236,11 +210,7 @@ class StateRepository(ABC):
 
     @abstractmethod
     def renew_if_damaged(self) -> bool:
-        """Let git check the files, and replace a damaged clone; return whether it was replaced.
-
-        Raises Unavailable if damaged files cannot be replaced now, and StateRepoError if there is
-        nothing to replace them from.
-        """
+        """Let git check the files, and replace a damaged clone; return whether it was replaced."""
 
     def abort(self) -> None:  # noqa: B027 - a repository on this disk has nothing to end
         """End the running transfer with a remote, if any; later ones raise RemoteAway."""

@@ -19,12 +19,11 @@ from demandops.repo.git import child_processes
 from demandops.repo.git import tree as trees
 from demandops.repo.git.objects import NewObjects
 
-# ---- commits signed by an SSH key, in the same way as git signs them ----
+# ---- signing with an SSH key, in the same way as git ----
 #
 # ``ssh-keygen`` signs the commit's bytes, and the signature goes into the header ``gpgsig``, so
 # ``git verify-commit`` accepts it, and so do forges that check SSH signatures. This module knows
 # only the key's path; ``ssh-keygen`` reads the key or asks an SSH agent.
-
 
 _TIMEOUT_S = 20
 
@@ -97,12 +96,11 @@ def _key_fault(key: Path, output: str) -> str:
 def create_commit(
     objects: NewObjects,
     signer: Signer | None,
-    people: tuple[Signature, Signature],
+    people: tuple[Signature, Signature],  # author and committer
     text: str,
     tree: Oid,
     parents: Sequence[Oid],
 ) -> Oid:
-    """Add a commit by ``people`` (author, committer) to ``objects``, and return its id."""
     content = str(objects.repo.create_commit_string(*people, text, tree, list(parents)))
     if signer is not None:
         head, end, message = content.partition("\n\n")
@@ -112,7 +110,7 @@ def create_commit(
     return objects.add(ObjectType.COMMIT, content.encode())
 
 
-# ---- signatures of the generator's commits, checked against the keys that people allow ----
+# ---- checking against the keys that people allow ----
 #
 # People list the keys in ``policy/allowed-signers`` (ssh-keygen's ALLOWED SIGNERS format). The list
 # in the commit's parent counts, so that a commit cannot allow its own key. One git process checks

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-# How many seconds git may take before the listener is called.
-AFTER_S = 1
+AFTER_S = 1  # how many seconds git may take before the listener is called
 
 _listeners: list[Callable[[str], None]] = []
 
 
 def listen(listener: Callable[[str], None]) -> None:
-    """Register a listener in place of an earlier one.
-
-    A slow run of git calls the listener each second with a text about what git does, and with an
-    empty text when git has ended.
-    """
+    # It replaces the earlier one. A slow run of git calls it each second with a text about what git
+    # does, and with an empty text when git has ended.
     _listeners[:] = [listener]
 
 
@@ -24,7 +20,6 @@ class SlowGit:
         self._what, self._told = what, 0
 
     def lasts(self, seconds: float) -> None:
-        """Call the listener once for each full second, however often this is called."""
         if int(seconds) > self._told and int(seconds) >= AFTER_S:
             self._told = int(seconds)
             for listener in _listeners:

@@ -12,7 +12,7 @@ from pygit2.enums import FileMode, ObjectType, SortMode
 
 from demandops.base.errors import StateRepoError
 from demandops.base.quoting import quoted
-from demandops.repo.git.objects import Entries, NewObjects
+from demandops.repo.git.objects import NewObjects
 
 # Sync the files that libgit2 writes, so that a commit is on the disk before anybody learns of it.
 pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
@@ -20,16 +20,12 @@ pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
 pygit2.option(pygit2.enums.Option.SET_CACHE_OBJECT_LIMIT, pygit2.enums.ObjectType.TREE, 1 << 20)
 
 
-# How many folders deep a file may be; deeper folders are not read.
-MAX_DEPTH = 64
+MAX_DEPTH = 64  # how many folders deep a file may be; deeper folders are not read
 
 
 def commit_of(repo: Repository, commit: str | Oid) -> Commit:
-    """Return the commit with a whole id, or raise StateRepoError.
-
-    An id as text may come from a trailer or the journal, so it may be any text. What people write
-    is read by :func:`.revisions.resolve`.
-    """
+    # An id as text may come from a trailer or the journal, so it may be any text. What people write
+    # is read by `revisions.resolve`.
     try:
         if isinstance(commit, str) and not re.fullmatch("[0-9a-f]{40}", commit):
             raise StateRepoError(f"{quoted(commit)} is no commit's id of 40 hexadecimal digits")
@@ -46,10 +42,7 @@ def commit_of(repo: Repository, commit: str | Oid) -> Commit:
 
 
 def place_of(repo: Repository, wanted: Oid) -> str | None:
-    """Return which file or folder of which of the newest commits has an object.
-
-    The object itself may be missing.
-    """
+    """Return where the newest commits have an object, which itself may be missing."""
     seen = set[Oid]()
 
     def path_in(tree: Tree, prefix: str) -> str | None:
@@ -99,7 +92,6 @@ def read_text(tree: Tree | None, path: str) -> str | None:
 
 
 def text_of(blob: Object) -> str:
-    """Return the text of a file, or an empty text for any other object."""
     # a person's file in another encoding must give a fault of its content, not an exception
     return blob.data.decode("utf-8", "replace") if isinstance(blob, Blob) else ""
 
@@ -132,22 +124,17 @@ def _printable(name: bytes) -> str:
 
 
 def blobs(tree: Tree, roots: Iterable[str]) -> Iterator[tuple[str, Blob]]:
-    """Yield (path, file) of every file and link at or below the paths ``roots``, in Git's order."""
     for path, child in entries(tree, roots):
         if isinstance(child, Blob):
             yield path, child
 
 
 def is_file(child: Object) -> bool:
-    """Return whether an entry is a file, not a link, submodule or folder."""
     return isinstance(child, Blob) and child.filemode != FileMode.LINK
 
 
 def texts(tree: Tree, roots: Iterable[str]) -> dict[str, str]:
-    """Return all files at or below the paths ``roots``, as path → text.
-
-    The text of a link is the path that it points to.
-    """
+    # the text of a link is the path that it points to
     return {path: text_of(blob) for path, blob in blobs(tree, roots)}
 
 
@@ -158,11 +145,10 @@ def differ(one: Tree | None, other: Tree | None, paths: Iterable[str]) -> bool:
 def differences(
     before: Tree | None, after: Tree | None, roots: Iterable[str] = ()
 ) -> Iterator[tuple[str, Oid | None]]:
-    """Yield (path, new id) of each file that differs between two trees.
+    """Yield the path of each file that differs, and its id in ``after``, None if it was removed.
 
-    The new id is the file's id in ``after``, or None if the file was removed. Only files at or
-    below the paths ``roots`` are compared; by default all files. A file whose mode alone changed,
-    and a file deeper than :data:`MAX_DEPTH`, is left out. Equal subtrees are not read.
+    Without ``roots``, all files are compared. A file whose mode alone changed, and a file deeper
+    than :data:`MAX_DEPTH`, is left out. Equal subtrees are not read.
     """
     if not roots:
         yield from _differences_below(before, after, "")
@@ -198,23 +184,25 @@ def is_readme(path: str) -> bool:
 
 
 def write(objects: NewObjects, base: Tree | None, files: Mapping[str, str | None]) -> Oid:
-    """Write the tree ``base`` with the changes in ``files``, and return the new tree's id.
+    """Write the tree ``base`` with the changes in ``files``, where None removes a file or folder.
 
-    ``files`` maps paths to new texts; None removes the file or folder. Only the folders above a
-    changed file are written again. A folder that becomes empty is removed, because Git has no empty
-    folders.
+    Only the folders above a changed file are written again.
     """
     return _write(objects, base.id if base is not None else None, files) or objects.add_folder({})
 
 
 def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None]) -> Oid | None:
-    """Write a folder with all below it; return its id, or None if the folder is empty."""
+    # None if the folder becomes empty, because Git has no empty folders
     entries = objects.folder(base) if base is not None else {}
     below: dict[bytes, dict[str, str | None]] = {}
     here: dict[bytes, str | None] = {}
     for path, text in files.items():
         folder_name, _, inner_path = path.partition("/")
-        raw_name = _raw_name(folder_name, entries)
+        raw_name = folder_name.encode()
+        if raw_name not in entries and b"\\" in raw_name:
+            # a backslash may stand for a byte that is not UTF-8
+            names = (key.removesuffix(b"/") for key in entries)
+            raw_name = next((name for name in names if _printable(name) == folder_name), raw_name)
         if inner_path:
             below.setdefault(raw_name, {})[inner_path] = text
         else:
@@ -238,12 +226,3 @@ def _write(objects: NewObjects, base: Oid | None, files: Mapping[str, str | None
             entries.pop(name, None)
             entries.pop(name + b"/", None)
     return objects.add_folder(entries) if entries else None
-
-
-def _raw_name(name: str, entries: Entries) -> bytes:
-    """Return the raw name of the entry that the program shows as ``name``; if none, in UTF-8."""
-    raw = name.encode()
-    if raw in entries or b"\\" not in raw:  # a backslash may stand for a byte that is not UTF-8
-        return raw
-    raw_names = (key.removesuffix(b"/") for key in entries)
-    return next((known for known in raw_names if _printable(known) == name), raw)

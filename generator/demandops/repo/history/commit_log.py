@@ -20,7 +20,7 @@ from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.tree import commit_of
 
-# ---- the text of commit messages: paragraphs of lines, and trailers in the last paragraph ----
+# ---- the text of messages: paragraphs of lines, and trailers in the last paragraph ----
 #
 # Only this module writes and reads messages. A line of a paragraph is for people: its text is
 # escaped and shortened. A trailer is for programs: its value is read back exactly. A value of
@@ -28,7 +28,6 @@ from demandops.repo.git.tree import commit_of
 # --format='%(trailers:key=Requester)'`` shows it; any other value is written in double quotes with
 # escapes like ``\u202e``. So no value can begin a line, end the message, look like a trailer or
 # give a forge an order. Messages of earlier versions, which did not quote, are read the same way.
-
 
 Trailers = Iterable[tuple[str, str]]
 
@@ -50,10 +49,7 @@ class MessageText:
 
 
 def compose(paragraphs: Iterable[Iterable[str]], trailers: Trailers) -> str:
-    """Return a message: paragraphs, each a list of lines, then the trailers.
-
-    Empty paragraphs, and trailers with an empty value, are left out.
-    """
+    # without empty paragraphs and trailers
     lines = [f"{key}: {_encoded(key, value)}" for key, value in trailers if value]
     body = ("\n".join(harmless(one_line(line)) for line in lines) for lines in paragraphs)
     return "\n\n".join(text for text in (*body, "\n".join(lines)) if text) + "\n"
@@ -69,7 +65,9 @@ def parse(message: str) -> MessageText:
         if not colon or not _KEY.fullmatch(key):
             trailers.clear()  # a paragraph with any other line is text for people
             break
-        trailers.setdefault(key, []).append(_decoded(value))
+        if _QUOTED.fullmatch(value):
+            value = _ESCAPES.sub(_unescaped, value[1:-1])
+        trailers.setdefault(key, []).append(value)
     return MessageText(lines[0], next(whys, ""), trailers)
 
 
@@ -81,18 +79,12 @@ def _encoded(key: str, value: str) -> str:
     return f'"{_EDGES.sub(_SPACE, harmless(text))}"'
 
 
-def _decoded(text: str) -> str:
-    if not _QUOTED.fullmatch(text):
-        return text
-    return _ESCAPES.sub(
-        lambda escape: (
-            escape[0][1] if escape[0][1] in '\\"' else escape[0].encode().decode("unicode_escape")
-        ),
-        text[1:-1],
-    )
+def _unescaped(escape: re.Match[str]) -> str:
+    letter = escape[0][1]
+    return letter if letter in '\\"' else escape[0].encode().decode("unicode_escape")
 
 
-# ---- the state repo's history: commits with their trailers, and which commits changed a path ----
+# ---- the history: commits with their trailers, and which commits changed a path ----
 #
 # Everything comes from commit messages, trailers and ``git log -- <path>``, so plain git shows the
 # same.
@@ -101,8 +93,7 @@ def _decoded(text: str) -> str:
 PROPOSAL = "Proposal"
 # The trailer with the branch and commit where the demand was proposed with other content.
 REPLACES = "Replaces"
-# The trailer, repeated, with what requires the approval.
-REQUIRED_BY = "Approval-Required-By"
+REQUIRED_BY = "Approval-Required-By"  # the trailer, repeated, with what requires the approval
 
 # The committer of every commit by a generator.
 GENERATOR_NAME = "DemandOps generator"
@@ -133,11 +124,11 @@ class LogEntry:
 
 
 def time_of(commit: Commit) -> datetime:
-    """Return the committer's time, but none before 1970 or after the year 9999."""
     return _time(commit.commit_time)
 
 
 def _time(seconds: int) -> datetime:
+    # none before 1970 or after the year 9999
     return datetime.fromtimestamp(min(max(seconds, 0), _LAST_SECOND), tz=timezone.utc)
 
 
@@ -169,14 +160,13 @@ def entry_of(commit: Commit) -> LogEntry:
 
 
 def is_by_generator(repo: Repository, commit: Commit) -> bool:
-    """Return whether the generator made a commit, and signed it if a signature is required."""
+    # signed, if a signature is required
     return entry_of(commit).by_generator and not signing.faults(repo, [commit])
 
 
 def commits(
     repo: Repository, tip: str | Oid, after: str | Oid | None = None
 ) -> Iterator[tuple[Commit, LogEntry]]:
-    """Yield ``tip`` and its ancestors without ``after`` and its ancestors, the newest first."""
     walker = repo.walk(commit_of(repo, tip).id, SortMode.TOPOLOGICAL)
     walked: Iterable[Commit] = walker
     if after is not None:
@@ -274,7 +264,6 @@ def operations_since(repo: Repository, tip: str | Oid, base: str) -> dict[str, R
 
 
 def last_generator_commit(repo: Repository, tip: Oid) -> Oid | None:
-    """Return the newest commit of the generator along the first parents, or None."""
     line = first_parents(repo, tip)
     return next((commit.id for commit in line if is_by_generator(repo, commit)), None)
 
@@ -288,24 +277,15 @@ class PathChange:
 
 @dataclass(frozen=True, slots=True)
 class PathHistory:
-    """The commits that changed a path since it was added for the last time.
-
-    ``started`` is the commit that added the path. ``newest`` lists the commits that changed the
-    path afterwards, newest first. ``more`` counts the older changes, which are not listed.
-    ``stopped`` is the commit that removed the path, or None if the path exists. If the path never
-    existed, ``started`` and ``stopped`` are None.
-    """
-
-    started: LogEntry | None
-    newest: tuple[LogEntry, ...]
-    more: int
-    stopped: LogEntry | None
+    started: LogEntry | None  # added the path; None if it never existed
+    newest: tuple[LogEntry, ...]  # changed it afterwards, newest first
+    more: int  # older changes, which are not listed
+    stopped: LogEntry | None  # removed the path; None if it exists or never did
 
 
 def changes_to(
     repo: Repository, tip: str | Oid, path: str, after: str | None = None
 ) -> Iterator[PathChange]:
-    """Yield the commits after ``after`` that changed a path, newest first, as ``git log`` does."""
     for revision in _git_log(repo, tip, after, "--format=%H", f":(literal){path}"):
         commit = commit_of(repo, revision)
         before = any(trees.entry(parent.tree, path) is not None for parent in commit.parents)
@@ -330,7 +310,6 @@ def history_of(repo: Repository, tip: str | Oid, path: str, most: int) -> PathHi
 
 
 def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
-    """Return the path of the file of the release ``name``, or its last path if it was stopped."""
     if not _NAME.fullmatch(name):
         return None
     files = trees.blobs(commit_of(repo, tip).tree, (CLUSTERS_ROOT,))
@@ -339,14 +318,12 @@ def release_path(repo: Repository, tip: str | Oid, name: str) -> str | None:
 
 
 def stopped_release_names(repo: Repository, tip: str | Oid) -> set[str]:
-    """Return the names of all releases that were ever stopped or moved; some may run again."""
     removed = _removed(repo, tip, "*.yaml")
     names = {path.rsplit("/", 1)[-1].removesuffix(".yaml") for path in removed}
     return {name for name in names if _NAME.fullmatch(name)}  # a chart's file has a version
 
 
 def _removed(repo: Repository, tip: str | Oid, file: str, *more: str) -> list[str]:
-    """Return the paths of the files below domains that commits removed, the last removal first."""
     options = ("--diff-filter=D", "--no-renames", *more, "--format=", "--name-only")
     return _git_log(repo, tip, None, *options, f":(glob){CLUSTERS_ROOT}/*/*/*/{file}")
 

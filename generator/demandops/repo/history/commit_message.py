@@ -34,12 +34,11 @@ from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME, REPLACES, compose
 
-# ---- commit messages: what changed in the desired state and why, for people and programs ----
+# ---- messages: what changed in the desired state and why, for people and programs ----
 #
 # The trailers are a contract: an auditor without this program finds everything with ``git log
 # --format='%(trailers:key=Requester)'``. Values from outside appear in a message only as
 # :mod:`.commit_log` quotes them. :mod:`.state_in_effect` adds the trailers about quarantined files.
-
 
 _SIGNS = {"start": "+", "change": "~", "stop": "-"}
 _MAX_AUTHOR = 200
@@ -62,7 +61,6 @@ def generator_signature(time: datetime) -> pygit2.Signature:
 
 
 def author(decision: Decision, received: datetime) -> pygit2.Signature:
-    """Return the author of the commit: the demand's requesters, or who ran the command."""
     request = decision.request
     if isinstance(request, Restoration):
         return signature(request.by, request.email, received)
@@ -216,16 +214,8 @@ def of_follow(
     *,
     reports: bool = True,
 ) -> str:
-    """Return the message of a commit that renders people's changes of the state repo.
-
-    Args:
-        releases: the releases that the commit changes.
-        cause: the newest commit whose changes are rendered.
-        since: the commit whose state was in effect before these changes.
-        problems: the faults of invalid files.
-        more: further trailers.
-        reports: whether the commit changes the problem report.
-    """
+    # ``cause`` is the newest commit whose changes are rendered, and ``since`` the one whose state
+    # was in effect before them. ``reports`` says whether the problem report changes.
     problems, releases = list(problems), tuple(releases)
     names, after = ", ".join(release.name for release in releases), f" after commit {cause[:12]}"
     title = f"Update ledger{after}"
@@ -255,10 +245,7 @@ def of_override_end(
     keys: Iterable[ClaimKey],
     more: Iterable[tuple[str, str]] = (),
 ) -> str:
-    """Return the message of the commit that ends an expired override.
-
-    ``keys`` are those of the claims that this changes, of demands and of ``keep`` overrides.
-    """
+    # ``keys`` are of the claims that this changes, of demands and of ``keep`` overrides
     end = format_time(override.end) if override.end else ""
     paragraphs = [
         [f"End override {override.name}"],
@@ -304,7 +291,6 @@ def keep_override_paths(keys: Iterable[ClaimKey]) -> list[str]:
 
 
 def demand_trailers(keys: Iterable[ClaimKey]) -> list[tuple[str, str]]:
-    """Return a trailer for each demand that has one of these claims; overrides have none."""
     demands = {key.demand for key in keys if not key.demand.startswith(OVERRIDE_PREFIX)}
     return [("Demand-Id", demand) for demand in sorted(demands)]
 
@@ -321,7 +307,7 @@ def _desired_state(releases: tuple[ReleaseChange, ...]) -> list[str]:
     return lines
 
 
-# ---- authors: which person made a commit or caused a follow commit, and who runs this program ----
+# ---- authors: who made a commit or caused a follow commit, and who runs this program ----
 #
 # A follow commit is made by the generator, and renders what people committed. Its trailers name
 # people's commits, and its author names these people. A commit is by a person if no generator on
@@ -333,14 +319,12 @@ _NO_ADDRESS = "@demandops.invalid"
 
 
 class Person(NamedTuple):
-    """The name and e-mail address of a person; ``str`` gives ``name <email>``, as git does."""
-
     name: str
     email: str
 
     @property
     def is_known(self) -> bool:
-        """Whether git knows the address. If not, the address is ``<login>@demandops.invalid``."""
+        # if git knows no address, it is ``<login>@demandops.invalid``
         return not self.email.endswith(_NO_ADDRESS)
 
     def __str__(self) -> str:
@@ -348,17 +332,13 @@ class Person(NamedTuple):
 
 
 def person_commits_since(repo: Repository, known: Oid, to: Oid) -> list[Commit]:
-    """Return people's commits since ``known`` that change files of the generator, newest first."""
     commits = commit_log.person_commits(repo, to, known)
     return [commit for commit in commits if _touches(commit, _ROOTS)]
 
 
 def fault_origin(repo: Repository, known: Oid, to: Oid) -> Callable[[str], tuple[str, str] | None]:
-    """Return a function from a file with a fault to the id and author of the commit that caused it.
-
-    This is the last person's commit that changed the file, else the last one that changed any file
-    of the generator, else None.
-    """
+    # A fault is caused by the last person's commit that changed its file, else by the last one that
+    # changed any file of the generator. The function returns the commit's id and author.
 
     @cache  # the commits are read only when needed: most problems are already in the report
     def commits() -> list[Commit]:
@@ -384,7 +364,7 @@ def author_of(commit: Commit) -> Person:
 
 
 def caused_by_trailers(causes: Sequence[Commit]) -> list[tuple[str, str]]:
-    """Return trailers for the newest of ``causes``, whose newest is first; in time's order."""
+    # of the newest causes, whose newest is first, in time's order
     named = reversed(causes[:_MOST_NAMED])
     return [("Caused-By", f"{commit.id} {author_of(commit)}") for commit in named]
 
@@ -400,7 +380,6 @@ def follow_author(causes: Sequence[Commit], now: datetime) -> pygit2.Signature:
 
 
 def operator(folder: str | None = None) -> Person:
-    """Return who runs this program, as git knows this person, else by the login."""
     try:
         login = getpass.getuser()
     except (KeyError, OSError):  # a container's user has no passwd entry

@@ -36,15 +36,10 @@ _LONGEST = 250  # bytes; a file system takes no longer name of a branch
 
 
 def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | None:
-    """Return the time that a text names, or None.
+    """Return the time that a date, a time of day, both, or a duration before ``now`` names.
 
-    Args:
-        text: a date, a time of day, a date with a time of day, or a duration before ``now``
-            (``2h``, ``1h30m``, ``2d ago``). A time of day without a date means its last occurrence
-            before ``now``.
-        now: the current time, with a time zone.
-        end: whether a date means the end of its day, and a time without seconds the end of its
-            minute, not the beginning.
+    A time of day without a date means its last occurrence before ``now``. With ``end``, a date
+    means the end of its day, and a time without seconds the end of its minute.
     """
     text = text.strip()
     try:
@@ -69,11 +64,8 @@ def parse_time(text: str, now: datetime, *, end: bool = False) -> datetime | Non
 
 
 def resolve(repo: Repository, tip: Oid, text: str, now: datetime) -> Commit:
-    """Return the commit that a text from outside names, or raise StateRepoError.
-
-    The text is a time, or the name of a branch or tag, or 4 to 40 digits of an id. A name or an id
-    may be followed by ``~N`` or ``^``, which count along the first parents. ``HEAD`` means ``tip``.
-    """
+    # The text is from outside: a time, the name of a branch or tag, or 4 to 40 digits of an id. A
+    # name or id may be followed by ``~N`` or ``^``, along the first parents. ``HEAD`` is ``tip``.
     # libgit2 never parses the text: its own grammar has searches, some of which crash it.
     text = text.strip(" ")
     is_plain = text.isprintable() and len(text.encode(errors="replace")) <= _LONGEST
@@ -101,7 +93,14 @@ def _commit_named(
     # a branch may be named like a time, such as 2026-01-31
     at = None if names or steps else parse_time(base, now, end=True)
     if at is not None:
-        return commit_at_time(repo, tip, at)
+        latest = int(at.timestamp())
+        for commit in commit_log.first_parents(repo, tip):
+            if commit.commit_time <= latest:
+                return commit
+        raise StateRepoError(
+            f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
+            f"{format_time(commit_log.time_of(commit))}"
+        )
     commits = {name: repo.references[name].peel(Commit) for name in names}
     if base == "HEAD":
         commits[base] = commit_of(repo, tip)
@@ -140,18 +139,5 @@ def _names(repo: Repository, base: str) -> list[str]:
     return names or [tracked for _ in valid[:1] if tracked in repo.references]
 
 
-def commit_at_time(repo: Repository, tip: Oid, at: datetime) -> Commit:
-    latest = int(at.timestamp())
-    for commit in commit_log.first_parents(repo, tip):
-        if commit.commit_time <= latest:
-            return commit
-    first = commit_log.time_of(commit)
-    raise StateRepoError(
-        f"at {format_time(at)} the state repo did not exist yet; its first commit is of "
-        f"{format_time(first)}"
-    )
-
-
 def format_time(at: datetime) -> str:
-    """Return a time as messages show it: ``2026-01-31 14:03:00 UTC``."""
     return at.astimezone(timezone.utc).strftime("%Y-%m-%d %H:%M:%S UTC")

@@ -18,13 +18,11 @@ from demandops.model.ledger import records
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log
 
-# ---- the problem report: a file in the state repo that lists the invalid files ----
+# ---- the problem report, which lists the invalid files ----
 #
 # The report names the first 100 faults and counts the others. A fault has the commit that caused it
 # and the author of the commit, if the commit was found. The same problems give the same bytes, so
-# an unchanged report causes no commit. This module only converts between problems and text; it
-# reads and writes no files.
-
+# an unchanged report causes no commit.
 
 PATH = f"{NOTES_ROOT}/reports/problems.yaml"
 _HEAD = (
@@ -44,8 +42,7 @@ class Problem:
     message: str
     since: str = ""
     author: str = ""
-    # not written to the report: ``Reader.problems`` finds it in the file
-    line: int | None = None
+    line: int | None = None  # not written to the report: ``Reader.problems`` finds it in the file
 
     def __str__(self) -> str:
         places = (place_text(self.file, self.line), self.field)
@@ -62,7 +59,7 @@ Origin = Callable[[str], tuple[str, str] | None]
 def with_origins(
     faults: Iterable[Fault], reported: Iterable[Problem], origin: Origin
 ) -> tuple[Problem, ...]:
-    """Return a problem for each fault, with the commit and author of one that is ``reported``."""
+    # a problem that is reported already keeps its commit and author
     existing = {(old.file, old.field, old.message): old for old in reported if old.since}
     places = sorted({(fault.file, fault.field, fault.message) for fault in faults})
     problems = []
@@ -111,7 +108,7 @@ def read(text: str | None) -> tuple[Problem, ...]:
     )
 
 
-# ---- the configuration at a commit, with the last valid versions of invalid files ----
+# ---- the configuration, with the last valid versions of invalid files ----
 #
 # If a file is invalid, its last valid version is in effect. The same holds for the files that apply
 # only together with the invalid file:
@@ -150,8 +147,6 @@ class ConfigSource:
 
 @dataclass(frozen=True, slots=True)
 class LastValidConfig:
-    """A commit's configuration, with the last valid versions of its invalid files."""
-
     # none if it is not valid even so; then the source is the one that was in effect before
     config: Config | None
     source: ConfigSource
@@ -159,7 +154,6 @@ class LastValidConfig:
 
 
 def config_at(tree: Tree) -> Config:
-    """Return the configuration of a tree, or raise InvalidInput with the faults of all files."""
     files = trees.texts(tree, CONFIG_ROOTS)
     if ROOT_FILE not in files:
         raise StateRepoError(NO_STATE_REPO)
@@ -171,7 +165,7 @@ def end_markers_at(tree: Tree) -> dict[str, str]:
 
 
 def ended_overrides_at(tree: Tree) -> dict[str, str]:
-    """Return the time ``expires`` of each ended override when it ended, by the override's name."""
+    # by the override's name: its time ``expires`` when it ended
     return records.read_ended_override(end_markers_at(tree))
 
 
@@ -206,16 +200,8 @@ def load_last_valid_config(
     to: Oid,
     load: Callable[[Mapping[str, str]], Config],
 ) -> LastValidConfig:
-    """Return the configuration of a commit, with the last valid versions of invalid files.
-
-    Args:
-        repo: the repository.
-        before: the source of the configuration that was in effect before ``to``.
-        last_valid_commit: the newest commit where all files were valid.
-        to: the commit to load.
-        load: gets files as path → text, and returns their configuration or raises
-            ``InvalidInput``.
-    """
+    # ``before`` was in effect before the commit ``to``; at ``last_valid_commit``, the newest such
+    # commit, all files were valid
     old, source = before.files(repo), ConfigSource(to)
     new = source.files(repo)
     changed = {path for path in {*old, *new} if old.get(path) != new.get(path)}
@@ -239,7 +225,6 @@ def load_last_valid_config(
 def _with_files_merged_together(
     repo: Repository, broken: Iterable[str], last_valid_commit: Oid, to: Oid
 ) -> set[str]:
-    """Return the broken files, and all files that apply only together with them or with these."""
     together = set(broken)
     merges = [
         {path for path, _ in trees.differences(commit.parents[0].tree, commit.tree, CONFIG_ROOTS)}

@@ -22,8 +22,6 @@ from demandops.repo.history import commit_log
 
 @dataclass(frozen=True, slots=True)
 class ClaimFiles:
-    """The claims that were read from files, and the faults of the files that are not valid."""
-
     claims: tuple[Claim, ...]
     faults: tuple[Fault, ...]
 
@@ -35,7 +33,6 @@ class ClaimFiles:
 
 
 def read_claims(files: Iterable[tuple[str, str]]) -> ClaimFiles:
-    """Return the claims and the faults in those of the files (path, text) that are claim files."""
     claims, faults = list[Claim](), list[Fault]()
     for path, text in files:
         if claim_file.kind_of(path) is None:
@@ -48,7 +45,6 @@ def read_claims(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
-    """Return the claim at a path, if there is a file, or raise InvalidInput if it is not valid."""
     text = trees.read_text(tree, path)
     return claim_file.read(text, path) if text is not None else None
 
@@ -69,7 +65,6 @@ def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
 
 
 def owner_faults(claim: Claim | None, path: str, ledger: Ledger) -> Iterator[Fault]:
-    """Yield a fault if the file at ``path`` belonged to another claim of ``ledger`` before."""
     # the generator books no such claim, but a person or an earlier version may replace the file
     owner = key_of(path, ledger) if claim and not ledger.get(claim.key) else None
     if claim is not None and owner is not None:
@@ -83,11 +78,8 @@ def owner_faults(claim: Claim | None, path: str, ledger: Ledger) -> Iterator[Fau
 def last_valid_claims(
     repo: Repository, last_valid_commit: Oid, to: Oid, paths: Iterable[str]
 ) -> dict[str, Claim | None]:
-    """Return a map from each of ``paths`` to the last valid claim there, or None for no claim.
-
-    If the generator has changed the file since ``last_valid_commit``, this is the claim that it
-    wrote last. If not, this is the claim at ``last_valid_commit``.
-    """
+    # If the generator has changed a file since ``last_valid_commit``, the claim that it wrote last
+    # counts, else the claim at that commit.
     tree = trees.commit_of(repo, last_valid_commit).tree
     claims = {path: claim_at(tree, path) for path in paths}
     left = set(claims)
@@ -103,7 +95,6 @@ def last_valid_claims(
 
 
 def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
-    """Return the lease that a claim had on main before its proposal was merged, if any."""
     for commit in commit_log.first_parents(repo, to):
         claim = valid_claim_at(commit.tree, path)
         # a merged proposal's lease has not started; the one before it has
@@ -115,10 +106,7 @@ def lease_before_approval(repo: Repository, to: Oid, path: str) -> Lease | None:
 def claims_by_people(
     repo: Repository, last_valid_commit: Oid, to: Oid, in_effect: Ledger
 ) -> list[ClaimChange]:
-    """Return the valid claims that people added or edited, each with the last valid claim before.
-
-    A claim that is the same in the ledger ``in_effect`` until now is left out.
-    """
+    """Return the valid claims that people added or edited, each with the last valid one before."""
     paths = {
         path
         for commit in commit_log.person_commits(repo, to, last_valid_commit)
@@ -136,7 +124,6 @@ def claims_by_people(
 
 
 def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
-    """Return the keys of the claims at ``to`` that people themselves have added since a commit."""
     if not since or since not in repo:
         return set()
     before, after = trees.commit_of(repo, since).tree, trees.commit_of(repo, to).tree
@@ -153,7 +140,6 @@ def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
 
 
 def restoration(repo: Repository, to: str, **more: object) -> Restoration:
-    """Return the request to roll back to the ledger of the commit ``to``; ``more`` are fields."""
     commit = trees.commit_of(repo, to)
     files = read_claims(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
     if files.faults:

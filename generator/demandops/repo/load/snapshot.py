@@ -22,7 +22,7 @@ from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.demand.claim import Claim
 from demandops.model.ledger import claim_file, records
 from demandops.model.ledger.ledger import ClaimChange, Ledger
-from demandops.model.ledger.records import Instance, RecentShutdowns, Steps
+from demandops.model.ledger.records import Instance, Steps
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log
 from demandops.repo.load import last_valid_config, ledger_files
@@ -43,8 +43,7 @@ ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
 class Snapshot:
     commit: Oid
     state: State
-    # the newest commit without problems
-    last_valid_commit: Oid
+    last_valid_commit: Oid  # the newest commit without problems
     # the faults of invalid files, whose last valid versions are in effect
     problems: tuple[Fault, ...] = ()
     # ledger files whose content at this commit is not in effect
@@ -66,8 +65,7 @@ class Snapshot:
 @dataclass(frozen=True, slots=True)
 class Advance:
     snapshot: Snapshot
-    # those whose claims changed
-    subjects: tuple[Subject, ...]
+    subjects: tuple[Subject, ...]  # those whose claims changed
     # all releases must be rendered again, usually because the configuration changed
     config_changed: bool
 
@@ -75,10 +73,7 @@ class Advance:
 def load(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Read all files of a commit and return its snapshot, or raise InvalidInput.
-
-    ``progress`` is called with (files read, all files) of the ledger.
-    """
+    # ``progress`` gets the numbers of read and of all claim files
     commit = trees.commit_of(repo, revision)
     config = last_valid_config.config_at(commit.tree)
     files = ledger_files.read_claims(_claim_texts(commit.tree, progress))
@@ -110,9 +105,8 @@ def advance(
 ) -> Advance:
     """Return the snapshot of the commit ``to``, and the changes since the snapshot ``before``.
 
-    Only files that differ are read. Invalid changes are not applied, but reported as problems of
-    the snapshot. Raises InvalidInput if the files of ``recorded`` are not valid, which is the
-    recorded source of the configuration in effect at ``to``.
+    Only files that differ are read. ``recorded`` is the recorded source of the configuration in
+    effect at ``to``; if its files are not valid, InvalidInput is raised.
     """
     old, new = trees.commit_of(repo, before.commit).tree, trees.commit_of(repo, to).tree
     state, in_effect = before.state, LastValidConfig(None, before.config_source, ())
@@ -125,7 +119,11 @@ def advance(
     config_changed = (
         world_changed or not before.is_rendered or _must_render_all(repo, before.commit, to)
     )
-    shutdowns, waits = _shutdowns(old, new, state.ledger), state.ledger.waiting
+    shutdowns, waits = state.ledger.shutdowns, state.ledger.waiting
+    for path, _ in trees.differences(old, new, (records.SHUTDOWNS_ROOT,)):
+        text = trees.read_text(new, path)
+        shutdown = records.read_shutdowns(text, path) if text is not None else None
+        shutdowns = shutdowns.replace(records.digest_in(path), shutdown)
     if trees.differ(old, new, (records.WAITING_ROOT,)):
         waits = records.read_all_waiting(trees.texts(new, (records.WAITING_ROOT,)))
     kept = state.ledger.kept
@@ -171,17 +169,8 @@ def advance(
     return Advance(snapshot, tuple(subjects), config_changed)
 
 
-def _shutdowns(old: Tree, new: Tree, ledger: Ledger) -> RecentShutdowns:
-    shutdowns = ledger.shutdowns
-    for path, _ in trees.differences(old, new, (records.SHUTDOWNS_ROOT,)):
-        text = trees.read_text(new, path)
-        shutdown = records.read_shutdowns(text, path) if text is not None else None
-        shutdowns = shutdowns.replace(records.digest_in(path), shutdown)
-    return shutdowns
-
-
 def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instance, Steps]]:
-    """Yield (instance, what it keeps now) for each service instance whose kept replicas changed."""
+    # what each instance whose kept replicas changed keeps now
     for path, _ in trees.differences(old, new, (records.REPLICAS_ROOT,)):
         texts = [trees.read_text(tree, path) for tree in (old, new)]
         before, after = (records.read_replicas(text, path) if text else None for text in texts)
@@ -190,7 +179,7 @@ def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instanc
 
 
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
-    """Return whether people may have changed generated files since ``before``."""
+    # people may have changed generated files since ``before``
     people = list(commit_log.person_commits(repo, to, before))
     # where a generator made the newest commit, the generated files match the ledger
     if not people or people[0].id != to:
@@ -238,14 +227,13 @@ def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValid
 
 
 def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
-    """Return the configuration in ``files``; if it is new, only if samples render with it."""
     if ROOT_FILE not in files:
         raise InvalidInput([fault("", last_valid_config.NO_STATE_REPO).within(ROOT_FILE)])
     config, in_force = load_config(files), state.config.repo_settings.render_version
     if config.repo_settings.render_version < in_force:
         message = f"is lower than {in_force}, which `demandops upgrade` wrote; write {in_force}"
         raise InvalidInput([fault("renderVersion", message).within(ROOT_FILE)])
-    if config != state.config:
+    if config != state.config:  # a new one must render samples
         # what takes too long is a fault for `check`, and of each demand that needs it; whether a
         # configuration is valid must not depend on the machine
         with suppress(OverLimit), processor_time(each=DEMAND_S, together=4 * DEMAND_S):
@@ -254,10 +242,8 @@ def _load_and_rehearse(files: Mapping[str, str], state: State) -> Config:
 
 
 class ReadAhead:
-    """Remembers what was read, so that the next attempt to publish reads only newer commits."""
-
-    # Reading takes time. If each attempt read all commits since this generator's last publication,
-    # other generators could publish first every time.
+    # Reading takes time. If each attempt to publish read all commits since this generator's last
+    # publication, and not only the newer ones, other generators could publish first every time.
     def __init__(self) -> None:
         self._so_far: Advance | None = None
         self._start: Oid | None = None

@@ -46,7 +46,6 @@ _TO_CHECK = Fault("invalid", "", "must be checked again")
 
 
 def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
-    """Return the trailers that record the state in effect; none if all files are in effect."""
     if not snapshot.problems:
         return []
     source = snapshot.config_source
@@ -63,7 +62,7 @@ def trailers_of(snapshot: Snapshot) -> list[tuple[str, str]]:
 
 
 def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
-    """Return the newest state that a commit records; the caller then follows people's changes."""
+    # the caller then follows people's later changes
     objects, tip = repository.objects, repository.tip()
     last_valid_config.refuse_other_render_version(objects, tip)
     return start_at(objects, tip, progress)
@@ -72,16 +71,12 @@ def first_snapshot(repository: StateRepository, progress: Progress) -> Snapshot:
 def state_at(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state in effect at a commit: the last recorded state, with people's later changes.
-
-    Raises InvalidInput or StateRepoError if there never was a valid state.
-    """
+    # InvalidInput or StateRepoError is raised if there never was a valid state
     commit = trees.commit_of(repo, revision)
     return state_after(repo, start_at(repo, commit.id, progress), commit.id)
 
 
 def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
-    """Return the state in effect at ``to``: the state ``start``, with people's later changes."""
     if start.commit == to:
         return start
     commit, advance = trees.commit_of(repo, to), snapshots.advance(repo, start, to)
@@ -100,11 +95,10 @@ def state_after(repo: Repository, start: Snapshot, to: Oid) -> Snapshot:
 def start_at(
     repo: Repository, commit: Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state in effect at the generator's newest commit at or before ``commit``.
+    """Return the state in effect that the generator's newest commit up to ``commit`` records.
 
-    The generator's commit records that state. If the record is missing or wrong, return the state
-    of the newest commit with only valid files up to the generator's commit or, if there is none,
-    up to ``commit``.
+    If the record is missing or wrong, return the state of the newest commit with only valid files
+    up to the generator's commit or, if there is none, up to ``commit``.
     """
     record = record_at(repo, commit)
     tried, faults = set[tuple[Oid | None, ...]](), list[InvalidInput | StateRepoError]()
@@ -129,11 +123,7 @@ def start_at(
 def snapshot_at(
     repo: Repository, revision: str | Oid, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the ledger and the configuration that are in effect at a commit.
-
-    Raises InvalidInput or StateRepoError if the commit is not valid, and no generator quarantined
-    its files.
-    """
+    # unlike state_at, this fails if a file is not valid and no generator has quarantined it
     if record_at(repo, revision).first("In-Force"):
         return state_at(repo, revision, progress)
     return snapshots.load(repo, revision, progress)
@@ -151,10 +141,6 @@ def record_at(repo: Repository, revision: str | Oid) -> LogEntry:
 def recorded_state(
     repo: Repository, record: LogEntry, progress: Progress = lambda done, total: None
 ) -> Snapshot:
-    """Return the state in effect that a commit of the generator records.
-
-    Raises InvalidInput or StateRepoError if the record is not valid.
-    """
     commit = trees.commit_of(repo, record.commit)
     if not record.first("In-Force"):
         return snapshots.load(repo, commit.id, progress)
@@ -184,30 +170,24 @@ Faults = Mapping[Subject, tuple[Fault, ...]]
 
 @dataclass(frozen=True, slots=True)
 class Judgement:
-    """The faults of people's changes with the new and with the old configuration, by subject."""
-
+    # of people's changes with the new and with the old configuration, by subject
     repo: Repository
     before: Snapshot
     advance: Advance
-    # why a subject cannot be planned with the new configuration
-    with_new: Faults
-    # why a subject cannot be planned, or is refused, with the old configuration
-    with_old: Faults
-    # why a person's claim on the subject is refused with the new configuration
-    refused: Faults
-    # the configuration that was in effect before, with the new ledger
-    old: State
+    with_new: Faults  # why a subject cannot be planned with the new configuration
+    with_old: Faults  # why a subject cannot be planned, or is refused, with the old configuration
+    refused: Faults  # why a person's claim on the subject is refused with the new configuration
+    old: State  # the configuration that was in effect before, with the new ledger
 
     def with_new_config(self) -> Advance:
-        """Return the advance, but with the last valid versions of claims at fault."""
-        # what has a fault only with the new configuration is not the claims' fault
+        # with the last valid versions of claims at fault; what has a fault only with the new
+        # configuration is not the claims' fault
         faults = {
             subject: faults for subject, faults in self.with_new.items() if subject in self.with_old
         }
         return self._quarantined(self.advance, _merged(faults, self.refused))
 
     def with_old_config(self, faults: Iterable[Fault]) -> Advance:
-        """Return the advance with the old configuration; ``faults`` are those of the new one."""
         accepted = self.with_new_config()
         ledger, problems = accepted.snapshot.state.ledger, accepted.snapshot.problems
         snapshot = replace(
@@ -220,7 +200,6 @@ class Judgement:
         return self._quarantined(replace(accepted, snapshot=snapshot), self.with_old)
 
     def _quarantined(self, accepted: Advance, faults: Faults) -> Advance:
-        """Return ``accepted`` with the last valid claims on each subject that has a fault."""
         snapshot, before = accepted.snapshot, self.before
         problems, ledger = list(snapshot.problems), snapshot.state.ledger
         quarantined = dict.fromkeys(snapshot.quarantined_files)
@@ -261,15 +240,10 @@ def judge(
     tree: Tree,
     held_back: Collection[str] | None = None,
 ) -> Judgement:
-    """Return the judgement of people's changes since ``before``.
+    """Return the judgement of people's changes, from the snapshot ``before`` to ``advance``.
 
-    Args:
-        repo: the repository.
-        advance: the snapshot with all valid changes, and the subjects that they change.
-        before: the snapshot before people's changes.
-        tree: the tree with the current generated files.
-        held_back: the claim files that a generator's commit records as not in effect. If it is
-            None, decide anew which claims are refused.
+    ``tree`` has the current generated files. ``held_back`` are the claim files that a generator's
+    commit records as not in effect; without them, it is decided anew which claims are refused.
     """
     state, ledger = advance.snapshot.state, before.state.ledger
     old = replace(before.state, ledger=state.ledger)

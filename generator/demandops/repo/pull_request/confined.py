@@ -16,11 +16,7 @@ from contextlib import suppress
 
 # helm renders a chart with 100 MB; Go reserves addresses beforehand.
 MEMORY = 4 << 30
-_LIMITS = {
-    resource.RLIMIT_AS: MEMORY,
-    resource.RLIMIT_FSIZE: 64 << 20,
-    resource.RLIMIT_CORE: 0,
-}
+_LIMITS = {resource.RLIMIT_AS: MEMORY, resource.RLIMIT_FSIZE: 64 << 20, resource.RLIMIT_CORE: 0}
 _NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
 
 

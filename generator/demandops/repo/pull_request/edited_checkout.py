@@ -31,11 +31,10 @@ from demandops.repo.git.repository import reading, unopened
 from demandops.repo.history import revisions
 from demandops.repo.load import state_in_effect
 
-# ---- overrides that do the same as manual edits, for values, replicas and images ----
+# ---- overrides in place of manual edits, for values, replicas and images ----
 #
 # The generator's next commit undoes a manual edit, but an override lasts. So the check suggests one
 # where it can, and a person has to write only the reason into it.
-
 
 _VALUES = (("spec", "values"), ("spec", "source", "helm", "valuesObject"))  # Flux, Argo CD
 _IMAGE_KEYS = {"repository", "tag", "digest"}
@@ -46,7 +45,6 @@ _REASON = "Say here why you need this override; it replaces a manual edit of a g
 
 
 def override_text(effects: dict[str, Any], release: Release, owner: str) -> str:
-    """Return an override with these effects on a release; ``owner`` may be any text."""
     who = owner.strip()[:100] if owner.isprintable() and owner.strip() else "unknown"
     head = {"apiVersion": API_VERSION, "kind": "Override", "reason": _REASON, "owner": who}
     if isinstance(release, ServiceRelease):
@@ -60,7 +58,6 @@ def override_text(effects: dict[str, Any], release: Release, owner: str) -> str:
 
 
 def also_applies(release: Release, other: Release) -> bool:
-    """Return whether the override of :func:`override_text` also applies to another release."""
     if not (isinstance(release, ServiceRelease) and isinstance(other, ServiceRelease)):
         return False
     same = (release.key.service, release.node.id) == (other.key.service, other.node.id)
@@ -71,7 +68,6 @@ def also_applies(release: Release, other: Release) -> bool:
 def effects_of(
     before: str, after: str, release: Release, config: Config
 ) -> tuple[dict[str, Any], list[str]]:
-    """Return the effects that replace an edit, and the edited fields that they leave out."""
     try:
         old, new = list(strict_yaml.load_all(before)), list(strict_yaml.load_all(after))
     except InvalidInput:
@@ -112,7 +108,6 @@ def effects_of(
 
 
 def _take(documents: list[Any], path: tuple[str, ...]) -> Any:  # noqa: ANN401
-    """Remove what is at a path of the first document, and return it."""
     part = documents[0] if documents else None
     for key in path[:-1]:
         part = part.get(key) if isinstance(part, dict) else None
@@ -122,10 +117,7 @@ def _take(documents: list[Any], path: tuple[str, ...]) -> Any:  # noqa: ANN401
 def _merge_patch(
     old: dict[str, Any], new: dict[str, Any], names: dict[str, str], pins: dict[str, dict[str, str]]
 ) -> dict[str, Any]:
-    """Return the JSON merge patch (RFC 7386) that turns ``old`` into ``new``.
-
-    Changes of an image whose repository is in ``names`` go to ``pins`` instead.
-    """
+    # RFC 7386; changes of an image whose repository is in ``names`` go to ``pins`` instead
     patch: dict[str, Any] = {key: None for key in old if key not in new}  # None removes a key
     for key, value in new.items():
         was = old.get(key, ABSENT)
@@ -142,7 +134,7 @@ def _merge_patch(
     return patch
 
 
-# ---- a checked-out state repo: its files, and the commit that an edit started from ----
+# ---- the checkout: its files, and the commit that an edit started from ----
 
 _ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
@@ -162,12 +154,9 @@ class Base:
     files: Mapping[str, str]
     # in effect at this commit, with last valid versions; None if there never was a valid state
     state: State | None
-    # whether all files of the commit are valid
-    valid: bool
-    # the merge target as git names it, such as ``origin/main``, if there is one
-    target: str = ""
-    # how many commits of the merge target the checkout lacks
-    newer: int = 0
+    valid: bool  # whether all files of the commit are valid
+    target: str = ""  # the merge target as git names it, such as ``origin/main``, if there is one
+    newer: int = 0  # how many commits of the merge target the checkout lacks
     # the merge target's generated files, if the checkout lacks commits of it
     merged: Mapping[str, str] = field(default_factory=dict)
 
@@ -231,11 +220,8 @@ def _why_not_read(name: str, depth: int, status: os.stat_result) -> str:
 
 
 def base_of(folder: Path, revision: str | None) -> Base | None:
-    """Return the commit that an edit is compared with, if the folder is a checkout with a commit.
-
-    ``revision`` is the merge target; by default ``origin/main``, else ``main``. If there is
-    neither, the edit is compared with HEAD.
-    """
+    # ``revision`` is the merge target; by default ``origin/main``, else ``main``. If there is
+    # neither, the edit is compared with HEAD. None if the folder is no checkout with a commit.
     try:
         repo = Repository(str(folder))
     except pygit2.GitError as error:
@@ -253,11 +239,17 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         return None
     with reading(str(folder), repo):
         target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
-        tip = _tip_of(repo, target) if target else None
+        try:
+            head = repo.head.peel(Commit).id
+            tip = revisions.resolve(repo, head, target, REAL.now()) if target else None
+        except StateRepoError:
+            if repo.is_shallow:
+                raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
+            raise
         commit = _started_from(repo, target, tip)
         base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
         if tip is not None:
-            _, newer = repo.ahead_behind(repo.head.peel(Commit).id, tip.id)
+            _, newer = repo.ahead_behind(head, tip.id)
             merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
             name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
             base = replace(base, target=name, newer=newer, merged=merged)
@@ -266,15 +258,6 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         except (InvalidInput, StateRepoError):
             return base
         return replace(base, state=snapshot.state, valid=not snapshot.problems)
-
-
-def _tip_of(repo: Repository, target: str) -> Commit:
-    try:
-        return revisions.resolve(repo, repo.head.peel(Commit).id, target, REAL.now())
-    except StateRepoError:
-        if repo.is_shallow:
-            raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
-        raise
 
 
 def _started_from(repo: Repository, target: str, tip: Commit | None) -> Commit:

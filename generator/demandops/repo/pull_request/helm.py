@@ -43,12 +43,10 @@ _PLACE = re.compile(
 
 @dataclass(frozen=True, slots=True)
 class Report:
-    # API group and kind of each rendered object
-    kinds: tuple[tuple[str, str], ...] = ()
+    kinds: tuple[tuple[str, str], ...] = ()  # API group and kind of each rendered object
     faults: tuple[Fault, ...] = ()
     warnings: tuple[Fault, ...] = ()
-    # not, if helm was stopped because of its limits
-    ended: bool = True
+    ended: bool = True  # not, if helm was stopped because of its limits
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +121,6 @@ class Helm:
 
 
 def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:
-    """Yield API group and kind of each object that ``helm template`` printed."""
     for document in re.split(r"(?m)^---(?=\s|$)", out):
         api, kind = _API.search(document), _KIND.search(document)
         if kind:
@@ -131,10 +128,7 @@ def parsed_kinds(out: str) -> Iterator[tuple[str, str]]:
 
 
 def parsed_lint(out: str, chart: str) -> Report:
-    """Return the faults and warnings in the output of ``helm lint``.
-
-    A fault whose template helm does not name is located at ``chart``, the chart's folder.
-    """
+    # a fault whose template helm does not name is located at the chart's folder
     by_level: dict[str, list[Fault]] = {"ERROR": [], "WARNING": []}
     for entry in re.split(r"\n(?=\[|\n)", out):
         match = _LINT.match(entry.strip())
@@ -144,7 +138,6 @@ def parsed_lint(out: str, chart: str) -> Report:
 
 
 def parsed_error(err: str, chart: str) -> Fault:
-    """Return helm's error message as a fault at the last template in it, else at ``chart``."""
     text = err.partition("Error: ")[2] or err
     return _fault(text.partition("\n\nUse --debug")[0].strip(), chart)
 

@@ -47,41 +47,27 @@ _MOST_LEFT = 5
 
 @dataclass(frozen=True, slots=True)
 class Suggestion:
-    """A suggested override that replaces the manual edit of a generated file."""
-
-    # the path of the edited file
-    instead_of: str
-    # path and content of the override
-    file: str
+    instead_of: str  # the path of the edited file
+    file: str  # path and content of the override
     text: str
-    # the parts of the edit that the override leaves out
-    not_covered: tuple[str, ...]
-    # the other releases to which the override also applies
-    other_releases: tuple[str, ...]
+    not_covered: tuple[str, ...]  # the parts of the edit that the override leaves out
+    other_releases: tuple[str, ...]  # the other releases to which the override also applies
 
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """The result of checking a checkout before it is merged.
-
-    What the merge changes leaves out claims that are not valid. It is None if the configuration is
-    not valid or the desired state cannot be rendered.
-    """
-
     faults: tuple[Fault, ...]
     suggestions: tuple[Suggestion, ...] = ()
+    # what the merge changes, without claims that are not valid; None if it cannot be rendered
     preview: MergePreview | None = None
     # also None if the base's bookkeeping is not known; empty if there is no base
     bookkeeping: tuple[EntryChange, ...] | None = None
-    # the commit that the checkout is compared with
-    base: str | None = None
-    # if not, the last valid versions of its files are compared
-    base_valid: bool = True
+    base: str | None = None  # the commit that the checkout is compared with
+    base_valid: bool = True  # if not, the last valid versions of its files are compared
     # the name of the merge target, and how many commits it has that the checkout lacks
     target: str = ""
     newer: int = 0
-    # likely mistakes, and what a person has to do after the merge
-    warnings: tuple[Fault, ...] = ()
+    warnings: tuple[Fault, ...] = ()  # likely mistakes, and what a person has to do after the merge
     charts: RenderedCharts | None = None
 
 
@@ -94,14 +80,9 @@ def check(
 ) -> CheckResult:
     """Check the files of a state repo, and return the faults and the effect of a merge.
 
-    Args:
-        folder: a checked-out state repo, or its files without Git.
-        base: the merge target; by default ``origin/main``, else ``main``. The edit is compared
-            with the common ancestor of HEAD and the merge target. If there is no merge target, the
-            edit is compared with HEAD.
-        now: the time of the check, by default the current time. Overrides that ended before this
-            time do not apply.
-        require_helm: whether a missing helm is a fault.
+    The folder is a checkout, or its files without Git. The edit is compared with the common
+    ancestor of HEAD and the merge target ``base``, by default ``origin/main``, else ``main``, and
+    without one with HEAD. Overrides that ended before ``now`` do not apply.
     """
     files, faults = files_of(folder)
     start = base_of(folder, base)
@@ -135,9 +116,7 @@ def check(
             new if start is None else start.releases(), new, edit.before_merge(wanted), wanted
         )
         charts = rendered_charts.render_charts(
-            state,
-            edit.changed if start else None,
-            {file.path for file in preview.files},
+            state, edit.changed if start else None, {file.path for file in preview.files}
         )
         faults += charts.faults
         if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
@@ -282,7 +261,6 @@ class _Edit:
         }
 
     def before_merge(self, wanted: Mapping[str, str]) -> dict[str, str]:
-        """Return the generated files before the merge, which makes those in ``wanted`` of them."""
         files, merged = self.generated_before, self.start.merged if self.start else {}
         for path in {*merged, *files} if merged else ():
             # what the merge target has already is no effect of this merge
@@ -323,7 +301,6 @@ class _Edit:
         return replace(state, ledger=applied.ledger)
 
     def refused_claims(self, state: State) -> Iterator[Fault]:
-        """Yield the reasons why the generator would refuse claims that the edit changes."""
         old = self.start.state if self.start else None
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
@@ -344,7 +321,7 @@ class _Edit:
             raise InvalidInput(faults or error.faults) from None
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:
-        """Yield a warning for each bootstrap file that a person must apply after the merge."""
+        # a person must apply these files
         before = self.before_merge(wanted)
         for path, text in sorted(wanted.items()):
             if path.startswith(f"{BOOTSTRAP_ROOT}/") and before.get(path) != text:
@@ -371,7 +348,11 @@ class _Edit:
             changed = sorted(path for part in folders for path in charts.below(part, edited))
             if not changed or metadata not in self.before:
                 continue
-            if _chart_version(self.before[metadata]) == source.version:
+            try:
+                data = strict_yaml.load(self.before[metadata])
+            except InvalidInput:
+                continue
+            if isinstance(data, dict) and data.get("version") == source.version:
                 first = changed[0].removeprefix(f"{folder}/")
                 yield fault(
                     "version",
@@ -391,11 +372,3 @@ def _bookkeeping_changes(start: Base | None, state: State) -> tuple[EntryChange,
     except InvalidInput:
         return None
     return bookkeeping_changes(old, bookkeeping(state))
-
-
-def _chart_version(text: str) -> object:
-    try:
-        data = strict_yaml.load(text)
-    except InvalidInput:
-        return None
-    return data.get("version") if isinstance(data, dict) else None

@@ -46,11 +46,7 @@ _MOST_SECONDS = 1800  # 5,000 releases take about 1,000 s
 
 @dataclass(frozen=True, slots=True)
 class RenderedCharts:
-    """Which charts helm rendered, for how many releases and examples, and the faults found.
-
-    A chart that is not used, or whose lint or schema has a fault, is in neither of the two.
-    """
-
+    # a chart that is not used, or whose lint or schema has a fault, is in neither of the two lists
     # each chart that helm tried to render, even if there were faults
     rendered: tuple[str, ...] = ()
     releases: int = 0
@@ -64,12 +60,10 @@ class RenderedCharts:
 def render_charts(
     state: State, changed: Collection[str] | None, wanted: Collection[str]
 ) -> RenderedCharts:
-    """Lint and render the charts of a checkout, and return the result.
+    """Lint and render the charts of a checkout, whose state is that after the merge.
 
-    Args:
-        state: the state after the merge, with the files of the checkout.
-        changed: the paths that the pull request changes, or None if they are unknown.
-        wanted: the paths of the generated files that will change because of the merge.
+    The pull request changes the paths ``changed``, None if they are unknown. With the merge, the
+    generated files at the paths ``wanted`` change.
     """
     config = state.config
     by_folder: dict[str | None, list[tuple[ServiceRelease, bool]]] = {}
@@ -121,7 +115,7 @@ class _Run:
         )
 
     def render(self, folder: str | None, releases: Sequence[tuple[ServiceRelease, bool]]) -> None:
-        """Lint a chart, and render it for releases; the truth value says that it is an example."""
+        # the truth value says that the release is an example
         names = dict.fromkeys(release.service.chart for release, _ in releases)
         if folder is None:
             self._not_rendered |= dict.fromkeys(names, "it is in a registry")
@@ -196,7 +190,12 @@ class _Run:
             self._add(report, folder, files)
             if not report.ended:
                 return
-            if not example or self._may_run(release):
+            rules, apps = release.domain.rules, self._state.config.services
+            names = [name for name, services in apps.items() if release.key.service in services]
+            may_run = not rules or any(
+                matches(name, rule.applications) for rule in rules for name in names
+            )
+            if not example or may_run:
                 self._faults |= dict.fromkeys(self._kinds_refused(report, release))
 
     def _check_libraries(self, folder: str, values: Mapping[str, Any]) -> None:
@@ -221,21 +220,12 @@ class _Run:
                 self._check_libraries(library, inner)
 
     def _add(self, report: Report, folder: str, files: Mapping[str, str]) -> None:
-        """Add the faults and warnings of a report, with the paths of files in the state repo."""
         for faults, into in ((report.faults, self._faults), (report.warnings, self._warnings)):
             for said in faults:
                 place = said.file.partition("/")[2]  # helm's path starts with the chart's name
                 into[said.within(files.get(place, f"{folder}/{place}".rstrip("/")))] = None
 
-    def _may_run(self, release: ServiceRelease) -> bool:
-        rules, apps = release.domain.rules, self._state.config.services
-        names = [name for name, services in apps.items() if release.key.service in services]
-        return not rules or any(
-            matches(name, rule.applications) for rule in rules for name in names
-        )
-
     def _kinds_refused(self, report: Report, release: ServiceRelease) -> Iterator[Fault]:
-        """Yield a fault for each rendered object whose kind the access domain does not allow."""
         domain = release.domain
         allowed = {(entry.group, entry.kind) for entry in domain.allowed_kinds}
         for group, kind in report.kinds:

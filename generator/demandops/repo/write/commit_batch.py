@@ -7,7 +7,7 @@ the batch is dropped and its demands are evaluated again on the new tip.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from datetime import datetime
 from itertools import islice
@@ -82,7 +82,6 @@ class CommitBatch:
         now: datetime,
         proposal: ProposalRecord | None = None,
     ) -> str:
-        """Commit one demand, for its proposal if it needs approval, and return the commit's id."""
         more = [*self._settled, *state_in_effect.trailers_of(self.head)]
         if proposal:
             more += [
@@ -129,7 +128,6 @@ class CommitBatch:
         return str(commit)
 
     def record_in_next_commit(self, operation: str, outcome: commit_log.Settled) -> None:
-        """Record the outcome of a demand that changed nothing, in the next commit of a demand."""
         # The process may die before it answers the demand. After a restart, it must not evaluate
         # the demand again, because later demands could change the outcome.
         self._settled.append((commit_log.settled_trailer(outcome), operation))
@@ -137,8 +135,7 @@ class CommitBatch:
     def follow(self, advance: Advance, before: Snapshot, now: datetime) -> None:
         """Render people's changes, and commit the generated files that differ, if any.
 
-        What cannot be planned or rendered, for example because its node left the inventory, stays
-        in effect in its last valid version, and is a problem of ``head``.
+        What cannot be planned or rendered stays in effect as it was, as a problem of ``head``.
         """
         self.head, change, keys = self._followed(advance, before, now)
         state, tip, problems = self.head.state, self.head.commit, self.head.problems
@@ -179,39 +176,27 @@ class CommitBatch:
 
     def _followed(self, advance: Advance, before: Snapshot, now: datetime) -> _Followed:
         judgement = state_in_effect.judge(self._objects, advance, before, self._tree)
-        accepted = judgement.with_new_config()
+        accepted, change = judgement.with_new_config(), None
         if advance.config_changed:
             try:
                 marked = last_valid_config.end_markers_at(self._tree)
-                state = accepted.snapshot.state
-                applied = update_ledger(before.state, state, accepted.subjects, marked, now)
+                state, subjects = accepted.snapshot.state, accepted.subjects
+                applied = update_ledger(before.state, state, subjects, marked, now)
                 state = replace(state, ledger=applied.ledger)
                 change = self.render_all(state, applied.files)
-                return self._with_started_leases(
-                    accepted.snapshot, state, change, applied.keys, now
-                )
             except InvalidInput as error:
                 accepted = judgement.with_old_config(error.faults)
-        # with the configuration as before, only the subjects that people changed are rendered
-        state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-        applied = update_claims(old, state, subjects, now)
-        touched = claim_changes(state.ledger, applied.ledger, applied.keys)
-        state = state.with_ledger(applied.ledger, touched)
-        subjects = tuple(dict.fromkeys((*subjects, *(change.key.subject for change in touched))))
-        change = changeset_of_edit(state, old, subjects, self.read)
-        change = replace(change, files={**applied.files, **change.files})
-        return self._with_started_leases(accepted.snapshot, state, change, applied.keys, now)
-
-    def _with_started_leases(
-        self,
-        snapshot: Snapshot,
-        state: State,
-        change: Changeset,
-        keys: Iterable[ClaimKey],
-        now: datetime,
-    ) -> _Followed:
+        if change is None:
+            # with the configuration as before, only the subjects that people changed are rendered
+            state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
+            applied = update_claims(old, state, subjects, now)
+            touched = claim_changes(state.ledger, applied.ledger, applied.keys)
+            state = state.with_ledger(applied.ledger, touched)
+            subjects = tuple(dict.fromkeys((*subjects, *(edit.key.subject for edit in touched))))
+            change = changeset_of_edit(state, old, subjects, self.read)
+            change = replace(change, files={**applied.files, **change.files})
         # an approved claim's lease starts only now, because else it could end before the approval
-        ledger, files = state.ledger, dict(change.files)
+        snapshot, ledger, files = accepted.snapshot, state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():
             assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
             path = claim_file.path_of(claim.key)
@@ -221,13 +206,10 @@ class CommitBatch:
             files[path] = claim_file.text_of(started)
         # a lease does not affect a release, so the usage of nodes need not be counted again
         snapshot = replace(snapshot, state=state.with_ledger(ledger, ()))
-        return snapshot, replace(change, files=files), tuple(keys)
+        return snapshot, replace(change, files=files), tuple(applied.keys)
 
     def end_override(self, override: Override, now: datetime) -> None:
-        """Commit the end of an expired override, with its effect on claims and releases.
-
-        Raises InvalidInput if the state without the override cannot be planned or rendered.
-        """
+        # InvalidInput is raised if the state without the override cannot be planned or rendered
         applied = end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
@@ -236,10 +218,7 @@ class CommitBatch:
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
 
     def scale_down(self, instance: Instance, now: datetime) -> str:
-        """Commit the removal of replicas that a service no longer keeps; return the title.
-
-        Raises InvalidInput if the service cannot be planned or rendered.
-        """
+        # the title of the commit; InvalidInput if the service cannot be planned or rendered
         state, change = scaled_down(self.head.state, instance, now, self.read)
         more = state_in_effect.trailers_of(self.head)
         text = commit_message.of_scale_down(instance, change, more)
@@ -247,11 +226,7 @@ class CommitBatch:
         return text.partition("\n")[0]
 
     def drain(self, node: str, after: str, operation: str, now: datetime) -> Decision:
-        """Commit the move of placed applications off a drained node, and return the decision.
-
-        It begins with the application that follows ``after`` (:class:`Drain`). If no application
-        can be moved, there is no commit.
-        """
+        # it begins with the application that follows ``after``; if none can move, nothing changes
         decision = decide(self.head.state, Drain(node, after=after), now, self.read)
         if decision.files:
             # the author is the person who last changed the node's file, and so drained the node
@@ -270,10 +245,6 @@ class CommitBatch:
     def render_all(
         self, state: State, more: Mapping[str, str | None] = MappingProxyType({})
     ) -> Changeset:
-        """Render all files; return those that differ from the batch's newest commit, and ``more``.
-
-        Raises InvalidInput if a release cannot be planned or rendered.
-        """
         generated = trees.texts(self._tree, GENERATED_ROOTS)
         files: dict[str, str | None] = dict(rendered_files(state, generated, keeps_late=True))
         changes = []
@@ -295,7 +266,6 @@ class CommitBatch:
         return Changeset({**more, **files}, tuple(changes))
 
     def publish(self) -> bool:
-        """Publish the commits, if any, like :meth:`StateRepository.publish`."""
         if self.is_empty:
             return True
         return self._repository.publish(self.start.commit, self.head.commit)

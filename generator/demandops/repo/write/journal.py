@@ -19,7 +19,7 @@ from demandops.model.demand.claim import UNSTARTED
 from demandops.repo.git.objects import sync_folder
 from demandops.repo.git.repository import disk_error
 
-# ---- the journal: a file with all accepted, unpublished demands, so that a crash loses none ----
+# ---- the journal: all accepted, unpublished demands, so that a crash loses none ----
 #
 # The journal has one JSON line for each demand received, for each change of its proposal, and for
 # each demand done. A demand is written and fsynced before it is evaluated. After a restart, demands
@@ -30,7 +30,6 @@ from demandops.repo.git.repository import disk_error
 # detects a changed, missing or moved line, but not that whole lines at the end are missing
 # (docs/decisions/0020-journal.md). Journals of the first version have no digests, and can still be
 # read.
-
 
 _MOST_BYTES = 1 << 20
 _SEALED = re.compile(rb'(\{.*), "digest": "([0-9a-f]{64})"\}')
@@ -49,22 +48,18 @@ class DamagedJournal(StateRepoError):
 
 @dataclass(frozen=True, slots=True)
 class ProposalRecord:
-    """The journal's record of a proposal: what a restarted process needs to continue it."""
+    # what a restarted process needs to continue a proposal
 
     branch: str
     # where the generator left the branch, newest last; two if the newest's push may have failed
     commits: tuple[str, ...] = ()
-    # the commit of main on which the newest of the commits was made
-    base: str = ""
+    base: str = ""  # the commit of main on which the newest of the commits was made
     # If a pushed branch is missing, somebody deleted it. After a person merges only some of the
     # demands, this is false until the branch is pushed again.
     pushed: bool = False
-    # the address of the branch's merge request, if GitLab printed it at a push
-    link: str = ""
-    # the reason why the demand was withdrawn
-    withdrawn: str = ""
-    # branch and commit where the demand waited, before it became another
-    replaces: str = ""
+    link: str = ""  # the address of the branch's merge request, if GitLab printed it at a push
+    withdrawn: str = ""  # the reason why the demand was withdrawn
+    replaces: str = ""  # branch and commit where the demand waited, before it became another
 
     @property
     def replaced_branch(self) -> str:
@@ -77,8 +72,6 @@ class ProposalRecord:
 
 @dataclass(frozen=True, slots=True)
 class JournalEntry:
-    """An accepted demand: operation id, goal, time received, and the tip known at that time."""
-
     operation: str
     goal: Any
     received: str
@@ -86,7 +79,6 @@ class JournalEntry:
     proposal: ProposalRecord | None = None
 
     def record(self) -> dict[str, Any]:
-        """Return the entry as plain data for JSON; without ``proposal`` if there is none."""
         # asdict would copy the goal, which may be nested too deeply for that
         record = {field.name: getattr(self, field.name) for field in fields(self)}
         del record["proposal"]
@@ -106,15 +98,13 @@ class Journal:
             self._rewrite()
 
     def require_sound(self) -> None:
-        """Raise Unsound if an earlier write left the file in an unknown state."""
         if self._unsound is not None:
             raise self._unsound
 
     def append(self, entries: Iterable[JournalEntry]) -> None:
         """Write and fsync all ``entries``, or raise StateRepoError and write none of them.
 
-        An entry replaces the pending entry with the same operation id. Raises Unsound if nobody
-        knows whether they are written.
+        Unsound is raised if nobody knows whether they are written.
         """
         entries = list(entries)
         if entries:
@@ -124,14 +114,10 @@ class Journal:
             self._rewrite_if_large()
 
     def mark_done(self, operations: Iterable[str], *, durably: bool = False) -> None:
-        """Remove demands that are published, refused or withdrawn, if they are pending.
-
-        If ``durably`` is true, the removal is fsynced, and a failure raises StateRepoError and
-        keeps the demands.
-        """
-        # Otherwise the next append makes the removal durable. If the machine fails before that, the
-        # demands are evaluated again after a restart. This is harmless if a commit records their
-        # outcome, but a refused demand could be booked.
+        # With ``durably``, the removal is fsynced, and a failure raises StateRepoError and keeps
+        # the demands. Otherwise the next append makes the removal durable. If the machine fails
+        # before that, the demands are evaluated again after a restart. This is harmless if a commit
+        # records their outcome, but a refused demand could be booked.
         done = [operation for operation in dict.fromkeys(operations) if operation in self.pending]
         records = [{"done": operation} for operation in done]
         if durably and done:
@@ -181,7 +167,6 @@ class Journal:
                 self._rewrite()
 
     def _rewrite(self) -> None:
-        """Replace the file by one that has only the pending demands."""
         text, chain = _sealed([entry.record() for entry in self.pending.values()], "")
         if text:
             fresh = self._path.with_suffix(".new")
@@ -204,7 +189,6 @@ class Journal:
         self._limit = max(_MOST_BYTES, 2 * len(text))
 
     def _require_known(self, error: OSError) -> None:
-        """Raise Unsound if the content of the disk is unknown after ``error``."""
         reason = disk_error(error, f"the journal {self._path}")
         if isinstance(reason, Unsound):
             self._unsound = reason
@@ -223,12 +207,10 @@ class Journal:
 
 
 def read(path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands in a journal's file, by operation id; none if it is missing."""
     return parse(path.read_bytes() if path.exists() else b"", path)
 
 
 def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
-    """Return the pending demands of a journal's text, by operation id, or raise DamagedJournal."""
     *lines, last = text.split(b"\n")
     chain = "" if _SEALED.fullmatch((lines or [last])[0]) else None
     pending: dict[str, JournalEntry] = {}
@@ -246,18 +228,8 @@ def parse(text: bytes, path: Path) -> dict[str, JournalEntry]:
     return pending
 
 
-def readable_entries(path: Path) -> list[JournalEntry]:
-    """Return the pending demands that can be read in a journal, even if it is damaged."""
-    pending: dict[str, JournalEntry] = {}
-    for line in path.read_bytes().split(b"\n"):
-        sealed = _SEALED.fullmatch(line)
-        with suppress(ValueError):
-            _replay(sealed[1] + b"}" if sealed else line, pending)
-    return list(pending.values())
-
-
 def _sealed(records: Iterable[dict[str, Any]], chain: str) -> tuple[bytes, str]:
-    """Return the journal's lines after one with the digest ``chain``, and the last digest."""
+    # the lines after one with the digest ``chain``, and the last digest
     lines = []
     for record in records:
         body = json.dumps(record, ensure_ascii=True)
@@ -271,7 +243,6 @@ def _digest(body: bytes, chain: str) -> str:
 
 
 def _apply(line: bytes, chain: str | None, pending: dict[str, JournalEntry]) -> str | None:
-    """Apply a line after one with the digest ``chain``, and return the line's digest."""
     if chain is not None:  # else a journal of the first version, which has no digests
         sealed = _SEALED.fullmatch(line)
         if sealed is None or _digest(sealed[1] + b"}", chain) != sealed[2].decode():
@@ -300,18 +271,15 @@ def _replay(body: bytes, pending: dict[str, JournalEntry]) -> None:
         raise ValueError("the line is not an entry") from error
 
 
-# ---- slots: folders for the journal and the clone of each process that uses a state repo ----
+# ---- slots: a folder for the journal and the clone of each process ----
 
 _MAX_SLOTS = 256
 _JOURNAL = "outbox.jsonl"
 
 
 class Slot:
-    """A folder for the journal and the clone of one process, locked while the process lives.
-
-    Several processes on one machine may serve one state repo. Each takes the first free slot and
-    takes over the journals of dead processes.
-    """
+    # Locked while its process lives. Several processes on one machine may serve one state repo.
+    # Each takes the first free slot, and takes over the journals of dead processes.
 
     def __init__(self, root: Path) -> None:
         """Take a slot below ``root``; raise StateRepoError, or OSError about the slot's folder."""
@@ -352,21 +320,15 @@ class Slot:
 
 @dataclass(frozen=True, slots=True)
 class FoundJournal:
-    """A journal on this machine, and its demands that are not done and can be read."""
-
     file: Path
-    demands: list[JournalEntry]
-    # the error of reading the journal, if any
-    damage: str = ""
-    # the file's new path, if it was renamed
-    set_aside: Path | None = None
+    demands: list[JournalEntry]  # that are not done and can be read
+    damage: str = ""  # the error of reading the journal, if any
+    set_aside: Path | None = None  # the file's new path, if it was renamed
 
 
 def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[FoundJournal]:
-    """Yield the journals in a data folder that have demands or are damaged.
-
-    If ``set_aside`` is true, each damaged journal is renamed, unless a running process uses it.
-    """
+    # Those that have demands or are damaged. With ``set_aside``, each damaged journal is renamed,
+    # unless a running process uses it.
     for file in sorted(root.glob(f"slot-*/{_JOURNAL}")):
         try:
             demands = list(read(file).values())
@@ -382,7 +344,12 @@ def find_journals(root: Path, now: datetime, *, set_aside: bool) -> Iterator[Fou
                 with lock:
                     moved = file.rename(file.with_name(f"outbox-{now:%Y%m%dT%H%M%S}.damaged"))
                     sync_folder(file.parent)
-            yield FoundJournal(file, readable_entries(moved or file), str(damage), moved)
+            pending: dict[str, JournalEntry] = {}
+            for line in (moved or file).read_bytes().split(b"\n"):
+                sealed = _SEALED.fullmatch(line)
+                with suppress(ValueError):
+                    _replay(sealed[1] + b"}" if sealed else line, pending)
+            yield FoundJournal(file, [*pending.values()], str(damage), moved)
 
 
 def _lock(folder: Path) -> IO[str] | None:

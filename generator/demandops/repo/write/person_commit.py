@@ -52,18 +52,13 @@ class CommitDetails:
 class Published:
     commit: str
     branch: str
-    # the address of the branch's merge request, if the server printed it
-    link: str = ""
+    link: str = ""  # the address of the branch's merge request, if the server printed it
 
 
 def commit_to_main(
     repository: StateRepository, make: Callable[[FileReader], Files], details: CommitDetails
 ) -> Published:
-    """Commit the files that ``make`` returns to main.
-
-    The argument of ``make`` reads a file on main. If main gets other commits meanwhile, ``make`` is
-    called again. Raises InvalidInput if the files give the configuration new faults.
-    """
+    # ``make`` reads files of main; it is called again if main gets other commits meanwhile
     return _publish(repository, lambda tip: (make(_reader(tip.tree)), [tip.id]), details)
 
 
@@ -74,10 +69,6 @@ def commit_to_branch(
     branch: str,
     options: Sequence[str],
 ) -> Published:
-    """Commit files to a new branch on top of main, with push options if the server has them.
-
-    Raises InvalidInput if the files give the configuration new faults.
-    """
     tip = trees.commit_of(repository.objects, repository.refresh())
     commit = _commit(repository, tip, files, [tip.id], details)
     branches = ProposalBranches(repository)
@@ -90,11 +81,7 @@ def commit_to_branch(
 def merge(
     repository: StateRepository, proposal: PendingProposal, details: CommitDetails
 ) -> Published:
-    """Merge the commit of a proposal, which a person has seen, into main.
-
-    Raises InvalidInput if the proposal gives the configuration new faults, and StateRepoError if
-    the branch has moved, or main has other changes to the same files.
-    """
+    """Merge the commit of a proposal, which a person has seen, into main."""
     objects = repository.objects
     head = trees.commit_of(objects, proposal.commit)
 

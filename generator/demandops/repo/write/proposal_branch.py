@@ -45,21 +45,16 @@ class BranchMoved(StateRepoError):
 
 
 def branch_name(name: str, operation: str) -> str:
-    """Return the branch name for a demand: a slug of ``name``, and a hash of the operation id."""
     return PREFIX + naming.slug_with_hash(name, operation, 12)
 
 
 @dataclass(frozen=True, slots=True)
 class BranchHeads:
-    """The newest commits of main, empty if there is none, and of the proposals' branches."""
-
-    main: str
-    branches: dict[str, str]
+    main: str  # empty if there is none
+    branches: dict[str, str]  # of the proposals
 
 
 class ProposalBranches:
-    """The branches ``demand/…`` of a state repo, on this disk or behind a URL."""
-
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
         self._remote = repository if isinstance(repository, RemoteRepository) else None
@@ -77,7 +72,7 @@ class ProposalBranches:
         return BranchHeads(heads.pop(MAIN_BRANCH, ""), heads)
 
     def exists(self, branch: str) -> bool:
-        """Return whether any branch exists, also one that does not begin with ``demand/``."""
+        # any branch, also one that does not begin with ``demand/``
         reference = f"{_HEADS}{branch}"
         if self._remote is None:
             return reference in self._repository.objects.references
@@ -86,22 +81,13 @@ class ProposalBranches:
     def put(self, branch: str, commit: Oid, expected: str, options: Sequence[str] = ()) -> str:
         """Make a branch point to ``commit``, durably, and return the link that the server printed.
 
-        Args:
-            branch: the branch's name.
-            commit: a commit in this repository.
-            expected: the branch's commit now; empty if the branch must not exist.
-            options: push options; left out if the server supports none.
-
-        Raises:
-            BranchMoved: the branch is not at ``expected``.
-            Unavailable, PushDenied: the branch could not be pushed for another reason.
-            GitError, OSError: the repository on this disk could not be written.
+        Raises BranchMoved if the branch is not at ``expected``; if that is empty, the branch must
+        not exist. Push options are left out if the server supports none.
         """
         with self._repository.new.packed(commit):
             return self._move(branch, commit, expected, options)
 
     def remove(self, branch: str, expected: str) -> None:
-        """Delete a branch, if it exists, with the errors of :meth:`put`."""
         self._move(branch, None, expected)
 
     def _move(
@@ -110,7 +96,17 @@ class ProposalBranches:
         reference, wanted = f"{_HEADS}{branch}", str(commit or "")
         if self._remote is None:
             try:
-                self._set_reference(reference, commit, expected)
+                references = self._repository.objects.references
+                now = str(references[reference].target) if reference in references else ""
+                if now != expected and (now or commit is not None):
+                    raise BranchMoved(branch)
+                if commit is None:
+                    if now:
+                        references.delete(reference)
+                elif now:
+                    references[reference].set_target(commit, "demandops")
+                else:
+                    references.create(reference, commit)
             except (GitError, OSError) as error:
                 raise self._why_denied(branch) or error from None
             return ""
@@ -142,22 +138,7 @@ class ProposalBranches:
             f"{taken}; delete or rename {taken}, then try again"
         )
 
-    def _set_reference(self, reference: str, commit: Oid | None, expected: str) -> None:
-        references = self._repository.objects.references
-        now = str(references[reference].target) if reference in references else ""
-        if commit is None and not now:
-            return
-        if now != expected:
-            raise BranchMoved(reference.removeprefix(_HEADS))
-        if commit is None:
-            references.delete(reference)
-        elif now:
-            references[reference].set_target(commit, "demandops")
-        else:
-            references.create(reference, commit)
-
     def message(self, commit: str) -> str:
-        """Return a commit's message, empty if this repository lacks the commit."""
         try:
             return commit_of(self._repository.objects, commit).message
         except StateRepoError:
@@ -166,13 +147,9 @@ class ProposalBranches:
     def is_up_to_date(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
-        """Return whether a proposal merges into main cleanly, and changes exactly ``files``.
+        """Return whether a proposal merges into main at ``tip`` cleanly, and changes ``files``.
 
-        Args:
-            tip: the current commit of main.
-            commit: the proposal, on top of ``base``.
-            base: the commit of main that the proposal was made on.
-            files: path → text of the files that the demands would change on the current main.
+        The proposal is ``commit``, made on ``base``. The demands would now change ``files``.
         """
         if (compared := self._trees(tip, commit, base, files)) is None:
             return False
@@ -185,10 +162,7 @@ class ProposalBranches:
     def books_the_same(
         self, tip: Oid, commit: str, base: str, files: Mapping[str, str | None]
     ) -> bool:
-        """Return whether a proposal would book the same on the current main, leases aside.
-
-        The arguments are those of :meth:`is_up_to_date`. Return True for an unknown proposal.
-        """
+        # leases aside; also true if the proposal is unknown
         if (compared := self._trees(tip, commit, base, files)) is None:
             return True
         old, proposal, now, new = compared
@@ -211,11 +185,9 @@ class ProposalBranches:
 @dataclass(frozen=True, slots=True)
 class PendingProposal:
     branch: str
-    # the newest of the branch, perhaps by a person
-    commit: str
+    commit: str  # the newest of the branch, perhaps by a person
     summary: str
-    # when the first demand was received
-    since: datetime
+    since: datetime  # when the first demand was received
     requesters: tuple[str, ...]
     demands: tuple[str, ...]
     operations: tuple[str, ...]
@@ -224,7 +196,6 @@ class PendingProposal:
     replaces: tuple[str, ...] = ()
 
     def require(self, commit: str) -> None:
-        """Raise InvalidInput unless ``commit`` is the whole id of the newest commit."""
         # whoever may push to the branch finds another commit with the same 10 digits in minutes
         if commit != self.commit:
             raise InvalidInput.at(
@@ -235,10 +206,7 @@ class PendingProposal:
 
 
 def pending_proposals(repository: StateRepository) -> Iterator[PendingProposal]:
-    """Yield the proposals whose commits are not on main, sorted by branch.
-
-    Branches that cannot be read are logged and left out. Raises Unavailable if git cannot fetch.
-    """
+    # those whose commits are not on main, sorted by branch
     if isinstance(repository, RemoteRepository):
         repository.fetch_branches(PREFIX)
     space = f"{repository.branches}{PREFIX}"

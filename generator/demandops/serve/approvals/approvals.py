@@ -2,10 +2,8 @@
 
 This code runs in the worker thread. A proposal is booked once main has its claims, whether by a
 merge commit, a squash or a rebase. Until then the worker rebuilds the branch if a new main makes
-it outdated, so that the branch has the files that the generator would render on that main. A branch
-to which a person has committed stays unchanged.
-:meth:`Proposal.verdict` decides what happens to the demands of a proposal, and this module carries
-that verdict out.
+it outdated. A branch to which a person has committed stays unchanged. :meth:`Proposal.verdict`
+decides what happens to the demands of a proposal, and this module carries that verdict out.
 """
 
 from __future__ import annotations
@@ -110,7 +108,6 @@ class Approvals:
     # ---- while a batch is evaluated ----
 
     def remove_released(self, batch: Iterable[Ticket], state: State) -> None:
-        """Withdraw each proposal that a demand of ``batch`` releases, and delete its branch."""
         # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
         # merged it earlier, the batch is evaluated on a tip that includes the merge.
         for ticket in batch if self._proposals else ():
@@ -128,7 +125,6 @@ class Approvals:
                 ticket.has_released = True
 
     def withdraw_released(self, earlier: list[Result], by: Ticket, state: State) -> None:
-        """Withdraw each demand in ``earlier`` that needs approval and that ``by`` releases."""
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
             if request and isinstance(result, Decision) and releases(request, [result.request]):
@@ -136,13 +132,9 @@ class Approvals:
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
-        """Add a demand to the proposal of the same demand, or to a new proposal.
-
-        The demand gets an error as its answer if other requesters own the earlier proposal, if a
-        requester has too many proposals, or if the demand was withdrawn.
-        """
+        """Add a demand to the proposal of the same demand, or to a new one, or answer it."""
         request, waiting = decision.request, self._waiting(decision.request)
-        owners = {name for each in waiting for name in each.requesters()}
+        owners = {name for old in waiting for name in old.requesters()}
         if owners and not owners & set(request.requesters()):
             message = f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; "
             message += "choose another demand id"
@@ -151,18 +143,13 @@ class Approvals:
         # What a person has seen on a branch never becomes another demand there. So a put with other
         # content gets a branch of its own, and replaces the earlier proposal.
         goal = json.dumps(ticket.goal)
-        proposal = next((each for each in waiting if goal in each.goals()), None)
+        proposal = next((old for old in waiting if goal in old.goals()), None)
         replaced = waiting if isinstance(request, Put) and proposal is None else []
         if proposal is None:
-            counts = Counter(
-                name
-                for each in self._proposals.values()
-                if each.waits
-                for name in each.requesters()
-            )
-            full = next(
-                (name for name in request.requesters() if counts[name] >= PROPOSAL_LIMIT), ""
-            )
+            open_proposals = [other for other in self._proposals.values() if other.waits]
+            counts = Counter(name for other in open_proposals for name in other.requesters())
+            names = request.requesters()
+            full = next((name for name in names if counts[name] >= PROPOSAL_LIMIT), "")
             if full and not replaced:
                 message = (
                     f"requester {quoted(full)} already has {PROPOSAL_LIMIT} proposals that await "
@@ -175,7 +162,7 @@ class Approvals:
             if branch in self._proposals:
                 self._demands.fail([ticket], _belongs_to_another(branch))
                 return
-            replaces = next((each.record.as_replaced() for each in replaced), "")
+            replaces = next((old.record.as_replaced() for old in replaced), "")
             proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
         if not self._demands.propose(ticket, proposal.record):
             self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
@@ -188,13 +175,12 @@ class Approvals:
             self._replace(old, branch)
 
     def _waiting(self, request: DemandRequest) -> list[Proposal]:
-        """Return the proposals of the same demand, whatever its content."""
         key = key_of(request)
-        waiting = (each for each in self._proposals.values() if each.waits)
-        return [each for each in waiting if key in map(key_of, each.requests)]
+        waiting = (proposal for proposal in self._proposals.values() if proposal.waits)
+        return [proposal for proposal in waiting if key in map(key_of, proposal.requests)]
 
     def withdraw_replaced(self, request: DemandRequest) -> None:
-        """Withdraw the open proposal that a put replaces which needs no approval."""
+        # by a put that needs no approval
         for proposal in self._waiting(request) if isinstance(request, Put) else ():
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
 
@@ -205,7 +191,6 @@ class Approvals:
     # ---- after main was read ----
 
     def is_due(self, tip: str) -> bool:
-        """Return whether to check the proposals now; ``tip`` is the newest commit of main."""
         if not self._proposals:
             return False
         tickets = (ticket for p in self._proposals.values() for ticket in p.tickets)
@@ -224,8 +209,7 @@ class Approvals:
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
         """Answer the demands that are decided or withdrawn, and update the other proposals.
 
-        ``snapshot`` is the state of main, at the commit ``heads.main`` or a later one. If an error
-        is raised, the next check handles the proposals that this check did not reach.
+        ``snapshot`` is of main, at ``heads.main`` or later. After an error, the next check goes on.
         """
         while self._changed:
             if changed := self._proposals.get(self._changed.popleft()):
@@ -235,7 +219,7 @@ class Approvals:
             is_long = self._runtime.monotonic() - began > _LONGEST_CHECK_S
             if number and is_long and self._demands.has_queued:
                 # make another check due, which begins with the rest
-                unchecked = {each.branch: each for each in proposals[number:]}
+                unchecked = {later.branch: later for later in proposals[number:]}
                 self._proposals = unchecked | self._proposals
                 self._changed.append(proposal.branch)
                 break
@@ -323,10 +307,7 @@ class Approvals:
     def _update(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
-        """Rebuild the branch if it is outdated, open its pull request and notify the requesters.
-
-        Return false if a demand was withdrawn meanwhile and the proposal must be checked again.
-        """
+        # false if a demand was withdrawn meanwhile, so that the proposal must be checked again
         head = heads.branches.get(proposal.branch)
         if head and head not in proposal.record.commits:
             # a rebuild would throw away what a person has written
@@ -351,10 +332,7 @@ class Approvals:
     def _bring_up_to_date(
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
-        """Rebuild the branch on main, with one commit for each demand, unless it is up to date.
-
-        Return false if a demand was withdrawn; the branch is then not pushed.
-        """
+        # one commit for each demand; false, without a push, if a demand was withdrawn
         commits = CommitBatch(self._repository, snapshot)
         steps, failed = decide_in_turn(verdict.unapproved, snapshot.state, commits.read)
         verdict.failed.extend(failed)
@@ -396,7 +374,7 @@ class Approvals:
         return True
 
     def _journal(self, proposal: Proposal, record: ProposalRecord) -> bool:
-        """Journal ``record`` for each demand; return false if a demand was withdrawn."""
+        # false if a demand was withdrawn
         proposal.record = record
         waiting = [self._demands.propose(ticket, record) for ticket in proposal.tickets]
         return all(waiting)
@@ -422,7 +400,6 @@ class Approvals:
         self._demands.wake()
 
     def suspend(self) -> None:
-        """Answer the demands that await approval with an error; the next start resumes them."""
         error = ShuttingDown("the demand awaits approval, and is resumed at the next start")
         for proposal in self._proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)
@@ -431,7 +408,7 @@ class Approvals:
 
 
 def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
-    """Return the request of a ticket that ends demands, or None if it would be refused."""
+    # None also if the request would be refused
     if ticket.state == "withdrawn" or not is_release(ticket.goal):
         return None
     return admit_or_none(state, ticket.goal)

@@ -13,8 +13,7 @@ from demandops.base.settings import MAIN_BRANCH
 from demandops.model.config.repo_settings import Proposals
 from demandops.repo.forge import Forge, ForgeError, PullRequest, forge_for
 
-# ---- when to check the proposals: soon after main has moved, and otherwise at an interval ----
-
+# ---- when to check the proposals: soon after main has moved, else at an interval ----
 
 # The seconds between two checks of the branches, as only a check detects a deleted branch.
 CHECK_LOCAL_S = 1.0
@@ -45,8 +44,8 @@ class CheckTimer:
         return due - self._runtime.monotonic()
 
     def began(self) -> None:
-        """Record that a check begins, and plan the next one in case this one fails."""
         self._began = self._runtime.monotonic()
+        # this plans the next check, in case this one fails
         self._next, self._checked_at = self._began + self._interval, None
 
     def ended(self, tip: str) -> None:
@@ -55,7 +54,7 @@ class CheckTimer:
         self._rest_until = now + _PAUSE_FACTOR * (now - self._began)
 
 
-# ---- opens, watches and closes pull requests at a forge, in a thread of its own ----
+# ---- the pull requests ----
 #
 # A slow or unreachable forge delays no demand and no proposal, because a branch can be merged
 # without a pull request.
@@ -64,8 +63,7 @@ log = logging.getLogger("demandops")
 
 # The seconds between two queries to the forge, to learn which pull requests were closed.
 POLL_S = 30.0
-# How long to pause after a forge has answered that it got too many requests.
-_REST_S = 60.0
+_REST_S = 60.0  # how long to pause after a forge has answered that it got too many requests
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,7 +96,6 @@ class ForgeWorker:
         self._due.set()
 
     def open(self, forge: Proposals, branch: str, title: str, body: str) -> None:
-        """Have the forge's thread open a pull request, unless the branch already has one."""
         if branch not in self._wanted:
             task = _Task(forge, branch, title, body)
             with self._lock:
@@ -106,14 +103,13 @@ class ForgeWorker:
             self._enqueue(task)
 
     def was_queried(self, branch: str) -> bool:
-        """Return whether the forge was queried about a branch, or cannot be queried now."""
+        # also true if the forge cannot be queried now
         return branch in self._pull_requests
 
     def pull_request(self, branch: str) -> PullRequest | None:
         return self._pull_requests.get(branch)
 
     def forget(self, branch: str, closed_as: str) -> None:
-        """Stop watching a branch; also close its pull request, if ``closed_as`` says why."""
         with self._lock:
             task = self._wanted.pop(branch, None)
             pull_request = self._pull_requests.pop(branch, None)
@@ -153,8 +149,8 @@ class ForgeWorker:
                     self._last_error = str(error)
                     if error.asks_to_wait or error.status is None:
                         # notify the requesters now, not only once the forge answers again
-                        for each in (task, *self._tasks):
-                            self._remember(each, self._pull_requests.get(each.branch))
+                        for waiting in (task, *self._tasks):
+                            self._remember(waiting, self._pull_requests.get(waiting.branch))
                     if error.asks_to_wait:
                         self._tasks.appendleft(task)
                         self._runtime.sleep(_REST_S)

@@ -39,15 +39,12 @@ class Verdict:
     booked: list[tuple[Ticket, Decision | InvalidInput]] = field(default_factory=list)
     # These were withdrawn or turned down, or can no longer be booked.
     failed: Failed = field(default_factory=list)
-    # These no longer need approval.
-    free: list[Ticket] = field(default_factory=list)
+    free: list[Ticket] = field(default_factory=list)  # these no longer need approval
     unapproved: Decided = field(default_factory=list)
 
 
 @dataclass(eq=False)
 class Proposal:
-    """A demand that awaits approval on a branch, with all goals that ask for it."""
-
     record: ProposalRecord
     tickets: list[Ticket] = field(default_factory=list)
     requests: list[DemandRequest] = field(default_factory=list)
@@ -65,7 +62,6 @@ class Proposal:
         return any(ticket.state == "proposed" for ticket in self.tickets)
 
     def is_unchanged(self, tip: str, branches: Mapping[str, str]) -> bool:
-        """Return whether main, this proposal's branch and its demands are as at the last check."""
         head = branches.get(self.branch)
         all_wait = all(ticket.state == "proposed" for ticket in self.tickets)
         return all_wait and self.checked_at == tip and head in self.record.commits[-1:]
@@ -79,12 +75,9 @@ class Proposal:
         head: str,
         pull_request: PullRequest | None,
     ) -> Verdict:
-        """Return the verdict on the proposal's demands.
-
-        ``on_main`` has the operation ids in the commits of main since ``searched_to``. ``added``
-        has the claims that people added since then; it is empty unless a person edited or deleted
-        the branch. ``head`` is empty if the branch does not exist.
-        """
+        # ``on_main`` has the operation ids in the commits of main since ``searched_to``. ``added``
+        # has the claims that people added since then, if a person edited or deleted the branch.
+        # ``head`` is empty if the branch does not exist.
         verdict = Verdict()
         for ticket in self.tickets:
             decision: Decision | InvalidInput
@@ -127,48 +120,46 @@ class Proposal:
     def wait_for(self, left: Decided) -> None:
         self.tickets = [ticket for ticket, _ in left]
         self.requests = [decision.request for _, decision in left]
-        self.reasons = tuple(dict.fromkeys(why for _, each in left for why in each.approval))
+        self.reasons = tuple(
+            dict.fromkeys(why for _, decision in left for why in decision.approval)
+        )
 
     def goals(self) -> list[str]:
-        """Return the goals of the demands that were not withdrawn, as JSON: 1 is not true."""
-        return [json.dumps(each.goal) for each in self.tickets if each.state == "proposed"]
+        # as JSON, because in Python 1 equals true
+        tickets = (ticket for ticket in self.tickets if ticket.state == "proposed")
+        return [json.dumps(ticket.goal) for ticket in tickets]
 
     def requesters(self) -> set[str]:
         return {name for request in self.requests for name in request.requesters()}
 
 
 def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
-    """Return whether a request releases all demands in ``pending``.
-
-    It has the key and a requester of one of them, and names all their subjects or is a Release.
-    """
-    requesters = {name for each in pending for name in each.requesters()}
+    # with the key and a requester of one of the demands; names all their subjects or is a Release
+    requesters = {name for other in pending for name in other.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False
-    subjects = {subject for each in pending for subject in each.subjects()}
+    subjects = {subject for other in pending for subject in other.subjects()}
     return isinstance(request, Release) or subjects <= set(request.subjects())
 
 
 def key_of(request: DemandRequest) -> tuple[str, ...]:
-    """Return what tells a demand from others, whatever its content."""
     if request.is_reference:  # the reference's goals have no demand id
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
 
 
 def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decided, Failed]:
-    """Decide each demand on the state after the previous one, with leases from approval on."""
     written: dict[str, str | None] = {}
     steps, failed = Decided(), Failed()
+
+    def read_step(path: str) -> str | None:
+        return written[path] if path in written else read(path)
+
     for ticket, decision in left:
+        # a lease counts from the approval on
         request = permission.with_leases_from_approval(decision.request)
         try:
-            step = decide(
-                state,
-                request,
-                ticket.received,
-                lambda path: written[path] if path in written else read(path),
-            )
+            step = decide(state, request, ticket.received, read_step)
         except InvalidInput as error:
             failed.append((ticket, error))
             continue
@@ -179,7 +170,6 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
 
 
 def is_release(goal: object) -> bool:
-    """Return whether a goal, as plain data, is a shutdown or the release of a demand."""
     fields = goal if isinstance(goal, dict) else {}
     return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
 
@@ -198,9 +188,8 @@ def waiting_text(branch: str, link: str, reasons: Iterable[str]) -> str:
 
 
 def parse_waiting_text(text: str) -> dict[str, str]:
-    """Return ``branch`` and ``link`` from a :func:`waiting_text`; the link may be empty."""
-    branch, _, rest = text.removeprefix(_PREFIX).partition(" ")
-    link = rest.split(" ")[0] if rest.startswith("http") else ""
+    branch, _, link_and_why = text.removeprefix(_PREFIX).partition(" ")
+    link = link_and_why.split(" ")[0] if link_and_why.startswith("http") else ""
     return {"branch": branch, "link": link}
 
 
@@ -249,5 +238,5 @@ def code(text: str) -> str:
 
 
 def _fence(text: str, shortest: int) -> str:
-    """Return at least ``shortest`` backticks, and more than ``text`` has in a row."""
+    # more backticks than the text has in a row
     return "`" * max([shortest, *(len(run) + 1 for run in re.findall(r"`+", text))])

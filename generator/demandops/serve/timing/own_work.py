@@ -23,11 +23,10 @@ from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.queue import Receipt, Ticket
 from demandops.serve.timing.timers import within
 
-# ---- moves placed applications and services off drained nodes ----
+# ---- drained nodes: placed applications and services move off them ----
 #
 # While any of them cannot move, another attempt is made each minute, and at each change of the
 # configuration.
-
 
 log = logging.getLogger("demandops")
 
@@ -40,14 +39,14 @@ class Draining:
         self._runtime = runtime
         self._tried: dict[str, tuple[Config, datetime]] = {}
         self._logged: dict[str, frozenset[str]] = {}
-        self._after: dict[str, str] = {}
+        # by node: the last application that was moved, if others are left for later
+        self.after: dict[str, str] = {}
 
     def move_due(self, commits: CommitBatch) -> None:
-        """Commit the moves of placed applications that can leave their drained node now."""
         now = self._runtime.now()
         for node in self._due(commits.head.state, now):
             tried = (commits.head.state.config, now)
-            after = self._after.pop(node, "")
+            after = self.after.pop(node, "")
             try:
                 decision = commits.drain(node, after, self._runtime.fresh_id(), now)
             except InvalidInput as error:
@@ -57,21 +56,12 @@ class Draining:
             # a commit may fail to be published, so only a try without commit is recorded
             assert isinstance(decision.request, Drain)  # noqa: S101 - it was decided
             if decision.request.last:
-                self._after[node] = decision.request.last
+                self.after[node] = decision.request.last
             elif not decision.files:
                 self._tried[node] = tried
             for moved in decision.placed:
                 log.info("'%s' is drained: %s", node, moved)
             self._warn(node, decision.warnings, continued=bool(after))
-
-    @property
-    def has_more(self) -> bool:
-        """Whether the last call left applications for later."""
-        return bool(self._after)
-
-    def postpone(self) -> None:
-        """Begin again with all applications later."""
-        self._after.clear()
 
     def _warn(self, node: str, stays: Iterable[str], *, continued: bool = False) -> None:
         # the texts of the last try are not logged again, as a try comes each minute
@@ -94,13 +84,12 @@ class Draining:
         return nodes
 
 
-# ---- ends leases, overrides and kept replicas, and says when to check again ----
+# ---- ends of leases, overrides and kept replicas ----
 #
 # A person may set the clock. A clock that is set back only delays the end of a lease. A clock that
 # jumps forward would end leases that were renewed in time, so after a jump every lease gets its
 # full term again. The sleep of a machine looks like a jump and has the same effect. Overrides and
 # kept replicas get no more time after a jump.
-
 
 # By how much the clock may gain on the monotonic clock before leases get their full term again.
 _JUMP = timedelta(seconds=30)
@@ -114,8 +103,6 @@ _RETRY = timedelta(seconds=LONGEST_WAIT_S)
 
 
 class LeaseExpiry:
-    """Decides which leases have ended, and makes tickets to release the claims of these leases."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._last = (runtime.now(), runtime.monotonic())
@@ -125,12 +112,8 @@ class LeaseExpiry:
         self._next_end: datetime | None = None
 
     def tickets(self, ledger: Ledger) -> list[Ticket]:
-        """Return a ticket for each demand whose lease has ended, to release its claims.
-
-        If a ticket did not release the claims, the demand's next ticket comes at least a minute
-        later. The tickets are correct only at the time of the call: later, a requester may renew a
-        lease, or a person may set the clock.
-        """
+        # The tickets are correct only now: later, a requester may renew a lease, or a person may
+        # set the clock. If one does not release its claims, the next comes at least a minute later.
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
         # forget demands that were released or renewed meanwhile
@@ -162,7 +145,6 @@ class LeaseExpiry:
         return now, [claim for claim in ended if claim.demand not in granted]
 
     def seconds_until_due(self, ledger: Ledger, longest: float) -> float:
-        """Return the seconds until the next check: at least one, but at most ``longest``."""
         first = ledger.first_to_end()
         if first is not self._first:  # a search is slow if many leases end at one time
             self._first, self._next_end = first, ledger.next_lease_end()
@@ -180,7 +162,6 @@ class LeaseExpiry:
         return wall
 
     def _has_ended(self, claim: Claim, now: datetime) -> bool:
-
         if claim.lease is None or self._jumped_at is None:
             return claim.lease is not None
         return now > self._jumped_at + timedelta(seconds=claim.lease.seconds + claim.lease.slack)
@@ -191,10 +172,9 @@ class OverrideExpiry:
         # By name and end: an override whose end a person changes is tried again at once.
         self._retry_at: dict[tuple[str, datetime | None], datetime] = {}
         # Before this time no end counts as due, but each batch of demands still commits the ends.
-        self._not_before = datetime.min.replace(tzinfo=timezone.utc)
+        self.not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
-        """Commit the end of each expired override; if that fails, try again later."""
         for override in expired_overrides(commits.head.state, now):
             if self._retry_at.get((override.name, override.end), now) > now:
                 continue
@@ -206,10 +186,6 @@ class OverrideExpiry:
                 for problem in error.faults:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
-    def postpone(self, now: datetime) -> None:
-        """For a minute, count no end as due, because a fetch or a publication failed."""
-        self._not_before = now + _RETRY
-
     def is_due(self, world: World, now: datetime) -> bool:
         return any(time <= now for time in self._due_times(world))
 
@@ -219,7 +195,7 @@ class OverrideExpiry:
 
     def _due_times(self, world: World) -> list[datetime]:
         return [
-            max(self._retry_at.get((override.name, override.end), override.end), self._not_before)
+            max(self._retry_at.get((override.name, override.end), override.end), self.not_before)
             for override in world.overrides
             if override.end
         ]
@@ -228,10 +204,9 @@ class OverrideExpiry:
 class ScaleDown:
     def __init__(self) -> None:
         self._retry_at: dict[Instance, datetime] = {}
-        self._not_before = datetime.min.replace(tzinfo=timezone.utc)
+        self.not_before = datetime.min.replace(tzinfo=timezone.utc)
 
     def end_due(self, commits: CommitBatch, now: datetime) -> None:
-        """Commit each scale-down that is due; if that fails, try again later."""
         for instance in commits.head.state.ledger.kept.due(now):
             if self._retry_at.get(instance, now) > now:
                 continue
@@ -245,28 +220,24 @@ class ScaleDown:
                 if isinstance(error, OverLimit):  # the next may take as long, and demands wait
                     break
 
-    def postpone(self, now: datetime) -> None:
-        self._not_before = now + _RETRY
-
     def is_due(self, ledger: Ledger, now: datetime) -> bool:
-        if now < self._not_before:
+        if now < self.not_before:
             return False
         return any(self._retry_at.get(due, now) <= now for due in ledger.kept.due(now))
 
     def seconds_until_due(self, ledger: Ledger, now: datetime, longest: float) -> float:
         end = ledger.kept.next_end()
-        return longest if end is None else _seconds_until(max(end, self._not_before), now, longest)
+        return longest if end is None else _seconds_until(max(end, self.not_before), now, longest)
 
 
 def _seconds_until(time: datetime, now: datetime, longest: float) -> float:
     return min(max((time - now).total_seconds() + 0.01, _SHORTEST_S), longest)
 
 
-# ---- when the demands that wait for room are tried again, and in which order ----
+# ---- the demands that wait for room: when they are tried again, and in which order ----
 #
 # If there may be room, the generator tries the waiting demands before it decides new demands. So no
 # demand gets the room for which an earlier demand, or a demand of higher priority, was waiting.
-
 
 # After this processor time, new demands come before the waiting demands that were not tried yet.
 _LONGEST_ROUND_S = 0.25
@@ -276,18 +247,17 @@ class WaitingTurns:
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._tried: World | None = None
-        self._left: list[str] = []
+        self.left: list[str] = []  # demands that the last round left for later
 
     def book_due(self, commits: CommitBatch) -> None:
-        """Commit each waiting demand that fits and needs no approval, in its turn."""
         state = commits.head.state
         if not self.is_due(state):
             return
-        if not self._is_tried(state) or not self._left:
-            self._left = [waiting.demand for waiting in in_turn(state.ledger.waiting)]
+        if not self._is_tried(state) or not self.left:
+            self.left = [waiting.demand for waiting in in_turn(state.ledger.waiting)]
         end = self._runtime.processor_s() + _LONGEST_ROUND_S
-        while self._left:
-            demand = self._left.pop(0)
+        while self.left:
+            demand = self.left.pop(0)
             state, now = commits.head.state, self._runtime.now()
             waiting = state.ledger.waiting.get(demand)
             if waiting is None:  # it was released meanwhile
@@ -318,17 +288,8 @@ class WaitingTurns:
         elif self._tried is before:  # the last demand freed no room, so the tries are still valid
             self._tried = commits.head.state
 
-    @property
-    def has_more(self) -> bool:
-        """Whether the last round left demands for later."""
-        return bool(self._left)
-
-    def postpone(self) -> None:
-        """Begin again with all waiting demands later."""
-        self._left.clear()
-
     def is_due(self, state: State) -> bool:
-        return bool(state.ledger.waiting) and (bool(self._left) or not self._is_tried(state))
+        return bool(state.ledger.waiting) and (bool(self.left) or not self._is_tried(state))
 
     def _is_tried(self, state: World) -> bool:
         # by identity: ledger and configuration are frozen, and to compare their content takes long
@@ -336,7 +297,7 @@ class WaitingTurns:
         return tried is not None and tried.ledger is state.ledger and tried.config is state.config
 
 
-# ---- the work that becomes due without a new demand, such as ends of overrides ----
+# ---- all of this work, in its order ----
 
 
 class OwnWork:
@@ -348,7 +309,6 @@ class OwnWork:
         self._waiting_turns = WaitingTurns(runtime)
 
     def commit_due(self, commits: CommitBatch) -> None:
-        """Commit all work that is due; if a part fails, try it again later."""
         # a scale-down frees room for what moves, and what runs moves before what waits is booked
         self._override_expiry.end_due(commits, self._runtime.now())
         self._scale_down.end_due(commits, self._runtime.now())
@@ -356,15 +316,14 @@ class OwnWork:
         self._waiting_turns.book_due(commits)
 
     def follow(self, commits: CommitBatch, before: State) -> None:
-        """Book waiting demands if the last demand, decided on ``before``, freed room."""
         self._waiting_turns.follow(commits, before)
 
     def postpone(self) -> None:
-        """Begin no work for a while, because a fetch or a publication failed."""
-        self._override_expiry.postpone(self._runtime.now())
-        self._scale_down.postpone(self._runtime.now())
-        self._draining.postpone()
-        self._waiting_turns.postpone()
+        # because a fetch or a publication failed
+        later = self._runtime.now() + _RETRY
+        self._override_expiry.not_before = self._scale_down.not_before = later
+        self._draining.after.clear()
+        self._waiting_turns.left.clear()
 
     def is_due(self, state: State) -> bool:
         now = self._runtime.now()
@@ -376,9 +335,8 @@ class OwnWork:
         )
 
     def seconds_until_due(self, state: State, longest: float) -> float:
-        """Return the seconds until the next check: at most ``longest``."""
         # what was left off goes on at once, but after the demands that arrived meanwhile
-        if self._draining.has_more or self._waiting_turns.has_more:
+        if self._draining.after or self._waiting_turns.left:
             return 0.0
         now = self._runtime.now()
         seconds = self._override_expiry.seconds_until_due(state, now, longest)

@@ -18,16 +18,14 @@ from demandops.model.config.config import Config
 from demandops.model.config.repo_settings import ROOT_FILE, Limits
 from demandops.model.demand.demand_request import DemandRequest
 
-# ---- the delay until the next attempt to publish, and how many demands to publish at once ----
+# ---- the next attempt to publish: when, and with how many demands ----
 #
 # There are two kinds of delays: after another writer published first, and while the remote cannot
 # be reached. Both kinds are jittered and bounded, so no writer starves, and the writers do not
 # flood a remote that comes back.
 
-
 FIRST_PAUSE_S = 0.05
-# While the remote cannot be reached.
-LONGEST_AWAY_S = 10.0
+LONGEST_AWAY_S = 10.0  # while the remote cannot be reached
 # After another writer published first; a writer that waits longer loses again to the others.
 LONGEST_TURN_S = 0.4
 # The most demands to publish together. A push takes about 50 ms, but moving a branch of a
@@ -47,16 +45,14 @@ class Backoff:
         self.published()
 
     def published(self) -> None:
-        """Reset the delays and ``max_demands``, because commits were published."""
         self.max_demands = self._limit
         self._turn = self._away = FIRST_PAUSE_S
 
     def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
         """Return the seconds to wait if another writer published first; adjust ``max_demands``.
 
-        ``size`` counts the demands that the attempt tried to publish, and ``evaluating_s`` the
-        seconds until it had decided and committed them. ``pushing_s`` goes on until the rejection
-        of the push.
+        ``size`` counts the demands of the attempt, which took ``evaluating_s`` to decide and commit
+        them, and ``pushing_s`` from then to the rejection.
         """
         # a writer that evaluates for longer than its push takes always loses to faster writers
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
@@ -65,7 +61,6 @@ class Backoff:
         return self._jittered(wait)
 
     def unreachable(self) -> float:
-        """Return the seconds to wait after the remote could not be reached."""
         wait, self._away = self._away, min(self._away * 2, LONGEST_AWAY_S)
         return self._jittered(wait)
 
@@ -104,22 +99,16 @@ class Rest:
 
 
 # ---- when to fetch from the state repo while no demand comes ----
-#
-# This module does not fetch; the caller fetches, and reports the end of each fetch.
 
 DEFAULT_INTERVAL = "30s"
 _LONGEST_BACKOFF_S = 60.0
-# A Git server may report many pushes at once; they share a fetch.
-_SHORTEST_GAP_S = 0.5
+_SHORTEST_GAP_S = 0.5  # a Git server may report many pushes at once; they share a fetch
 # The longest interval for a repository on this disk, where a check is cheap: it reads one file.
 _LOCAL_S = 1.0
 
 
 def parse_interval(text: str) -> float:
-    """Return an interval in seconds, from a duration like ``30s`` or a number of seconds.
-
-    ValueError is raised if the text is neither of them.
-    """
+    """Return the seconds of a duration like ``30s`` or of a number, or raise ValueError."""
     if re.fullmatch(r"[0-9]{1,8}(\.[0-9]{1,6})?", text):
         return float(text)
     return float(seconds_of(text))
@@ -141,7 +130,6 @@ class PollTimer:
         self._requested = runtime.event()
 
     def request(self) -> None:
-        """Make a fetch due now, or half a second after the last one, if that is later."""
         self._requested.set()
 
     def seconds_until_due(self) -> float | None:
@@ -166,14 +154,12 @@ class PollTimer:
             self._next = self._last + self._pause * self._runtime.uniform(0.8, 1.0)
 
 
-# ---- shows a supervisor, such as a pod's liveness probe, that the worker is not stuck ----
+# ---- the sign of life, for a supervisor such as a pod's liveness probe ----
 
 
 class Heartbeat:
-    """Touches a file in each turn of the worker and at each wait for git."""
-
-    # So the file grows old only if the worker is stuck, and not because a remote is away.
-
+    # The worker calls it in each turn and at each wait for git. So the file grows old only if the
+    # worker is stuck, and not because a remote is away.
     def __init__(self, file: Path | None) -> None:
         self._file = file
         # an earlier process may have left one; until the first turn there is none, because a start
@@ -188,19 +174,18 @@ class Heartbeat:
                 self._file.touch()
 
 
-# ---- the processor time in which one demand is decided, because other demands wait meanwhile ----
+# ---- the budget of one decision, because other demands wait meanwhile ----
 
 # The usual demand lists a dozen topics; one of this size is decided in some 10 ms.
 _USUAL = Limits.model_validate({"demandItems": 200, "demandCharacters": 20_000})
 
 
 def may_take_long(goal: object) -> bool:
-    """Return whether a demand is so large that what was decided before it is published first."""
+    # what was decided before such a demand is published first
     return any(True for _ in length_faults(goal, _USUAL))
 
 
 def within(limits: Limits, runtime: Runtime) -> Checkpoint:
-    """Return a checkpoint that ends a decision once the calling thread has used its time."""
     # Only a refusal may depend on it, because another machine takes another time. Processor time,
     # because other programs on this machine must not get a demand refused.
     most = limits.decision_milliseconds
@@ -217,7 +202,7 @@ def within(limits: Limits, runtime: Runtime) -> Checkpoint:
     return checkpoint
 
 
-# ---- how many demands a requester may send in a minute, by the quotas of the access domains ----
+# ---- the rate of a requester, by the quotas of the access domains ----
 #
 # A generator counts only the demands that it receives itself. It counts a demand once, even if it
 # evaluates the demand several times.
@@ -253,7 +238,6 @@ class RateLimit:
                     yield fault("", message, code="quota")
 
     def _count(self, key: tuple[str, str], operation: str, received: datetime) -> int:
-        """Count a demand, and return its number among those of the last minute."""
         # forget requesters that sent nothing for a minute, because vehicles come and go
         while self._seen:
             idlest = next(iter(self._seen))
