@@ -422,7 +422,7 @@ def _clock(at: datetime, now: datetime) -> str:
 
 
 # How many connections may be open; at most half of them are streams of events (`Site`).
-_AT_ONCE = 200
+_MOST_CONNECTIONS = 200
 _LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 
@@ -453,7 +453,7 @@ class WebServer:
         # name, for example that of a reverse proxy.
         hosts = _LOCAL_HOSTS if is_local else ("*",)
         site = Site(follower, hosts, settings.documentation())
-        self._server = HttpServer(listening, site.application, "web", _AT_ONCE)
+        self._server = HttpServer(listening, site.application, "web", _MOST_CONNECTIONS)
 
     def close(self) -> None:
         self._follower.closed.set()  # ends the open streams of events

@@ -36,7 +36,7 @@ SPANS = {
     "all": 0,
 }
 
-WIDTH = 1000
+_STRIP_WIDTH = 1000
 _BINS = 60
 _FEW = 20
 # The distances between ticks that people can read off easily, from a second to 30 days.
@@ -154,13 +154,14 @@ def strip(
     length = max((now - start).total_seconds(), 1.0)
 
     def x_of(at: datetime) -> float:
-        return WIDTH * (at - start).total_seconds() / length
+        return _STRIP_WIDTH * (at - start).total_seconds() / length
 
     bins: dict[tuple[str, int], list[Event]] = {}
     for event in events:
         if event.time >= start:
-            x = min(x_of(event.time), WIDTH - 1e-6)  # an event of this moment is in the last bin
-            bins.setdefault((event.lane, int(x * _BINS / WIDTH)), []).append(event)
+            # an event of this moment is in the last bin
+            x = min(x_of(event.time), _STRIP_WIDTH - 1e-6)
+            bins.setdefault((event.lane, int(x * _BINS / _STRIP_WIDTH)), []).append(event)
     dots = []
     for (lane, place), group in sorted(bins.items()):
         newest, count = group[0], len(group)
@@ -169,7 +170,7 @@ def strip(
         label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
         tone = "bad" if any(event.tone == "bad" for event in group) else newest.tone
         is_chosen = chosen is not None and any(event.commit == chosen[1] for event in group)
-        x, radius = (place + 0.5) * WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
+        x, radius = (place + 0.5) * _STRIP_WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
         dots.append(Dot(lane, x, radius, count, label, newest.commit, tone, is_chosen))
     step = next((each for each in _STEPS_S if length / each <= _TICKS), length / _TICKS)
     form = "%H:%M:%S" if step < 60 else "%H:%M" if step < 86400 else "%m-%d"
@@ -179,7 +180,7 @@ def strip(
         ticks.append(Tick(x_of(moment), moment.strftime(form)))
         at += step
     mark = x_of(chosen[0]) if chosen else None
-    shown = mark if mark is not None and 0 <= mark <= WIDTH else None
+    shown = mark if mark is not None and 0 <= mark <= _STRIP_WIDTH else None
     return Strip(span, tuple(dots), tuple(ticks), shown)
 
 
