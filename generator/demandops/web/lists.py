@@ -21,7 +21,6 @@ from demandops.web.situation import RANKS, WORDS, ReusableRows, Situation, word_
 
 # ---- lists that can be filtered, sorted and paged, as plain values ----
 
-
 # How many rows a page of a list has at most.
 PAGE = 100
 
@@ -47,16 +46,12 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """The content of one field of a row: texts, or a time.
-
-    ``tone`` is the cell's color. ``order`` is the sort key; by default it is the time or the first
-    text.
-    """
+    """A field of a row: texts, or a time; ``tone`` is its color."""
 
     parts: tuple[Part, ...] = ()
     time: datetime | None = None
     tone: str = ""
-    order: float | str | None = None
+    order: float | str | None = None  # by default the time or the first text
 
     @property
     def shown(self) -> tuple[Part, ...]:
@@ -68,7 +63,7 @@ class Cell:
 
     @property
     def rank(self) -> tuple[bool, float, str]:
-        """The key by which rows are sorted; in ascending order, empty cells come last."""
+        # in ascending order, empty cells come last
         order = self.order
         if order is None:
             order = self.time.timestamp() if self.time else self.parts[0].text if self.parts else ""
@@ -92,7 +87,7 @@ class Row:
 
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
-        """The texts of each column and hidden field; lower case, because filters ignore case."""
+        """The texts of each field; lower case, because filters ignore case."""
         all_texts = {
             key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()
         }
@@ -107,23 +102,18 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One page of a filtered and sorted list.
-
-    ``total`` counts all rows of the list, ``matching`` the rows that match the filter. ``sort`` is
-    the key of a column, with ``-`` in front for the reverse order.
-    """
+    """One page of a filtered and sorted list."""
 
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
-    total: int
+    total: int  # of all rows of the list
     matching: int
-    sort: str
+    sort: str  # the key of a column, with `-` in front for the reverse order
     page: int
     pages: int
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
-    """Return a cell with all of ``texts`` that are not empty."""
     parts = (text if isinstance(text, Part) else Part(str(text)) for text in texts)
     return Cell(tuple(part for part in parts if part.text), tone=tone, order=order)
 
@@ -159,17 +149,12 @@ class Filter:
 
 
 def exactly(key: str, value: str) -> str:
-    """Return the filter text for rows whose field ``key`` has exactly this value."""
     return shlex.quote(f"{key}={value}")
 
 
 def table(
     columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
 ) -> Table:
-    """Return a page of the rows that match the filter.
-
-    An unknown ``sort`` means the first column.
-    """
     every = list(rows)
     matching = [row for row in every if wanted.matches(row)]
     key = sort.removeprefix("-")
@@ -181,10 +166,6 @@ def table(
 
 
 def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item], int, int]:
-    """Return the items of a page, the number of the page, and the number of pages.
-
-    A number out of range means the nearest page.
-    """
     pages = max(1, -(-len(items) // size))
     page = min(max(page, 1), pages)
     return items[(page - 1) * size : page * size], page, pages
@@ -197,11 +178,11 @@ Values: TypeAlias = "tuple[Any, ...]"
 
 @dataclass(frozen=True, slots=True)
 class ListKind:
-    """One of the lists: its name in addresses, its title, its columns and its entries.
+    """One of the lists, with its name in addresses.
 
-    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the world and
-    the values. For an entry whose values have not changed, ``row`` is called again only if the
-    configuration or the overrides have changed.
+    ``entries`` yields the id and the values of each entry, from which ``row`` makes a row. While
+    the values stay the same, ``row`` is called again only if the configuration or the overrides
+    have changed.
     """
 
     name: str
@@ -221,12 +202,10 @@ def _demand_part(id: str) -> Part:
 
 
 def _health_cell(word: str) -> Cell:
-    """Return the cell for a health word; its sort key puts the worst health first."""
     return cell(word, tone=WORDS[word], order=RANKS[word])
 
 
 def _linked(view: str, key: str, values: Iterable[str]) -> Cell:
-    """Return a cell in which each value is linked to the rows that have it in field ``key``."""
     return cell(*(Part(value, Link(view, {"q": exactly(key, value)})) for value in values))
 
 
@@ -347,12 +326,11 @@ def _lease(world: World, claim: Claim) -> Row:
     )
 
 
-def _columns(*named: str) -> tuple[Column, ...]:
-    return tuple(Column(*each.split("|")) for each in named)
+def _columns(keys_and_titles: str) -> tuple[Column, ...]:
+    return tuple(Column(*column.split("|")) for column in keys_and_titles.split(", "))
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
-    """Return the rows of a list; reuse the rows of entries that have not changed."""
     commit_state, kind = now.commit_state, LISTS[name]
     reusable = commit_state.rows.get(name, ReusableRows(None, {}))
     # the follower makes a new mapping of statuses whenever it looks, so the same mapping means that
@@ -376,14 +354,8 @@ LISTS = {
             "Demands",
             "What requesters hold, until they release it or its lease ends.",
             _columns(
-                "demand|Demand",
-                "health|Health",
-                "requester|Requesters",
-                "application|Applications",
-                "connection|Connections",
-                "since|Since",
-                "lease|Lease until",
-                "request|Request",
+                "demand|Demand, health|Health, requester|Requesters, application|Applications, "
+                "connection|Connections, since|Since, lease|Lease until, request|Request"
             ),
             _demands,
             _demand,
@@ -393,14 +365,8 @@ LISTS = {
             "Services",
             "One row for each Helm release: a service on a node, shared by all who need it.",
             _columns(
-                "release|Release",
-                "health|Health",
-                "service|Service",
-                "node|Node",
-                "cluster|Cluster",
-                "application|For",
-                "version|Version",
-                "requester|Requesters",
+                "release|Release, health|Health, service|Service, node|Node, cluster|Cluster, "
+                "application|For, version|Version, requester|Requesters"
             ),
             _services,
             _service,
@@ -410,14 +376,8 @@ LISTS = {
             "Connections",
             "Topics that are carried from one node to another.",
             _columns(
-                "connection|Connection",
-                "health|Health",
-                "by|By",
-                "from|From",
-                "to|To",
-                "topic|Topics",
-                "requester|Requesters",
-                "release|Releases",
+                "connection|Connection, health|Health, by|By, from|From, to|To, topic|Topics, "
+                "requester|Requesters, release|Releases"
             ),
             _connections,
             _connection,
@@ -427,13 +387,8 @@ LISTS = {
             "Leases",
             "Claims that end unless their requester renews them. The first to end comes first.",
             _columns(
-                "ends|Ends",
-                "subject|Holds",
-                "kind|Kind",
-                "demand|Demand",
-                "requester|Requesters",
-                "term|Term",
-                "slack|Slack",
+                "ends|Ends, subject|Holds, kind|Kind, demand|Demand, requester|Requesters, "
+                "term|Term, slack|Slack"
             ),
             _leases,
             _lease,

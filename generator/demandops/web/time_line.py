@@ -16,7 +16,6 @@ from demandops.web.situation import WORDS, Commit, HealthChange
 
 # ---- the time line, with the events of demands, overrides, people's commits and health ----
 
-
 # The title of each lane of the time line, from top to bottom, by the lane's name.
 LANES = {
     "demands": "Demands",
@@ -66,17 +65,14 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """Events of one lane that are close together.
-
-    ``commit`` is the commit of the newest event; empty for a change of health.
-    """
+    """Events of one lane that are close together."""
 
     lane: str
     x: float
     radius: float
     count: int
     label: str
-    commit: str
+    commit: str  # of the newest event; empty for a change of health
     tone: str
     is_chosen: bool
 
@@ -89,15 +85,10 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """The picture of the time line.
-
-    ``chosen`` is the x coordinate of the chosen commit; None if the picture does not show it.
-    """
-
     span: str
     dots: tuple[Dot, ...]
     ticks: tuple[Tick, ...]
-    chosen: float | None
+    chosen: float | None  # where the chosen commit is; None if the picture does not show it
 
 
 def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
@@ -125,7 +116,6 @@ def of_commit(commit: Commit) -> Event:
 
 
 def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
-    """Return the events of ``lane`` (if empty, of all lanes) that match the filter."""
     return [
         event
         for event in events
@@ -139,7 +129,7 @@ def strip(
     """Return the picture of the time line that ends at ``now``, for events that are newest first.
 
     If ``span`` is no key of ``SPANS``, it is the shortest that has enough events. ``chosen`` is the
-    time and the id of the chosen commit; None if no earlier commit is chosen.
+    time and the id of the chosen commit.
     """
     if span not in SPANS:
         # enough events are 20, or three quarters of all events, whichever is less
@@ -185,10 +175,6 @@ def strip(
 
 
 # ---- plots of rates and latencies ----
-#
-# The rates are those of demands that are booked or released, and of people's commits. The latencies
-# are the time from the receipt of a demand to its commit, and the time until a release is healthy
-# again.
 
 WIDTH, HEIGHT = 560, 150
 _RATE_BINS = 48
@@ -205,20 +191,15 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A plot: its bars, the highest value of the axis as text, and the values as a table.
-
-    Bins of time whose value is 0 have neither a bar nor a line in the table.
-    """
-
     title: str
     unit: str
     about: str
     bars: tuple[Bar, ...]
-    top: str
+    top: str  # the highest value of the axis
     first: datetime
     last: datetime
     summary: str
-    table: tuple[tuple[datetime, str], ...]
+    table: tuple[tuple[datetime, str], ...]  # without the bins of time whose value is 0
 
 
 # When a value was measured, and the value.
@@ -233,8 +214,7 @@ def plots(
 ) -> list[Plot]:
     """Return the plots of a span of time that ends at ``now``.
 
-    ``span`` is a key of ``SPANS``. ``all``, and any text that is no key, means the time since the
-    oldest of ``commits``; without commits, the last hour.
+    A ``span`` that is no key of ``SPANS`` means the time since the oldest of ``commits``.
     """
     seconds = SPANS.get(span, 0)
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
@@ -281,11 +261,9 @@ class _PlotMaker:
         self._span = span_s
 
     def counts(self, title: str, times: Iterable[datetime], about: str) -> Plot:
-        bins = self._bins((at, 1.0) for at in times)
-        total = sum(map(len, bins))
-        per_hour = total * 3600 / self._span
-        summary = f"{total} in all, {per_hour:.3g} an hour"
-        values = [float(len(each)) for each in bins]
+        values = [float(len(events)) for events in self._bins((at, 1.0) for at in times)]
+        total = int(sum(values))
+        summary = f"{total} in all, {total * 3600 / self._span:.3g} an hour"
         return self._plot(title, f"per {span(self._bin_s)}", about, values, summary, "")
 
     def medians(self, title: str, samples: Iterable[Sample], about: str) -> Plot:
