@@ -63,11 +63,9 @@ COMMANDS = {
     "why": ("views.why", "Explain why something runs or ran."),
 }
 
-
 # These commands run until they are stopped. They log or fill the screen, so they do not show the
 # progress of git operations.
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-
 
 # Errors about a file: its path is wrong, or permissions are missing.
 _OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
@@ -82,7 +80,6 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import and return a command; a ClickException says if git or a Python package is missing."""
     module = COMMANDS[name][0]
     ros = module.split(".")[0] == "demandops_ros"
     try:

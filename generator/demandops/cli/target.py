@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import click
 from click.core import ParameterSource
@@ -23,9 +23,6 @@ from demandops.repo.git.local_repository import checkout_around, is_url, origin_
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.views import explanations
-
-if TYPE_CHECKING:
-    pass  # DROPPED
 
 # ---- contexts: the fleets that a person works with, from a file in the user's config folder ----
 #
@@ -66,7 +63,6 @@ def path() -> Path:
 
 
 def read() -> ContextsFile:
-    """Return the contexts in the file; without a file there are none."""
     try:
         text = path().read_text(encoding="utf-8")
     except FileNotFoundError:
@@ -80,7 +76,6 @@ def read() -> ContextsFile:
 
 
 def write(content: ContextsFile) -> None:
-    """Write the contexts to the file, which only its owner may read."""
     file = path()
     file.parent.mkdir(parents=True, exist_ok=True)
     data = content.model_dump(by_alias=True, exclude_none=True)
@@ -92,7 +87,7 @@ def write(content: ContextsFile) -> None:
 
 
 def named(name: str, field: str = "") -> Context:
-    """Return the context of this name; a fault names ``field`` as the place of the name."""
+    # a fault names `field` as the place of the name
     contexts = read().contexts
     if name not in contexts:
         message = f"there is no context '{name}'{suggestion(name, contexts)}"
@@ -100,9 +95,7 @@ def named(name: str, field: str = "") -> Context:
     return contexts[name]
 
 
-# ---- target ----
-#
-# Which state repo a command works on, and with which access: options, environment, contexts.
+# ---- which state repo a command works on, and with which access ----
 #
 # The first of these that is given decides:
 #
@@ -130,9 +123,6 @@ _NO_STATE_REPO = (
 
 
 def _chosen_context(around: Path | None) -> Context | None:
-    """Return the context that applies, and remember it for :func:`_from_context`."""
-    pass  # DROPPED
-
     # clusters and signing key of a context apply only to its own state repo
     ctx = click.get_current_context()
     name = ctx.meta.get(_NAME)
@@ -151,13 +141,12 @@ def _chosen_context(around: Path | None) -> Context | None:
 
 
 def _checkout() -> Path | None:
-    """Return the checkout around the current folder; None outside one, or with ``--context``."""
+    # `--context` goes before the checkout around the current folder
     named = _NAME in click.get_current_context().meta
     return None if named else checkout_around(Path.cwd())
 
 
 def readable_repo() -> str | None:
-    """Return the default state repo of a command that only reads; None if there is none."""
     around = _checkout()
     context = _chosen_context(around)
     return str(around) if around else context.state_repo if context else None
@@ -181,15 +170,12 @@ def _writable() -> str | None:
 
 
 def hint_to_pull() -> list[str]:
-    """Return a hint to pull if the command works on the remote of a checkout, as a list."""
     # the new commit is not in the checkout yet, and commands that only read use the checkout
     behind = click.get_current_context().meta.get(_BEHIND)
     return ["to see the new commit in this checkout: git pull"] if behind else []
 
 
 def _from_context(field: str) -> Callable[[], str | None]:
-    """Return a function that returns ``field`` of the context that applies."""
-
     def default() -> str | None:
         context = click.get_current_context().meta.get(_CONTEXT)
         return getattr(context, field) if context else None
@@ -203,8 +189,6 @@ def _remember_name(ctx: click.Context, param: click.Parameter, value: str | None
 
 
 def context_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    pass  # DROPPED
-
     return [name for name in read().contexts if name.startswith(incomplete)]
 
 
@@ -288,15 +272,13 @@ clusters_option = click.option(
 )
 
 
-# ---- name completion ----
-#
-# Completers for names from the state repo, by which a shell completes a command's arguments.
+# ---- names from the state repo, by which a shell completes a command's arguments ----
 
 Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
 
 def names_of(*kinds: str) -> Complete:
-    """Return a completer for names of these kinds; it offers no names if an error occurs."""
+    """Return a completer for names of these kinds."""
 
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         try:

@@ -32,7 +32,6 @@ from demandops.repo.write.proposal_branch import (
 
 # ---- ``demandops approve``: merge a proposal in the caller's own name ----
 
-
 commit_option = click.option(
     "--commit",
     metavar="ID",
@@ -43,10 +42,6 @@ commit_option = click.option(
 
 
 def proposal_named(repo: Reader, name: str) -> PendingProposal:
-    """Return the proposal with this branch, or with a demand of this id.
-
-    If there is none, ``name`` may be a part of a branch's name.
-    """
     pending = list(pending_proposals(repo.repository))
     # requesters choose ids of demands, so such an id may be the branch of another proposal
     fitting = (

@@ -32,7 +32,6 @@ from demandops.model.demand.demand_request import Decommission
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo import reader
 from demandops.repo.history import commit_message
-from demandops.repo.history.commit_message import Person
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.serve import evaluation
@@ -41,20 +40,17 @@ from demandops.serve.queue import Receipt
 
 # ---- booking, and printing the changes ----
 
-
 _LOOK_UP_S = 0.5
 
 
 def await_answer(future: Future[Any]) -> None:
-    """Wait until a demand has an answer; Ctrl-C and SIGTERM interrupt the wait."""
-    # Polled, because a wait without a timeout could miss a signal that arrives just before the wait
-    # begins, or a signal that another library handles.
+    # Polled, so that Ctrl-C and SIGTERM interrupt it: a wait without a timeout could miss a signal
+    # that arrives just before the wait begins, or a signal that another library handles.
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)
 
 
 def booked(generator: Generator, goal: Json) -> Receipt:
-    """Submit a goal, and return its receipt when it is published."""
     ticket = generator.submit(goal)
     with busy("booking"):
         await_answer(ticket.future)
@@ -167,21 +163,17 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
         if dry_run or row["outcome"] == "unchanged":
             return
         confirm("Continue?", yes, output)
-    row = _book(goal, by, state_repo, signing_key)
-    show(output, row, _decommission_lines(row, False))
-
-
-def _book(goal: Json, by: Person, state_repo: str, signing_key: Path | None) -> Json:
     # through the journal, like a demand, so it may run beside other generators
     with started_generator(state_repo, signing_key) as generator:
         warned_if_unnamed(by)
         try:
             receipt = booked(generator, goal)
+            row = _row(goal, receipt.outcome, receipt.commit, receipt.changes)
         except Refused as error:
             if not _is_unclaimed_node(error, goal, generator.snapshot):
                 raise
-            return _row(goal, "unchanged", None, ())
-    return _row(goal, receipt.outcome, receipt.commit, receipt.changes)
+            row = _row(goal, "unchanged", None, ())
+    show(output, row, _decommission_lines(row, False))
 
 
 def _dry_run_decommission(goal: Json, state_repo: str, output: str) -> Json:
@@ -298,7 +290,6 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 
 
 def _dry_run_rollback(repo: Reader, goal: Json, base: str) -> Json:
-    """Return the outcome and consequences of a rollback on top of ``base``; book nothing."""
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
     request = repo.restoration(goal["to"], drop_newer=goal["dropNewer"])
@@ -318,11 +309,7 @@ def _consequences(decision: Decision | None) -> Json:
 
 
 def _roll_back(state_repo: str, goal: Json, signing_key: Path | None, base: str) -> Json:
-    """Roll back with a generator; return the outcome as JSON data.
-
-    The caller knows the consequences on top of the commit ``base``. The data has others if the
-    rollback was decided on another commit, was refused or had no effect.
-    """
+    """Roll back with a generator; return what differs from the consequences on ``base``."""
     try:
         with started_generator(state_repo, signing_key) as generator:
             receipt = booked(generator, goal)

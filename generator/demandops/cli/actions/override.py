@@ -19,7 +19,6 @@ from demandops.cli.actions.person_change import (
     carry_out,
     confirm,
     consequence,
-    consequence_lines,
     editing,
     print_edit,
     selecting,
@@ -165,9 +164,7 @@ def new_override(
 ) -> str:
     """Return the text of a new override's file.
 
-    ``selected`` has the values of the options that select releases and claims. ``more`` has the
-    effects and the other fields; None leaves a field out. Without an owner, the person's name in
-    git is the owner.
+    ``more`` has the effects and the other fields; None leaves a field out.
     """
     if not options.reason:
         raise click.UsageError("give the reason: -m TEXT")
@@ -185,10 +182,6 @@ def new_override(
 
 
 def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Show the effect of a new override, ask for confirmation, and commit the override.
-
-    With ``options.propose``, commit it to a branch. With ``options.dry_run``, only show the effect.
-    """
     if repo.file_reader()(edit.path) is not None:
         message = "exists already; end it first, or choose another name"
         raise InvalidInput.at("", message, file=edit.path)
@@ -198,7 +191,6 @@ def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Like :func:`create_override`, but remove an override."""
     overrides = repo.last_valid_snapshot(repo.commit()).state.config.overrides
     if edit.name not in overrides and repo.file_reader()(edit.path) is not None:
         message = "is not valid, so nothing is overridden; correct or remove the file with git"
@@ -212,7 +204,10 @@ def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
 def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> None:
     if options.output == "text":
         errors.print(f"{edit.summary} ({edit.path})")
-        for line in consequence_lines(edit, entry):
+        verb = "affects" if edit.text is not None else "no longer affects"
+        lines = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
+        lines += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
+        for line in lines or ["  affects nothing now"]:
             errors.print(line)
     published = None
     if not options.dry_run:
@@ -222,10 +217,6 @@ def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> 
 
 
 def ends_at(text: str | None) -> str | None:
-    """Return the end of an override as the file has it.
-
-    ``text`` is a time, or a duration from now; for any other text, raise BadParameter.
-    """
     if text is None:
         return None
     try:
@@ -241,18 +232,18 @@ def ends_at(text: str | None) -> str | None:
         ) from None
 
 
-# ---- ``demandops suspend``: stop applications and connections by an override that denies them ----
+# ---- ``demandops suspend``: an override that denies applications and connections ----
 
 
 def name_of(selected: dict[str, tuple[str, ...]]) -> str:
-    """Return the name of the override for a selection; equal selections get the same name."""
+    # equal selections get the same name, so that `resume` finds the override
     chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
     words = "-".join(value for _, values in chosen for value in values)
     return "suspend-" + naming.slug_with_hash(words, repr(chosen), 6)
 
 
 def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
-    """Return whether an override has this selection, and not another one with the same name."""
+    # another override may have the same name
     selectors = [each.model_dump(exclude_none=True) for each in override.select]
     return [{kind: {*values} for kind, values in each.items()} for each in selectors] == [
         {kind: {*values} for kind, values in selector(selected).items()}
@@ -289,7 +280,6 @@ def suspend(expires: str | None, options: EditOptions, **selected: tuple[str, ..
 
 
 def described(selected: dict[str, tuple[str, ...]]) -> str:
-    """Return a selection as text, such as ``node edge, requester vehicle00``."""
     return ", ".join(
         f"{kind.removesuffix('s')} {value}"
         for kind, values in selector(selected).items()

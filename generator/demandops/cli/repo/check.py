@@ -19,15 +19,12 @@ from demandops.repo.pull_request import merge_check
 from demandops.repo.pull_request.merge_check import CheckResult
 from demandops.repo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
 from demandops.templating.evaluator import processor_time
-from demandops.views.bookkeeping import EntryChange
 
 # ---- the result as a comment on a pull request ----
 #
 # Text that people wrote appears only as code, so that this text cannot mention users, make links or
 # break the layout. Each code span or fence uses more backticks than any run of backticks in its
-# text. The length of a comment is limited. So the most important parts come first, and the comment
-# states how many parts are omitted.
-
+# text. The length of a comment is limited, so the most important parts come first.
 
 # The first line of every report. A pipeline finds its earlier comment by this line.
 MARK = "<!-- demandops check -->"
@@ -41,7 +38,7 @@ _ROOM_FOR_NOTE = 200
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
     """Return the result of a check as Markdown, with at most ``longest`` characters."""
-    parts = [f"{MARK}\n", *_head(checked), *_suggestions(checked), *_consequence(checked)]
+    parts = [f"{MARK}\n", *_findings(checked), *_consequence(checked)]
     room = longest - _ROOM_FOR_NOTE
     taken, left_out = list[str](), 0
     for part in parts:
@@ -64,10 +61,7 @@ def report(checked: CheckResult, longest: int = LONGEST) -> str:
 def chart_lines(
     charts: RenderedCharts | None, shown: Callable[[str], str] = one_line
 ) -> Iterator[str]:
-    """Yield lines that say which charts helm rendered, and why it did not render the others.
-
-    A reason may contain text that people wrote, so ``shown`` makes it safe to print.
-    """
+    # a reason may contain text that people wrote, so `shown` makes it safe to print
     if charts is None:
         return
     if MISSING in charts.not_rendered.values():
@@ -83,7 +77,7 @@ def chart_lines(
 
 
 def code(text: str) -> str:
-    """Return text as a code span of one line, cut off if it is very long."""
+    # one line, cut off if it is very long
     text = one_line(text, _LONGEST_SPAN)
     if not text.strip():
         return "(empty)"
@@ -104,7 +98,7 @@ def _longer_than_any(text: str, least: int) -> str:
     return "`" * max(least, longest + 1)
 
 
-def _head(checked: CheckResult) -> Iterator[str]:
+def _findings(checked: CheckResult) -> Iterator[str]:
     count = len(checked.faults)
     if count:
         yield f"## DemandOps: {'1 error' if count == 1 else f'{count} errors'}\n"
@@ -120,9 +114,6 @@ def _head(checked: CheckResult) -> Iterator[str]:
             yield f"\n- {kind}{': '.join([*places, code(fault.message)])}"
         if faults:
             yield "\n"
-
-
-def _suggestions(checked: CheckResult) -> Iterator[str]:
     for suggestion in checked.suggestions:
         body = f"Merge this as {code(suggestion.file)}:\n\n{fence(suggestion.text, 'yaml')}"
         if suggestion.not_covered:
@@ -157,7 +148,15 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
         yield "\nNot compared, because the base has no valid files.\n"
     elif not checked.bookkeeping:
         yield "\nUnchanged.\n"
-    yield from map(_entry, checked.bookkeeping or ())
+    for entry in checked.bookkeeping or ():
+        word = "new" if entry.change == "added" else entry.change
+        line = f"\n- {word}: {entry.kind} {code(entry.name)}"
+        if entry.change == "changed":
+            facts = [f"\n  - no longer {code(fact)}" for fact in entry.lost]
+            facts += [f"\n  - now {code(fact)}" for fact in entry.gained]
+            yield line + "".join(facts)
+        else:
+            yield f"{line} for {', '.join(map(code, entry.requesters))}"
     yield "\n"
     if consequence.files:
         yield f"\n### Files that the generator writes or removes: {len(consequence.files)}\n"
@@ -170,27 +169,17 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
             yield _folded(_plain(file.path), fence("\n".join(file.diff()), "diff"))
 
 
-def _entry(entry: EntryChange) -> str:
-    word = "new" if entry.change == "added" else entry.change
-    line = f"\n- {word}: {entry.kind} {code(entry.name)}"
-    if entry.change != "changed":
-        return f"{line} for {', '.join(map(code, entry.requesters))}"
-    facts = [f"\n  - no longer {code(fact)}" for fact in entry.lost]
-    facts += [f"\n  - now {code(fact)}" for fact in entry.gained]
-    return line + "".join(facts)
-
-
 def _folded(summary: str, body: str) -> str:
     return f"\n<details><summary>{summary}</summary>\n\n{body}\n</details>\n"
 
 
 def _plain(path: str) -> str:
-    """Return a path as HTML for a ``<summary>``, in which Markdown is not rendered."""
+    # for a <summary>, in which Markdown is not rendered
     safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", one_line(path))
     return f"<code>{safe if len(safe) <= _LONGEST_SPAN else '…'}</code>"
 
 
-# ---- ``demandops check``: the effect of edits of a state repo, before they are merged ----
+# ---- the command ----
 
 _MOST_DIFF_LINES = 400
 _LONG_NEW_FILE = 30
@@ -282,7 +271,7 @@ def _data(checked: CheckResult) -> Json:
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return the diffs that fit into ``most`` lines, by path, and the number of other lines."""
+    # the diffs that fit into `most` lines, by path, and the number of other lines
     shown: dict[str, str] = {}
     left_out = 0
     for file in files:

@@ -246,11 +246,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
-    """Ask the question until the answer is valid; return the words of the answer.
-
-    ``check`` raises a click exception for a word that is not valid. ``most`` is the highest number
-    of words; None for any number.
-    """
+    """Ask until the answer is at most ``most`` valid words; ``check`` raises for another word."""
 
     def valid(answer: str) -> tuple[str, ...]:
         words = tuple(answer.split())
@@ -326,7 +322,6 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
 
 
 def _read_configuration(directory: Path) -> tuple[Files, Config]:
-    """Return the files that people edit in a checkout, and the configuration in them."""
     with busy("reading the state repo"):
         files, faults = edited_checkout.files_of(directory)
         if faults:
@@ -338,9 +333,9 @@ def _read_configuration(directory: Path) -> tuple[Files, Config]:
 def _lay_down(
     directory: Path, existing: Files, new_files: Files, output: str, then: list[str]
 ) -> None:
-    """Write new files, but only if the whole configuration is valid with them."""
     if strange := [path for path in new_files if ".." in path.split("/") or "//" in path]:
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
+    # nothing is written unless the whole configuration is valid with it
     with busy("rendering an example of each application"):
         try_configuration(State(load({**existing, **new_files}), Ledger(), EVALUATE))
     hints = [f"to check the files: demandops check {directory}", *then]

@@ -55,9 +55,7 @@ def version(output: str) -> None:
     show(output, data, lines)
 
 
-# ---- completion ----
-#
-# ``demandops completion``: a script with which a shell completes commands, options and names.
+# ---- ``demandops completion``: a script with which a shell completes commands and names ----
 
 VARIABLE = "_DEMANDOPS_COMPLETE"
 
@@ -177,7 +175,7 @@ def set_context(
 
 
 def _absolute(place: str | None) -> str | None:
-    """Return the absolute form of a path that exists; return other text, such as a URL, as is."""
+    # other text, such as a URL, stays as it is
     if place is None or not Path(place).expanduser().exists():
         return place
     return str(Path(place).expanduser().resolve())

@@ -55,41 +55,7 @@ from demandops.views import demand_lists, explanations
 from demandops.views.bookkeeping import bookkeeping
 from demandops.views.explanations import override_report, override_state
 
-# ---- the proposals that await a person's approval, with links to their pull requests ----
-
-
-def proposals(repo: Reader) -> list[Json]:
-    """Return the proposals as JSON data.
-
-    The links to the pull requests come from the GitHub or Gitea that demandops.yaml names, with the
-    token in the file that DEMANDOPS_FORGE_TOKEN_FILE names. If one of these is missing, or there is
-    no answer or no pull request, a link is None.
-    """
-    pending = list(pending_proposals(repo.repository))
-    token_file, forge = settings.forge_token_file(), None
-    if pending and token_file is not None:
-        try:
-            configured = repo.config().repo_settings.proposals
-        except InvalidInput:
-            configured = Proposals()  # if a file is invalid, list the proposals without links
-        try:
-            forge = forge_for(configured, token_file)
-        except ForgeError as error:
-            errors.print(f"warning: {error}")
-    rows = []
-    for proposal in pending:
-        link = None
-        try:
-            request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
-            link = request.link if request else None
-        except ForgeError as error:
-            errors.print(f"warning: {error}")
-        since = time_data(proposal.since)
-        rows.append({"name": proposal.branch, **asdict(proposal), "since": since, "link": link})
-    return rows
-
-
-# ---- the kinds of things that ``demandops get`` lists: their data, columns and filters ----
+# ---- the kinds of things: their data, columns and filters ----
 
 Values = Callable[[Json], Iterable[str]]
 CellOf = Callable[[Json, datetime], Cell]
@@ -105,15 +71,12 @@ class Source:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """A kind of thing: its items, each with a ``name``, and how they are shown.
-
-    Only ``-o wide`` shows the columns in ``wide``. ``filters`` maps an option to a function from an
-    item to values. An item is listed if the option matches one of the values.
-    """
+    """A kind of thing: its items, each with a ``name``, and how they are shown."""
 
     items: Callable[[Source], list[Json]]
     columns: Sequence[tuple[Column, CellOf]]
-    wide: Sequence[tuple[Column, CellOf]]
+    wide: Sequence[tuple[Column, CellOf]]  # further columns for `-o wide`
+    # An item is listed if the option matches one of the values that its filter returns.
     filters: Mapping[str, Values] = field(default_factory=dict)
 
     def table(self, items: Iterable[Json], now: datetime, *, wide: bool = False) -> Table:
@@ -125,7 +88,6 @@ class Kind:
 def _column(
     title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False
 ) -> tuple[Column, CellOf]:
-    """Return a column whose cells are a field of the items, or what a function returns."""
     cell_of = cell if callable(cell) else lambda item, now: item[cell] or ""
     return Column(title, rank, wraps), cell_of
 
@@ -160,6 +122,32 @@ def _nodes(source: Source) -> list[Json]:
     ]
 
 
+def _proposals(source: Source) -> list[Json]:
+    repo, pending = source.repo, list(pending_proposals(source.repo.repository))
+    # without a forge, a token or an answer, the proposals are listed without links
+    token_file, forge = settings.forge_token_file(), None
+    if pending and token_file is not None:
+        try:
+            configured = repo.config().repo_settings.proposals
+        except InvalidInput:
+            configured = Proposals()
+        try:
+            forge = forge_for(configured, token_file)
+        except ForgeError as error:
+            errors.print(f"warning: {error}")
+    rows = []
+    for proposal in pending:
+        link = None
+        try:
+            request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
+            link = request.link if request else None
+        except ForgeError as error:
+            errors.print(f"warning: {error}")
+        since = time_data(proposal.since)
+        rows.append({"name": proposal.branch, **asdict(proposal), "since": since, "link": link})
+    return rows
+
+
 def _services(source: Source) -> list[Json]:
     world = source.snapshot.state
     return [
@@ -177,10 +165,10 @@ def _connections(source: Source) -> list[Json]:
     return [
         {
             "name": name,
-            "domains": demand_lists.domains_of([each.source, each.target], world.config),
-            **asdict(each),
+            "domains": demand_lists.domains_of([entry.source, entry.target], world.config),
+            **asdict(entry),
         }
-        for name, each in bookkeeping(world).connections.items()
+        for name, entry in bookkeeping(world).connections.items()
     ]
 
 
@@ -400,7 +388,7 @@ KINDS: dict[str, Kind] = {
         },
     ),
     "proposals": Kind(
-        lambda source: proposals(source.repo),
+        _proposals,
         (
             _column("Branch", "branch"),
             _column("Commit", lambda item, now: item["commit"][:10]),
@@ -439,7 +427,7 @@ KINDS: dict[str, Kind] = {
 }
 
 
-# ---- ``demandops get``: lists of demands, of running services and of people's configuration ----
+# ---- the command ----
 
 FILTERS = ("node", "requester", "application", "domain")
 _POLL_S = 1.0
@@ -534,16 +522,16 @@ def get(
     """
     if watch and at:
         raise click.UsageError("--watch follows the newest commit, so leave out --at")
-    shown = KINDS[kind]
+    listed = KINDS[kind]
     wanted = {name: value for name, value in filters.items() if value is not None}
-    for name in wanted.keys() - shown.filters.keys():
-        can = ", ".join(f"--{each}" for each in FILTERS if each in shown.filters)
+    for name in wanted.keys() - listed.filters.keys():
+        can = ", ".join(f"--{option}" for option in FILTERS if option in listed.filters)
         raise click.UsageError(f"{kind} have no --{name}; they can be filtered by {can}")
     with reader.opened(state_repo) as repo:
         source = _read_source(repo, at)
-        items = shown.items(source)
-        _refuse_unknown(shown, items, source.snapshot.state, names, wanted)
-        items = _matching(shown, items, names, wanted)
+        items = listed.items(source)
+        _refuse_unknown(listed, items, source.snapshot.state, names, wanted)
+        items = _matching(listed, items, names, wanted)
         _print_list(kind, source, items, output, watch)
         while watch:
             REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
@@ -555,7 +543,7 @@ def get(
             if is_same and kind != "proposals":  # a proposal is a branch, and no commit on main
                 continue
             source = _read_source(repo, None)
-            before, items = items, _matching(shown, shown.items(source), names, wanted)
+            before, items = items, _matching(listed, listed.items(source), names, wanted)
             if items != before:
                 _print_list(kind, source, items, output, watch)
 
@@ -586,7 +574,7 @@ def _matching(
 def _refuse_unknown(
     kind: Kind, items: list[Json], world: World, names: tuple[str, ...], wanted: dict[str, str]
 ) -> None:
-    """Refuse names and filters that match nothing: they are probably misspelled."""
+    # what matches nothing is probably misspelled
     # a filter may match no item if it names something that exists, such as a node without demands
     existing: dict[str, Iterable[str]] = {
         "node": {*world.config.nodes, *world.ledger.indexed_names("node")},
@@ -608,9 +596,8 @@ def _refuse_unknown(
 
 
 def _print_list(kind: str, source: Source, items: list[Json], output: str, watch: bool) -> None:
-    commit, shown = str(source.snapshot.commit), KINDS[kind]
-    data = {"kind": kind, "commit": commit, "items": items}
-    plain = json.loads(json.dumps(data))
+    commit = str(source.snapshot.commit)
+    plain = json.loads(json.dumps({"kind": kind, "commit": commit, "items": items}))
     if output == "json" and watch:
         click.echo(json_escaped(json.dumps(plain, ensure_ascii=False)))
     elif output == "json":
@@ -620,7 +607,7 @@ def _print_list(kind: str, source: Source, items: list[Json], output: str, watch
     elif output == "name":
         show(output, None, [item["name"] for item in items])
     else:
-        table = shown.table(items, source.now, wide=output == "wide")
+        table = KINDS[kind].table(items, source.now, wide=output == "wide")
         table = replace(table, empty=f"no {kind}", styles=_COLORS)
         when = f"{source.now:%H:%M:%S} UTC, " if watch else ""
         note = painted(f"{when}at {commit[:10]}", "dim")

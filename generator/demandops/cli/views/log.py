@@ -163,7 +163,7 @@ def log(
 
 
 def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
-    """Refuse names that no commit is about: they are probably misspelled."""
+    # a name that no commit is about is probably misspelled
     names: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
     for entry in repo.log() if names else ():
         for name, values in names.items():
@@ -199,7 +199,6 @@ def _matching(
     until: datetime | None,
     **trailers: str | None,
 ) -> Iterable[LogEntry]:
-    """Return the commits that match every filter; ``trailers`` has keys of ``_TRAILERS``."""
     wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
 
     def matches(entry: LogEntry) -> bool:

@@ -132,10 +132,8 @@ def status(
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The state of all releases at one commit; ``rows`` are the releases as JSON data."""
-
     commit: str
-    rows: list[Json]
+    rows: list[Json]  # the releases
     problems: tuple[Problem, ...]
     clusters: frozenset[str]
     not_rendered: frozenset[str]
@@ -151,7 +149,6 @@ class Status:
         clusters: Mapping[str, clusters_file.ClusterAccess],
         patience_s: int = _PATIENCE_S,
     ) -> Status:
-        """Return the current status; give the clusters ``patience_s`` seconds to answer."""
         problems = repo.problems()
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(progress=report)
@@ -194,10 +191,8 @@ class Status:
         )
 
     def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
-        """Return a text that counts everything that is wrong; empty if nothing is wrong.
-
-        Of the releases, only those on clusters with a kubeconfig in ``clusters`` count.
-        """
+        """Return a text that counts everything that is wrong; empty if nothing is wrong."""
+        # of the releases, only those on clusters with a kubeconfig count
         readable = {name for name, cluster in clusters.items() if cluster.kubeconfig}
         watched = [row for row in self.rows if row["cluster"] in readable]
         failing = sum(row["failing"] for row in watched)
@@ -219,9 +214,9 @@ class Status:
             "commit": self.commit,
             "releases": self.rows,
             "not_rendered": sorted(self.not_rendered),
-            "old_bootstraps": [asdict(each) for each in self.old_bootstraps],
-            "orphans": [asdict(each) | {"command": each.command} for each in self.orphans],
-            "missing_inputs": [asdict(each) for each in self.missing_inputs],
+            "old_bootstraps": [asdict(bootstrap) for bootstrap in self.old_bootstraps],
+            "orphans": [asdict(orphan) | {"command": orphan.command} for orphan in self.orphans],
+            "missing_inputs": [asdict(missing) for missing in self.missing_inputs],
             "unreadable": [
                 {"cluster": name, "reason": why} for name, why in self.unreadable.items()
             ],
@@ -243,7 +238,6 @@ def _read_clusters(
     wanted: Mapping[str, Iterable[ObjectSelector]],
     patience_s: int,
 ) -> dict[str, ObjectCache]:
-    """Return a cache of the ``wanted`` objects of each cluster that has a kubeconfig."""
     caches = {
         name: ObjectCache(name, cluster, lambda: None)
         for name, cluster in clusters.items()

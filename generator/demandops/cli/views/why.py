@@ -45,8 +45,7 @@ from demandops.views import explanations
 from demandops.views.demand_lists import nodes_of
 from demandops.views.explanations import affected_releases, override_report
 
-# ---- what is meant: the release, demand, node or other object that has the given name ----
-
+# ---- the release, demand, node or other object that has the given name ----
 
 KINDS = (
     "release",
@@ -63,12 +62,7 @@ _MOST_LISTED = 8
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """What a name identifies.
-
-    ``kind`` is one of ``KINDS``, ``claim`` or ``file``.
-    """
-
-    kind: str
+    kind: str  # one of `KINDS`, `claim` or `file`
     name: str
     path: str = ""
     release: Release | None = None
@@ -78,8 +72,7 @@ class Match:
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
     """Return the object that a name or path identifies; ``kind`` limits the search to one kind.
 
-    Only the history up to the commit of ``snapshot`` counts. A StateRepoError says that the name
-    identifies nothing, or several things.
+    Only the history up to the commit of ``snapshot`` counts.
     """
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
@@ -136,12 +129,20 @@ def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
 def _by_looser_match(
     repo: Reader, snapshot: Snapshot, name: str, kind: str | None
 ) -> Iterator[Match]:
-    """Yield what a name may mean that is no whole name of a release or subject."""
+    # for a name that is no whole name of a release or subject
     world, commit = snapshot.state, str(snapshot.commit)
-    named = next((each for each in _named(world, name) if kind in (None, each.kind)), None)
-    if named is not None:
-        yield named
-        return
+    config, index = world.config, world.ledger.index
+    places = {
+        "demand": "" if ("demand", name) in index else None,
+        "node": config.file_of(NODES_FILE, name) if name in config.nodes else None,
+        "appdef": f"appdefs/{name}/appdef.yaml" if name in config.appdefs else None,
+        "override": config.overrides[name].path if name in config.overrides else None,
+        "requester": "" if ("requester", name) in index else None,
+    }
+    for named_kind, path in places.items():
+        if path is not None and kind in (None, named_kind):
+            yield Match(named_kind, name, path)
+            return
     # what runs or is held comes before what has ended
     if kind in (None, "release"):
         parts = {each.name: each for each in explanations.releases(world) if name in each.name}
@@ -164,21 +165,6 @@ def _by_looser_match(
             yield Match("release", only, repo.release_path(only, commit) or "")
 
 
-def _named(world: World, name: str) -> Iterator[Match]:
-    """Yield each current object of this name that is no release, application or connection."""
-    config = world.config
-    if ("demand", name) in world.ledger.index:
-        yield Match("demand", name)
-    if name in config.nodes:
-        yield Match("node", name, config.file_of(NODES_FILE, name))
-    if name in config.appdefs:
-        yield Match("appdef", name, f"appdefs/{name}/appdef.yaml")
-    if name in config.overrides:
-        yield Match("override", name, config.overrides[name].path)
-    if ("requester", name) in world.ledger.index:
-        yield Match("requester", name)
-
-
 def _the_only_name(
     part: str, names: list[str], what: str = "releases have {} in their name"
 ) -> str:
@@ -192,8 +178,7 @@ def _the_only_name(
 
 
 def demand_commits(repo: Reader, snapshot: Snapshot, id: str) -> list[LogEntry]:
-    """Return the generator's commits about a demand up to the snapshot's, newest first."""
-    entries = repo.log(str(snapshot.commit))
+    entries = repo.log(str(snapshot.commit))  # newest first
     return [entry for entry in entries if id in entry.trailers.get("Demand-Id", ())]
 
 
@@ -252,9 +237,9 @@ def lines_of(answer: Json) -> Iterator[str]:
         yield from _claim_lines(answer["claims"])
     if answer.get("shaped_by"):
         yield "configured by"
-        for each in answer["shaped_by"]:
-            entry = f" {each['entry']}" if each["entry"] else ""
-            yield f"  {each['file']}{entry}: {each['what']}"
+        for place in answer["shaped_by"]:
+            at = f" {place['entry']}" if place["entry"] else ""
+            yield f"  {place['file']}{at}: {place['what']}"
     if answer.get("overrides"):
         yield "overridden by"
         yield from (f"  {_override_text(each)}" for each in answer["overrides"])
@@ -262,7 +247,6 @@ def lines_of(answer: Json) -> Iterator[str]:
 
 
 def _state(answer: Json) -> str:
-    """Return the predicate of the first line, such as ``runs`` or ``is suspended``."""
     runs, kind = answer["runs"], answer["kind"]
     if kind in ("file", "claim") and not runs:
         return "no longer exists" if answer["stopped"] else "exists"
@@ -343,7 +327,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
         yield f"    carries out commit {each['commit'][:10]} of {each['author']}: {each['summary']}"
 
 
-# ---- ``demandops why``: the requesters, configuration, overrides and commits behind what runs ----
+# ---- the command: the requesters, configuration, overrides and commits behind what runs ----
 
 _MOST_CARRIED_OUT = 5
 
@@ -420,7 +404,6 @@ def why(
 
 
 def _described(world: World, match: Match) -> Json:
-    """Return as JSON data what the object of ``match`` is, and who needs it."""
     name, config = match.name, world.config
     if match.release is not None:
         release = match.release
@@ -536,28 +519,23 @@ def _claims(claims: list[Claim], world: World) -> Json:
 
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> Json:
-    if match.kind in ("node", "requester"):  # `demandops log` lists their commits
-        return _history(repo, PathHistory(None, (), 0, None))
-    if match.kind != "demand":
-        return _history(repo, repo.history(match.path, str(snapshot.commit), most))
-    about = demand_commits(repo, snapshot, match.name)
-    if not about:  # the history was made anew
-        return _history(repo, PathHistory(None, (), 0, None))
-    *newer, first = about
-    held = ("demand", match.name) in snapshot.state.ledger.index
-    stopped = None if held or not newer else newer.pop(0)
-    more = max(len(newer) - most, 0)
-    return _history(repo, PathHistory(first, tuple(newer[:most]), more, stopped))
-
-
-def _history(repo: Reader, history: PathHistory) -> Json:
-    """Return commits as JSON data, each with the people's commits that it carries out."""
+    history = PathHistory(None, (), 0, None)
+    if match.kind == "demand":
+        about = demand_commits(repo, snapshot, match.name)
+        if about:  # else the history was made anew
+            *newer, first = about
+            held = ("demand", match.name) in snapshot.state.ledger.index
+            stopped = None if held or not newer else newer.pop(0)
+            more = max(len(newer) - most, 0)
+            history = PathHistory(first, tuple(newer[:most]), more, stopped)
+    elif match.kind not in ("node", "requester"):  # `demandops log` lists their commits
+        history = repo.history(match.path, str(snapshot.commit), most)
 
     def row(entry: LogEntry | None) -> Json | None:
         if entry is None:
             return None
         behind = repo.person_commits_behind(entry, _MOST_CARRIED_OUT)
-        return commit_data(entry) | {"carries_out": [commit_data(each) for each in behind]}
+        return commit_data(entry) | {"carries_out": [commit_data(commit) for commit in behind]}
 
     return {
         "started": row(history.started),
