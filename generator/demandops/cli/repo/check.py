@@ -19,6 +19,7 @@ from demandops.repo.pull_request import merge_check
 from demandops.repo.pull_request.merge_check import CheckResult
 from demandops.repo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
 from demandops.templating.evaluator import processor_time
+from demandops.views.bookkeeping import EntryChange
 
 # ---- the result as a comment on a pull request ----
 #
@@ -148,15 +149,7 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
         yield "\nNot compared, because the base has no valid files.\n"
     elif not checked.bookkeeping:
         yield "\nUnchanged.\n"
-    for entry in checked.bookkeeping or ():
-        word = "new" if entry.change == "added" else entry.change
-        line = f"\n- {word}: {entry.kind} {code(entry.name)}"
-        if entry.change == "changed":
-            facts = [f"\n  - no longer {code(fact)}" for fact in entry.lost]
-            facts += [f"\n  - now {code(fact)}" for fact in entry.gained]
-            yield line + "".join(facts)
-        else:
-            yield f"{line} for {', '.join(map(code, entry.requesters))}"
+    yield from map(_entry, checked.bookkeeping or ())
     yield "\n"
     if consequence.files:
         yield f"\n### Files that the generator writes or removes: {len(consequence.files)}\n"
@@ -167,6 +160,16 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
     for file in consequence.files:
         if file.after is not None:
             yield _folded(_plain(file.path), fence("\n".join(file.diff()), "diff"))
+
+
+def _entry(entry: EntryChange) -> str:
+    word = "new" if entry.change == "added" else entry.change
+    line = f"\n- {word}: {entry.kind} {code(entry.name)}"
+    if entry.change != "changed":
+        return f"{line} for {', '.join(map(code, entry.requesters))}"
+    facts = [f"\n  - no longer {code(fact)}" for fact in entry.lost]
+    facts += [f"\n  - now {code(fact)}" for fact in entry.gained]
+    return line + "".join(facts)
 
 
 def _folded(summary: str, body: str) -> str:
