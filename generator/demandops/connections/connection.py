@@ -416,12 +416,12 @@ class ConnectionType(ABC):
         return iter(())
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        # as clients will carry it, and a note of how it differs; the generator checks the connection
-        # only after this call, so it may have faults
+        # as clients will carry it, and a note of how it differs; it may have faults, because the
+        # generator checks it only after this call
         return connection, ""
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return (field of a policy's rule, value that it must allow) besides access to the nodes."""
+        """Return (field of a policy's rule, value that it must allow), besides the nodes."""
         return []
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:

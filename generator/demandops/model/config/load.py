@@ -73,7 +73,7 @@ _ANY = RepoSettings(
 
 
 def load(files: Mapping[str, str]) -> Config:
-    """Return the configuration of a state repo; files outside of the configuration are ignored."""
+    """Return the configuration of a state repo; other files are ignored."""
     reader = ConfigReader(files)
     repository = reader.read_file(ROOT_FILE, RepoSettings)
     if repository and repository.render_version > RENDER_VERSION:
@@ -140,7 +140,6 @@ def load(files: Mapping[str, str]) -> Config:
 
 
 def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
-    """Return the settings of all connection types, and for each type the file with its settings."""
     clients, files = DEFAULT_SETTINGS, dict[str, str]()
     for file in reader.files_of(CLIENTS_FILE):
         part = reader.read_file(file, ClientsFile)
@@ -173,7 +172,6 @@ def _refuse_unread(reader: ConfigReader) -> None:
 def _read_definitions(
     reader: ConfigReader, file: str, model: type[Definition]
 ) -> Mapping[str, Definition]:
-    """Return the definitions in all valid files ``appdefs/<folder>/{file}``, by folder."""
     definitions = {}
     for path in sorted(reader.files):
         parts = path.split("/")
@@ -253,7 +251,7 @@ def _in_further_domains(
     domains: Mapping[str, AccessDomain],
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
-    """Return nodes, domains and hosts, with a node ``<id>@<domain>`` for each further domain."""
+    """Return nodes, domains and hosts, with ``<id>@<domain>`` for each further domain."""
     # Everything follows from the node: namespace, rules, quotas, keys of releases. A domain beside
     # each node would have to be asked for at each place, and a place that forgets it would mix the
     # data of two domains.

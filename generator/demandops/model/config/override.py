@@ -1,8 +1,7 @@
 """Overrides: a person's declared deviations, one file each in ``overrides/``.
 
-This module has the model and the rules for one override. The module
-:mod:`.cross_check` finds conflicts between two overrides, and the
-package ``plan/overrides`` applies overrides to releases and claims.
+This module has the model and the rules for one override. :mod:`.cross_check` finds conflicts
+between two of them, and ``decide.planning.overrides`` applies overrides to releases and claims.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ EFFECTS = (*_SHAPING, "hold", "deny", "keep")
 
 
 def parse_time(text: str) -> datetime:
-    """Parse an RFC 3339 time that has a time zone, and return it in UTC, or raise ValueError."""
+    """Parse an RFC 3339 time that has a time zone, and return it in UTC."""
     match = _MOMENT.fullmatch(text)
     if match is None:
         raise ValueError(
@@ -65,7 +64,6 @@ def parse_time(text: str) -> datetime:
 
 
 def format_time(moment: datetime) -> str:
-    """Return a time as RFC 3339 text in UTC, as messages and the ledger's markers have it."""
     text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
     return re.sub(r"\.?0*\+00:00$", "Z", text)
 
@@ -134,7 +132,6 @@ class Selector(FrozenModel):
         return self
 
     def takes(self, service: str, appdef: str) -> bool:
-        """Return whether a service of an appdef fits ``services`` and ``appdefs``."""
         return (not self.services or matches(service, self.services)) and (
             not self.appdefs or matches(appdef, self.appdefs)
         )
@@ -209,7 +206,6 @@ class OverrideFile(FileModel):
                 )
 
     def patches_clients(self) -> bool:
-        """Return whether ``values`` patches the settings of clients instead of Helm values."""
         return all(selector.connections for selector in self.select)
 
     def effects(self) -> tuple[str, ...]:
@@ -244,15 +240,12 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
-    """The overrides that shape a release, each with the names of its effects on the release.
+    """The overrides that shape a release, each with the names of its effects on the release."""
 
-    The overrides are in the order in which they apply; the last one wins.
-    """
-
+    # In the order in which they apply; the last one wins
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, name: str, image: Image) -> Image:
-        """Return ``image``, which the registry calls ``name``, as the overrides pin it."""
         for override, effects in self.by:
             if "images" in effects and override.images and name in override.images:
                 image = override.images[name].over(image)
@@ -260,7 +253,6 @@ class Shaping:
 
     @property
     def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The file and the patch of each override that patches values."""
         return tuple(
             (override.path, override.values or {})
             for override, effects in self.by
@@ -269,7 +261,6 @@ class Shaping:
 
     @property
     def held(self) -> bool:
-        """Whether a ``hold`` keeps the release's file unchanged."""
         held = False
         for _, effects in self.by:
             # one that applies later and changes the release cancels the hold
@@ -284,7 +275,6 @@ Settings = TypeVar("Settings", bound=ClientSettings)
 
 
 def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
-    """Return the settings of clients, patched by the ``values`` of the override in ``file``."""
     data = merge_patch(settings.model_dump(by_alias=True), patch)
     own, of_mqtt = (
         {field.alias for field in model.model_fields.values()}
@@ -298,12 +288,12 @@ def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) ->
 
 
 def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
-    """Return overrides in the order in which they apply; the last one wins."""
+    # the order in which they apply; the last one wins
     return tuple(sorted(overrides, key=lambda override: override.rank))
 
 
 def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
-    """Return the overrides that have not ended; ``ended`` maps names to the expiry that passed."""
+    # `ended` has the expiry of each override when it ended
     return [
         override
         for name, override in overrides.items()
