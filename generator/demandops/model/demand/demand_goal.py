@@ -28,7 +28,6 @@ from demandops.model.demand.demand_request import Demanded, DemandRequest, Put, 
 # Fields of the wrong form are left out, and the other fields are kept. So the caller can report
 # faults of form and of content together.
 
-
 # how deeply a goal may be nested: as deeply as a YAML file of the state repo
 _DEEPEST_GOAL = 100
 
@@ -40,10 +39,7 @@ def parse_valid_part(
 ) -> tuple[Goal, list[Fault]]:
     """Return the part of ``data`` that has the form of ``model``, and a fault for each wrong part.
 
-    The model has a default for every field; ``lists_of_text`` are those that are lists of text.
-
-    Raises:
-        Refused: with the first faults, if there are too many to look for others.
+    Raises Refused with the first faults, if there are too many to look for others.
     """
     faults: list[Fault] = []
     pruned = _with_keys_of_text(data, (), faults)
@@ -63,7 +59,7 @@ def _with_keys_of_text(
     location: tuple[int | str, ...],
     faults: list[Fault],
 ) -> Any:  # noqa: ANN401
-    """Return ``data`` without keys that are not Unicode text and without what is too deep."""
+    # without keys that are not Unicode text, and without what is too deep
     if len(location) > _DEEPEST_GOAL and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST_GOAL} levels; make it flatter"
         faults.append(fault(field_path(location[:2]), message))
@@ -91,7 +87,7 @@ def is_unicode(text: str) -> bool:
 def _blank(
     data: dict[str, Any], location: Sequence[int | str], lists_of_text: Container[str]
 ) -> dict[str, Any]:
-    """Remove the value at ``location`` from ``data`` in place, and return ``data``."""
+    # removes the value at `location` in place
     *parents, last = location
     node: Any = data
     within = ""
@@ -109,13 +105,7 @@ def _blank(
     return data
 
 
-# ---- demand goal ----
-#
-# The goal of our own ``Demand`` action as plain data, parsed into a :class:`DemandRequest`.
-#
-# :func:`parse` takes goals of ``demandops_interfaces/action/Demand`` and YAML of the kind
-# ``Demand``. The goal names its demand. A put may list any type of application, and replaces the
-# demand's claims.
+# ---- goals of ``demandops_interfaces/action/Demand``, and YAML of the kind ``Demand`` ----
 
 
 class GoalTopic(FrozenModel):
@@ -234,18 +224,12 @@ _LISTS_OF_TEXT = ("requesters", "labels", "capabilities", "properties")
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
-    """Return whether plain data is to be read as a goal of our own action."""
     # the reference's goals have neither of these fields
     return "kind" in data or "apiVersion" in data
 
 
 def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
-    """Parse a goal of our own action.
-
-    Returns:
-        The request and the faults of its form. Fields of the wrong form are left out of the
-        request, so that the caller can check the others. A request with faults must not be booked.
-    """
+    """Return the request and the faults of its form; one with faults must not be booked."""
     goal, faults = parse_valid_part(data, DemandGoal, _LISTS_OF_TEXT)
     requesters = tuple(goal.requesters)
     id = goal.request or goal.demand
@@ -300,7 +284,6 @@ def _field(item: str, path: str) -> str:
 
 
 def _fields_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
-    """Yield a fault for each field of a release or a renewal that only a put may have."""
     if lease_s is not None:
         yield fault("lease", "is set by a put; leave it out, or put the demand again")
     if goal.applications or goal.connections:
@@ -375,8 +358,8 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
         parameters=MappingProxyType(parameters),
         version=app.version,
         deliver=tuple(
-            Delivery(each.output, each.node, absolute_topic(each.topic) if each.topic else "")
-            for each in app.deliver
+            Delivery(item.output, item.node, absolute_topic(item.topic) if item.topic else "")
+            for item in app.deliver
         ),
         place=_requirement(f"{where}.place", app.place, faults),
         services=MappingProxyType(dict(app.services)),

@@ -86,7 +86,7 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return the path of an application's field in the goal; ``lists`` maps roles to its lists."""
+    # `lists` maps roles to the lists of the goal
     name, _, within = path.partition(".")
     if name in ("id", "node"):
         return f"{item}.header.{'id' if name == 'id' else 'node_id'}"
@@ -114,12 +114,7 @@ def _connection_field(item: str, path: str) -> str:
 
 
 def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | None, list[Fault]]:
-    """Parse a goal given as plain data, as ``ros2 action send_goal`` takes it.
-
-    Returns:
-        The request and the faults of its form. Fields of the wrong form are left out of the
-        request, so that the caller can check the others. A request with faults must not be booked.
-    """
+    """Return the request and the faults of its form; one with faults must not be booked."""
     if not isinstance(data, dict):
         return None, [_not_a_mapping()]
     goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
@@ -149,8 +144,8 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     return operation(id=goal.id, demanded=tuple(demanded)), faults
 
 
+# those that need no configuration
 def form_faults(data: object) -> list[Fault]:
-    """Return the faults in a goal's form that need no configuration."""
     if not isinstance(data, dict):
         return [_not_a_mapping()]
     return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
