@@ -67,7 +67,17 @@ class Table:
         ]
         if width is None:
             rows = [[[", ".join(filter(None, cell))] for cell in row] for row in rows]
-        shown = range(len(self.columns)) if width is None else self._fitting(rows, width)
+        shown = list(range(len(self.columns)))
+        if width is not None:
+            used = [at for at in shown if any(any(row[at]) for row in rows)]
+            shown = [at for at in shown if self.columns[at].rank == 0]
+            room = width - sum(self._least(rows, at) + len(_GAP) for at in shown) + len(_GAP)
+            for at in sorted(set(used) - set(shown), key=lambda at: (self.columns[at].rank, at)):
+                needed = self._least(rows, at) + len(_GAP)
+                if needed <= room:
+                    shown.append(at)
+                    room -= needed
+            shown.sort()
         widths = natural = [self._natural(rows, at) for at in shown]
         if width is not None:
             widths = [self._least(rows, at) for at in shown]
@@ -90,17 +100,6 @@ class Table:
             note = f"more columns in a wider terminal: {', '.join(left_out)}"
             lines += [paint(line, "dim") for line in _wrapped([note], width or 0)]
         return [*title, *lines]
-
-    def _fitting(self, rows: list[list[list[str]]], width: int) -> list[int]:
-        used = [at for at in range(len(self.columns)) if any(any(row[at]) for row in rows)]
-        shown = [at for at, column in enumerate(self.columns) if column.rank == 0]
-        room = width - sum(self._least(rows, at) + len(_GAP) for at in shown) + len(_GAP)
-        for at in sorted(set(used) - set(shown), key=lambda at: (self.columns[at].rank, at)):
-            needed = self._least(rows, at) + len(_GAP)
-            if needed <= room:
-                shown.append(at)
-                room -= needed
-        return sorted(shown)
 
     def _natural(self, rows: list[list[list[str]]], at: int) -> int:
         lengths = [cell_len(line) for row in rows for line in row[at]]

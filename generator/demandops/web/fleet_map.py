@@ -222,7 +222,18 @@ def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
     layouts = ("cluster", "place") if placed else ("cluster",)
     if layout not in layouts:
         layout = "place" if len(placed) > len(nodes) / 2 else "cluster"
-    lit = _lit_nodes(now, wanted, nodes, marks)
+    lit: set[str] = set()
+    if wanted:
+        # a node is also lit if it has a service or connection that matches
+        lit = {id for id, on_node in marks.items() if any(mark.is_lit for mark in on_node)}
+        for row in rows_of(now, "connections"):
+            if wanted.matches(row):
+                lit.update(row.hidden["node"])
+        for node in nodes:
+            row = Row({}, {"node": [node.id], "type": [node.type], "cluster": [node.cluster]})
+            if wanted.matches(row):
+                lit.add(node.id)
+        lit &= marks.keys()
     only_lit = len(nodes) > _MOST_NAMED and 0 < len(lit) <= _MOST_NAMED
     if only_lit:
         nodes = [node for node in nodes if node.id in lit]
@@ -277,23 +288,6 @@ def _by_tone(drawn: Iterable[_Drawn]) -> Iterable[tuple[str, list[_Drawn]]]:
     for part in drawn:
         groups.setdefault(part.tone, []).append(part)
     return groups.items()
-
-
-def _lit_nodes(
-    now: Situation, wanted: Filter, nodes: Iterable[Node], marks: Mapping[str, list[ServiceMark]]
-) -> set[str]:
-    # a node is also lit if it has a service or connection that matches
-    if not wanted:
-        return set()
-    lit = {id for id, on_node in marks.items() if any(mark.is_lit for mark in on_node)}
-    for row in rows_of(now, "connections"):
-        if wanted.matches(row):
-            lit.update(row.hidden["node"])
-    for node in nodes:
-        row = Row({}, {"node": [node.id], "type": [node.type], "cluster": [node.cluster]})
-        if wanted.matches(row):
-            lit.add(node.id)
-    return lit & {*marks}
 
 
 def _card(node: Node, marks: list[ServiceMark], is_lit: bool, total: int) -> NodeCard:

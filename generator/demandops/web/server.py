@@ -103,11 +103,6 @@ def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
     return "not_ready.html.j2", data
 
 
-def _map(asked: ViewRequest) -> tuple[str, Data]:
-    picture = fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))
-    return "map.html.j2", {"map": picture}
-
-
 def _list(asked: ViewRequest) -> tuple[str, Data]:
     kind = LISTS[asked.path]
     rows = rows_of(asked.situation, kind.name)
@@ -181,7 +176,10 @@ def _rates(asked: ViewRequest) -> tuple[str, Data]:
 
 VIEWS: Mapping[str, View] = {
     "/": _not_ready,
-    "/map": _map,
+    "/map": lambda asked: (
+        "map.html.j2",
+        {"map": fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))},
+    ),
     **{f"/{name}": _list for name in LISTS},
     "/demand": _demand,
     "/release": _release,

@@ -108,12 +108,6 @@ def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
 
 
-def _leases(source: Source) -> list[Json]:
-    leased = [demand for demand in _demands(source) if demand["lease"]]
-    # "~" sorts a lease that has not started behind every time
-    return sorted(leased, key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]))
-
-
 def _nodes(source: Source) -> list[Json]:
     world = source.snapshot.state
     return [
@@ -226,12 +220,6 @@ def effect_words(override: Json) -> list[str]:
     ]
 
 
-def _override_targets(item: Json, now: datetime) -> list[str]:
-    releases = (release["name"] for release in item["releases"])
-    subjects = ("{kind} {id}".format(**claim["subject"]) for claim in item["claims"])
-    return [*dict.fromkeys((*releases, *subjects))]
-
-
 def _node_state(item: Json, now: datetime) -> str:
     if item["type"] is None:  # only claims name it
         return "not in the inventory"
@@ -318,7 +306,11 @@ KINDS: dict[str, Kind] = {
         _COMMON | {"application": _key("applications")},
     ),
     "leases": Kind(
-        _leases,
+        lambda source: sorted(
+            (demand for demand in _demands(source) if demand["lease"]),
+            # "~" sorts a lease that has not started behind every time
+            key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]),
+        ),
         (
             _column("Demand", "name"),
             _column("Requesters", _joined("requesters"), 2, wraps=True),
@@ -372,7 +364,14 @@ KINDS: dict[str, Kind] = {
             _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
             _column("Until", _ago("until"), 3),
             _column("Owner", "owner", 4),
-            _column("To", _override_targets, 5),
+            _column(
+                "To",
+                lambda item, now: [
+                    *dict.fromkeys(release["name"] for release in item["releases"]),
+                    *dict.fromkeys("{kind} {id}".format(**c["subject"]) for c in item["claims"]),
+                ],
+                5,
+            ),
             _column("Reason", "reason", 6, wraps=True),
         ),
         (

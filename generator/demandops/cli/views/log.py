@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from datetime import datetime
 from itertools import islice
 from typing import Any
@@ -153,8 +152,20 @@ def log(
                     "`demandops status` lists the current ones"
                 )
         commits = repo.log(commit_range, path) if path else repo.log(commit_range)
+        wanted = [(_TRAILERS[name], given[name]) for name in _TRAILERS if given[name] is not None]
+
+        def matches(entry: LogEntry) -> bool:
+            return (
+                all(value in entry.trailers.get(trailer, ()) for trailer, value in wanted)
+                and given["operation"] in (None, entry.first("Operation") or "by-hand")
+                and (given["since"] is None or entry.time >= given["since"])
+                and (given["until"] is None or entry.time <= given["until"])
+                # last, because it reads the trees of the commit
+                and (given["node"] is None or repo.changes_node(entry.commit, given["node"]))
+            )
+
         with busy("looking through the commits"):
-            entries = list(islice(_matching(repo, commits, **given), max_count))
+            entries = list(islice(filter(matches, commits), max_count))
             if not entries:
                 _refuse_unknown(repo, given)
     rows = [commit_data(entry) for entry in entries]
@@ -187,31 +198,6 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
             faults.append(fault("--node", message))
     if faults:
         raise InvalidInput(faults)
-
-
-def _matching(
-    repo: Reader,
-    entries: Iterable[LogEntry],
-    *,
-    node: str | None,
-    operation: str | None,
-    since: datetime | None,
-    until: datetime | None,
-    **trailers: str | None,
-) -> Iterable[LogEntry]:
-    wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
-
-    def matches(entry: LogEntry) -> bool:
-        return (
-            all(value in entry.trailers.get(key, ()) for key, value in wanted)
-            and operation in (None, entry.first("Operation") or "by-hand")
-            and (since is None or entry.time >= since)
-            and (until is None or entry.time <= until)
-            # last, because it reads the trees of the commit
-            and (node is None or repo.changes_node(entry.commit, node))
-        )
-
-    return filter(matches, entries)
 
 
 _COLUMNS = (

@@ -160,7 +160,22 @@ class Status:
         for domain in {*domains, *(target.domain for target in targets)}:
             watched = health_reader(domain).objects_to_watch(domain)
             wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
-        caches = _read_clusters(clusters, wanted, patience_s)
+        caches = {
+            name: ObjectCache(name, cluster, lambda: None)
+            for name, cluster in clusters.items()
+            if cluster.kubeconfig and name in wanted
+        }
+        threads = {
+            name: REAL.start_thread(f"read-{name}", partial(cache.read_once, wanted[name]))
+            for name, cache in caches.items()
+        }
+        # all clusters are read at the same time, so that a slow cluster does not delay the others
+        end = REAL.monotonic() + patience_s
+        with busy("asking the clusters"):
+            for name, thread in threads.items():
+                thread.join(max(0.0, end - REAL.monotonic()))
+                if thread.is_alive():
+                    caches[name].give_up(f"it did not answer within {duration_text(patience_s)}")
         ledger = without_suspended(snapshot.state).ledger
         rows = [
             release_data(release)
@@ -231,30 +246,6 @@ class Status:
             text.insert(0, f"{title}; the last valid version of each file, if any, is in effect:")
         further = map(str, (*self.old_bootstraps, *self.orphans))
         return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
-
-
-def _read_clusters(
-    clusters: Mapping[str, clusters_file.ClusterAccess],
-    wanted: Mapping[str, Iterable[ObjectSelector]],
-    patience_s: int,
-) -> dict[str, ObjectCache]:
-    caches = {
-        name: ObjectCache(name, cluster, lambda: None)
-        for name, cluster in clusters.items()
-        if cluster.kubeconfig and name in wanted
-    }
-    threads = {
-        name: REAL.start_thread(f"read-{name}", partial(cache.read_once, wanted[name]))
-        for name, cache in caches.items()
-    }
-    # all clusters are read at the same time, so that a slow cluster does not delay the others
-    end = REAL.monotonic() + patience_s
-    with busy("asking the clusters"):
-        for name, thread in threads.items():
-            thread.join(max(0.0, end - REAL.monotonic()))
-            if thread.is_alive():
-                caches[name].give_up(f"it did not answer within {duration_text(patience_s)}")
-    return caches
 
 
 _COLORS = {"failing": "red", "healthy": "green", "unknown": "yellow", "waiting": "yellow"}

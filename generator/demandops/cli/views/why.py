@@ -77,17 +77,29 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     world = snapshot.state
-    matches = [each for each in _by_name(repo, snapshot, name) if kind in (None, each.kind)]
+    matches = []
+    release = explanations.release_named(world, name)
+    path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
+    if path is None:  # a release that an override denies may never have run
+        denied = explanations.denied_release_named(world, name)
+        path = path_of(denied[0]) if denied else None
+    if path is not None:
+        matches.append(Match("release", name, path, release))
+    for subject in (Subject(subject_kind, name) for subject_kind in SubjectKind):
+        folder = claim_file.folder_of(subject)
+        if world.ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
+            matches.append(Match(subject.kind.value[:-1], name, folder, subject=subject))
+    matches = [match for match in matches if kind in (None, match.kind)]
     matches = matches or list(_by_looser_match(repo, snapshot, name, kind))
     running = [
-        each
-        for each in matches
-        if each.release or (each.subject and world.ledger.claims_on(each.subject))
+        match
+        for match in matches
+        if match.release or (match.subject and world.ledger.claims_on(match.subject))
     ]
     if len(running or matches) == 1:
         return (running or matches)[0]
     if matches:
-        kinds = ", ".join(each.kind for each in matches)
+        kinds = ", ".join(match.kind for match in matches)
         raise StateRepoError(
             f"{quoted(name)} names several things: {kinds}; choose one with --kind"
         )
@@ -108,22 +120,6 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         f"nothing called {quoted(name)} runs or ran up to commit {str(snapshot.commit)[:10]}"
         f"{suggestion(name, names)}"
     )
-
-
-def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
-    world = snapshot.state
-    release = explanations.release_named(world, name)
-    path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
-    if path is None:  # a release that an override denies may never have run
-        stopped = explanations.denied_release_named(world, name)
-        path = path_of(stopped[0]) if stopped else None
-    if path is not None:
-        yield Match("release", name, path, release)
-    for kind in SubjectKind:
-        subject = Subject(kind, name)
-        folder = claim_file.folder_of(subject)
-        if world.ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
-            yield Match(kind.value[:-1], name, folder, subject=subject)
 
 
 def _by_looser_match(

@@ -385,7 +385,15 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
     prefixes: dict[str, tuple[str, str]] = {}
     files: dict[str, str] = {}
     words = {connection_type.word for connection_type in connection_types.CONNECTION_TYPES}
-    for file, where, name, service in _defined_services(config):
+    # (file, beginning of the paths of its fields, name, definition)
+    defined: list[tuple[str, str, str, Deployed]] = [
+        (f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, own)
+        for appdef in config.appdefs.values()
+        for name, own in appdef.services.items()
+    ]
+    for name, shared in config.definitions.items():
+        defined.append((f"appdefs/{name}/service.yaml", "", name, shared))
+    for file, where, name, service in defined:
         folder, _, own = file.rpartition("/")
         reader.check_reference(file, f"{where}chart", service.chart, CHARTS_FILE)
         for image in service.images:
@@ -423,15 +431,6 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
                 f"'{service.prefix}' is already the prefix of '{owner[1]}'; choose another prefix"
             )
             reader.add_fault(file, f"{where}prefix", message)
-
-
-def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
-    # (file, beginning of the paths of its fields, name, definition)
-    for appdef in config.appdefs.values():
-        for name, service in appdef.services.items():
-            yield f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, service
-    for name, definition in config.definitions.items():
-        yield f"appdefs/{name}/service.yaml", "", name, definition
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:

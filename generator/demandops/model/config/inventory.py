@@ -276,15 +276,13 @@ def amount_text(amount: int, resource: str) -> str:  # of thousandths
     return f"{whole}.{decimals:03}".rstrip("0") if decimals else str(whole)
 
 
-def _plain_number(value: object) -> object:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return str(value) if is_number else value
-
-
 # A quantity as Kubernetes writes it, like `500m`. A plain number needs no quotes.
 Quantity = Annotated[
     str,
-    BeforeValidator(_plain_number, json_schema_input_type=str | int | float),
+    BeforeValidator(
+        lambda value: str(value) if type(value) in (int, float) else value,
+        json_schema_input_type=str | int | float,
+    ),
     readable_by(amount_of),
 ]
 

@@ -160,50 +160,49 @@ class OverrideFile(FileModel):
     @model_validator(mode="after")
     def _consistent(self) -> OverrideFile:
         _filled_in(self)
-        if problems := [*self._problems()]:
-            raise ValueError(sentences(problems))
-        return self
-
-    def _problems(self) -> Iterable[str]:
+        problems: list[str] = []
         effects = self.effects()
         if not effects:
-            yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
+            problems.append(f"has no effect; give at least one of {', '.join(EFFECTS)}")
         if "deny" in effects and len(effects) > 1:
             others = " and ".join(f"'{name}'" for name in effects if name != "deny")
-            yield (
+            problems.append(
                 f"with 'deny', nothing runs, so {others} cannot apply; remove 'deny', or remove "
                 f"{others}"
             )
         frozen = " and ".join(f"'{name}'" for name in effects if name in _SHAPING)
         if "hold" in effects and frozen:
-            yield (
+            problems.append(
                 f"'hold' freezes the release, so {frozen} cannot apply; remove 'hold', or remove "
                 f"{frozen}"
             )
         selects_clients = any(selector.connections for selector in self.select)
         if self.values is not None and selects_clients and not self.patches_clients():
-            yield (
+            problems.append(
                 "select: selects both connections and services, but 'values' fits only connections "
                 "(settings of clients) or only services (Helm values); write two overrides"
             )
         of_services = [name for name in effects if name in _OF_SERVICES]
         for index, selector in enumerate(self.select):
             if selector.connections and of_services:
-                yield (
+                problems.append(
                     f"select[{index}].connections: '{of_services[0]}' is for services, but this "
                     f"selector selects connections; remove 'connections' or '{of_services[0]}'"
                 )
             if selector.requesters and "node" in effects:
-                yield (
+                problems.append(
                     f"select[{index}].requesters: 'node' moves a service for all its "
                     "requesters, so it cannot be limited to some of them; select by applications, "
                     "appdefs, services, nodes or labels"
                 )
             if selector.services and "keep" in effects:
-                yield (
+                problems.append(
                     f"select[{index}].services: 'keep' applies to applications and connections "
                     "only; select those"
                 )
+        if problems:
+            raise ValueError(sentences(problems))
+        return self
 
     def patches_clients(self) -> bool:
         return all(selector.connections for selector in self.select)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, TypeVar
@@ -242,7 +242,22 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     else:
         lease_s = goal.lease
     if goal.operation != "put":
-        faults += _fields_of_a_put(goal, lease_s)
+        verb = goal.operation
+        if lease_s is not None:
+            message = "is set by a put; leave it out, or put the demand again"
+            faults.append(fault("lease", message))
+        if goal.applications or goal.connections:
+            remedy = "leave the field out; to change the demand, send a put"
+            if verb == "release":
+                remedy = "to release a part of the demand, put the demand without that part"
+            field = "applications" if goal.applications else "connections"
+            faults.append(fault(field, f"a {verb} names only its demand; {remedy}"))
+        if goal.priority:
+            message = f"a {verb} does not wait for room; leave priority out"
+            faults.append(fault("priority", message))
+        if goal.positions:
+            message = f"a {verb} chooses no node; leave the positions out"
+            faults.append(fault("positions", message))
         operation = Release if goal.operation == "release" else Renew
         return operation(id, demand=goal.demand, own_requesters=requesters), faults
     applications = (
@@ -281,25 +296,6 @@ def _field(item: str, path: str) -> str:
     if path.startswith("requesters"):
         return path
     return f"{item}.{'type' if path == 'appdef' else path}"
-
-
-def _fields_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
-    if lease_s is not None:
-        yield fault("lease", "is set by a put; leave it out, or put the demand again")
-    if goal.applications or goal.connections:
-        remedy = (
-            "to release a part of the demand, put the demand without that part"
-            if goal.operation == "release"
-            else "leave the field out; to change the demand, send a put"
-        )
-        yield fault(
-            "applications" if goal.applications else "connections",
-            f"a {goal.operation} names only its demand; {remedy}",
-        )
-    if goal.priority:
-        yield fault("priority", f"a {goal.operation} does not wait for room; leave priority out")
-    if goal.positions:
-        yield fault("positions", f"a {goal.operation} chooses no node; leave the positions out")
 
 
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import absolute_topic
-from demandops.connections.connection import Connection, ConnectionType, Route
+from demandops.connections.connection import Connection, Route
 from demandops.connections.connection_types import by_number, type_numbered
 from demandops.model.config.appdef import ApplicationDefinition
 from demandops.model.config.base_model import FrozenModel
@@ -127,16 +127,30 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         where = f"connections[{index}]"
         # an invalid type becomes None, so that nothing is checked that depends on the type
         kind = type_numbered(connection.type) if f"{where}.type" not in faulty else None
-        demanded.append(_connection(where, connection, kind))
+        sources, targets = connection.source_topics, connection.target_topics
+        # If the lists are not equally long, the longer one fills up the shorter one, so that faults
+        # of all topics are found too.
+        pairs = zip(
+            [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
+        )
+        held = Connection(
+            id=connection.id,
+            type=kind,
+            source=connection.source_node_id,
+            target=connection.target_node_id,
+            topics=tuple(Route(absolute_topic(here), absolute_topic(to)) for here, to in pairs),
+            broker=connection.broker_node_id,
+        )
+        requesters = tuple(dict.fromkeys(connection.requester_ids))
+        demanded.append(Demanded(held, requesters, partial(_connection_field, where)))
         if kind is None and f"{where}.type" not in faulty:
             types = ", ".join(f"{each.number} ({each.name})" for each in by_number())
             message = f"{connection.type} is not a connection type; known: {types}"
             faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
-        sources, targets = len(connection.source_topics), len(connection.target_topics)
-        if sources != targets:
+        if len(sources) != len(targets):
             message = (
-                f"has {targets} names, but source_topics has {sources}; source topic i goes to "
-                "target topic i, so both lists must have the same length"
+                f"has {len(targets)} names, but source_topics has {len(sources)}; source topic i "
+                "goes to target topic i, so both lists must have the same length"
             )
             faults.append(fault(f"{where}.target_topics", message))
     # if "shutdown" is invalid, treat the goal as a shutdown, because a join must obey all its rules
@@ -184,26 +198,4 @@ def _application(
         ),
         tuple(dict.fromkeys(body.requester_ids)),
         partial(_application_field, where, {role: name for name, role in roles.items()}),
-    )
-
-
-def _connection(where: str, connection: WireConnection, kind: ConnectionType | None) -> Demanded:
-    sources, targets = connection.source_topics, connection.target_topics
-    # The caller reports lists of unequal length. Here the longer list fills up the shorter one, so
-    # that faults of all topics are found too.
-    pairs = zip(
-        [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
-    )
-    held = Connection(
-        id=connection.id,
-        type=kind,
-        source=connection.source_node_id,
-        target=connection.target_node_id,
-        topics=tuple(Route(absolute_topic(here), absolute_topic(there)) for here, there in pairs),
-        broker=connection.broker_node_id,
-    )
-    return Demanded(
-        held,
-        tuple(dict.fromkeys(connection.requester_ids)),
-        partial(_connection_field, where),
     )

@@ -250,10 +250,41 @@ class _ConnectionFile(_Claim):
 
 def text_of(claim: Claim) -> str:
     held = claim.held
+
+    def requesters(*topic: str) -> dict[str, list[str]]:
+        names = claim.partial.get(topic)
+        return {"requesters": list(names)} if names else {}
+
+    data: dict[str, Any]
     if isinstance(held, Application):
-        kind, data = "Application", _application_data(claim, held)
+        inputs: dict[str, list[dict[str, Any]]] = {role: [] for role in held.inputs}
+        for role, topic in held.all_inputs():
+            entry: dict[str, Any] = {"topic": topic.topic, "source": topic.source}
+            entry |= {"type": topic.type} if topic.type else {}
+            entry |= {"further": True} if topic.further else {}
+            inputs[role].append(entry | requesters(role, topic.topic, topic.source))
+        deliver = [{k: v for k, v in item._asdict().items() if v} for item in held.deliver]
+        # Empty fields are left out, so that a new field leaves other claims' files as they are
+        further = {
+            "parameters": dict(sorted(held.parameters.items())),
+            "version": held.version,
+            "separate": held.separate,
+            "deliver": deliver,
+            "services": dict(sorted(held.services.items())),
+            "named": list(held.named),
+            "moved": dict(sorted(held.moved.items())),
+        }
+        kind, data = "Application", {"definition": held.appdef, "node": held.node, "inputs": inputs}
+        data |= {name: value for name, value in further.items() if value}
+        data |= {"place": place_data(held.place)} if held.place else {}
     else:
-        kind, data = "Connection", _connection_data(claim, held)
+        topics: dict[str, str | dict[str, Any]] = {}
+        for route in held.topics:
+            options = route.options() | requesters(route.source)
+            topics[route.source] = {"target": route.target, **options} if options else route.target
+        kind, data = "Connection", {"type": held.known_type.word, "source": held.source}
+        data |= {"target": held.target} | ({"broker": held.broker} if held.broker else {})
+        data["topics"] = topics
     lease: dict[str, object] = {}
     if claim.lease is not None:
         lease = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
@@ -275,33 +306,6 @@ def text_of(claim: Claim) -> str:
     )
 
 
-def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
-    def topic_data(role: str, topic: InputTopic) -> dict[str, Any]:
-        entry: dict[str, Any] = {"topic": topic.topic, "source": topic.source}
-        entry |= {"type": topic.type} if topic.type else {}
-        entry |= {"further": True} if topic.further else {}
-        return entry | _partial(claim, (role, topic.topic, topic.source))
-
-    data: dict[str, Any] = {
-        "definition": app.appdef,
-        "node": app.node,
-        "inputs": {
-            role: [topic_data(role, topic) for topic in topics]
-            for role, topics in app.inputs.items()
-        },
-    }
-    # Empty fields are left out, so that a new field leaves the files of other claims as they are
-    data |= {"parameters": dict(sorted(app.parameters.items()))} if app.parameters else {}
-    data |= {"version": app.version} if app.version else {}
-    data |= {"separate": True} if app.separate else {}
-    deliver = [{k: v for k, v in item._asdict().items() if v} for item in app.deliver]
-    data |= {"deliver": deliver} if deliver else {}
-    data |= {"services": dict(sorted(app.services.items()))} if app.services else {}
-    data |= {"named": list(app.named)} if app.named else {}
-    data |= {"moved": dict(sorted(app.moved.items()))} if app.moved else {}
-    return data | {"place": place_data(app.place)} if app.place else data
-
-
 def place_data(place: Requirement) -> dict[str, Any]:
     listed = {
         "role": place.role,
@@ -312,28 +316,9 @@ def place_data(place: Requirement) -> dict[str, Any]:
     return {name: value for name, value in listed.items() if value}
 
 
-def _connection_data(claim: Claim, connection: Connection) -> dict[str, Any]:
-    topics: dict[str, str | dict[str, Any]] = {}
-    for route in connection.topics:
-        options = route.options() | _partial(claim, (route.source,))
-        topics[route.source] = {"target": route.target, **options} if options else route.target
-    return {
-        "type": connection.known_type.word,
-        "source": connection.source,
-        "target": connection.target,
-        **({"broker": connection.broker} if connection.broker else {}),
-        "topics": topics,
-    }
-
-
 def format_timestamp(moment: datetime) -> str:
     in_utc = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
     return f"{in_utc.removesuffix('+00:00')}Z"
-
-
-def _partial(claim: Claim, topic: TopicKey) -> dict[str, list[str]]:
-    names = claim.partial.get(topic)
-    return {"requesters": list(names)} if names else {}
 
 
 def read(text: str, path: str) -> Claim:
