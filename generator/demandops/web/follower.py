@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from itertools import islice
@@ -14,17 +14,10 @@ from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL, Runtime
 from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health import ClusterDomain, Target, health_reader
+from demandops.cluster.health import ClusterDomain, health_reader
 from demandops.cluster.object_cache import ObjectCache
-from demandops.cluster.release_status import (
-    OldBootstrap,
-    Orphan,
-    ReleaseStatus,
-    old_bootstraps,
-    orphans,
-    statuses,
-)
-from demandops.repo.git.repository import StateRepository, reading
+from demandops.cluster.release_status import old_bootstraps, orphans, statuses
+from demandops.repo.git.repository import reading
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.reader import Reader
@@ -63,14 +56,18 @@ class ClusterWatch:
         # any thread may read this; to iterate would fail if the follower appended meanwhile
         return tuple(self._changes.copy())
 
-    def statuses(
-        self, targets: Iterable[Target], commit: str, repository: StateRepository
-    ) -> dict[str, ReleaseStatus]:
+    def with_reports(self, situation: Situation, reader: Reader) -> Situation:
+        commit_state, caches, repository = situation.commit_state, self._caches, reader.repository
+        targets = [target for _, target in commit_state.targets]
+        domains = rollouts.domains_of_state(commit_state.state)
+        for domain in dict.fromkeys((*(target.domain for target in targets), *domains)):
+            if domain.cluster in caches and domain not in self._domains:
+                self._domains.add(domain)
+                caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
+        commit = commit_state.commit
         # Health is judged by the file that the cluster has applied. Judged by the newest commit,
         # everything would be `waiting` for seconds after each commit.
-        targets = list(targets)
-        self._watch(target.domain for target in targets)
-        reported = statuses(targets, commit, self._caches, repository, repository.changed_paths)
+        reported = statuses(targets, commit, caches, repository, repository.changed_paths)
         status_of = {target.name: each for target, each in zip(targets, reported, strict=True)}
         at = self._runtime.monotonic()
         for name, status in status_of.items():
@@ -91,29 +88,12 @@ class ClusterWatch:
         for name in self._states.keys() - status_of.keys():
             del self._states[name]
             self._unhealthy_from.pop(name, None)
-        return status_of
-
-    def old_bootstraps(
-        self, domains: Collection[ClusterDomain], read: Callable[[str], str | None]
-    ) -> tuple[OldBootstrap, ...]:
-        self._watch(domains)
-        return tuple(old_bootstraps(domains, self._caches, read))
-
-    def orphans(
-        self,
-        domains: Collection[ClusterDomain],
-        targets: Iterable[Target],
-        commit: str,
-        repository: StateRepository,
-    ) -> tuple[Orphan, ...]:
-        self._watch(domains)
-        return tuple(orphans(domains, targets, commit, self._caches, repository))
-
-    def _watch(self, domains: Iterable[ClusterDomain]) -> None:
-        for domain in dict.fromkeys(domains):
-            if domain.cluster in self._caches and domain not in self._domains:
-                self._domains.add(domain)
-                self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
+        return replace(
+            situation,
+            statuses=status_of,
+            old_bootstraps=tuple(old_bootstraps(domains, caches, reader.file_reader(commit))),
+            orphans=tuple(orphans(domains, targets, commit, caches, repository)),
+        )
 
     def close(self) -> None:
         for cache in self._caches.values():
@@ -271,16 +251,7 @@ class Follower:
             watched=watch.clusters,
             proposals=tuple(pending_proposals(repository)),
         )
-        if not watch.clusters:
-            return situation
-        targets = [target for _, target in commit_state.targets]
-        domains = rollouts.domains_of_state(commit_state.state)
-        return replace(
-            situation,
-            statuses=watch.statuses(targets, commit, repository),
-            old_bootstraps=watch.old_bootstraps(domains, self._reader.file_reader(commit)),
-            orphans=watch.orphans(domains, targets, commit, repository),
-        )
+        return watch.with_reports(situation, self._reader) if watch.clusters else situation
 
 
 def _commit_state(reader: Reader, snapshot: Snapshot) -> CommitState:

@@ -23,7 +23,6 @@ from demandops.cli.actions.person_change import (
     print_edit,
     selecting,
     selector,
-    warn_of_idle,
     writable,
 )
 from demandops.cli.output import errors
@@ -133,9 +132,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
         "keep": keep or None,
     }
     more = {"owner": owner, "priority": priority, "expires": ends_at(expires)}
-    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
-        text = new_override(repo, name, options, selected, {**more, **effects})
-        create_override(repo, Edit(name, text, f"Create override {name}", options.reason), options)
+    create_override(name, f"Create override {name}", selected, {**more, **effects}, options)
 
 
 @override.command()
@@ -155,39 +152,37 @@ def end(name: str, options: EditOptions) -> None:
         end_override(repo, Edit(name, None, f"End override {name}", options.reason), options)
 
 
-def new_override(
-    repo: Reader,
+def create_override(
     name: str,
-    options: EditOptions,
+    summary: str,
     selected: dict[str, tuple[str, ...]],
     more: dict[str, Any],
-) -> str:
-    """Return the text of a new override's file.
-
-    ``more`` has the effects and the other fields; None leaves a field out.
-    """
-    if not options.reason:
-        raise click.UsageError("give the reason: -m TEXT")
-    chosen = selector(selected)
-    if not chosen:
-        raise click.UsageError("select what the override applies to, for example --node edge")
-    owner = more.get("owner")
-    if not owner:
-        # a name in git may have characters that an owner may not have
-        person = repo.operator()
-        owner = person.email if id_problem(person.name) else person.name
-    fields = {"reason": options.reason, **more, "owner": owner, "select": [chosen]}
-    given = {key: value for key, value in fields.items() if value is not None}
-    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
-
-
-def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    if repo.file_reader()(edit.path) is not None:
-        message = "exists already; end it first, or choose another name"
-        raise InvalidInput.at("", message, file=edit.path)
-    entry = consequence(repo, edit)
-    warn_of_idle(entry)
-    _carry_out(repo, edit, entry, options)
+    options: EditOptions,
+) -> None:
+    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+        if not options.reason:
+            raise click.UsageError("give the reason: -m TEXT")
+        chosen = selector(selected)
+        if not chosen:
+            raise click.UsageError("select what the override applies to, for example --node edge")
+        owner = more.get("owner")
+        if not owner:
+            # a name in git may have characters that an owner may not have
+            person = repo.operator()
+            owner = person.email if id_problem(person.name) else person.name
+        fields = {"reason": options.reason, **more, "owner": owner, "select": [chosen]}
+        given = {key: value for key, value in fields.items() if value is not None}
+        text = document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
+        edit = Edit(name, text, summary, options.reason)
+        if repo.file_reader()(edit.path) is not None:
+            message = "exists already; end it first, or choose another name"
+            raise InvalidInput.at("", message, file=edit.path)
+        entry = consequence(repo, edit)
+        if entry.state == "matches nothing":
+            errors.print(f"warning: {edit.path} has no effect on anything that is demanded now")
+        elif entry.state in ("held back", "expired"):
+            errors.print(f"warning: {edit.path} is {entry.state}, so it changes nothing now")
+        _carry_out(repo, edit, entry, options)
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
@@ -272,11 +267,8 @@ def suspend(expires: str | None, options: EditOptions, **selected: tuple[str, ..
       demandops suspend --connection vehicle00/edge -m "Too much data" --propose
     """
     effect = {"expires": ends_at(expires), "deny": True}
-    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
-        name = name_of(selected)
-        text = new_override(repo, name, options, selected, effect)
-        edit = Edit(name, text, f"Suspend {described(selected)}", options.reason)
-        create_override(repo, edit, options)
+    summary = f"Suspend {described(selected)}"
+    create_override(name_of(selected), summary, selected, effect, options)
 
 
 def described(selected: dict[str, tuple[str, ...]]) -> str:

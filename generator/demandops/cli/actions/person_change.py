@@ -212,14 +212,6 @@ def print_edit(edit: Edit, entry: Entry, published: Published | None, output: st
     show(output, data, lines)
 
 
-def warn_of_idle(entry: Entry) -> None:
-    override = entry.override
-    if entry.state == "matches nothing":
-        errors.print(f"warning: {override.path} has no effect on anything that is demanded now")
-    elif entry.state in ("held back", "expired"):
-        errors.print(f"warning: {override.path} is {entry.state}, so it changes nothing now")
-
-
 SELECTORS = ("application", "appdef", "service", "connection", "node", "requester")
 
 
