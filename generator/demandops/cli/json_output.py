@@ -70,11 +70,11 @@ def show(output: str, data: object, text: Iterable[str | Table]) -> None:
         print_json(data)
         return
     printed: list[str] = []
-    for each in text:
-        if isinstance(each, Table):
-            printed += each.lines(terminal_width(), painted)
+    for part in text:
+        if isinstance(part, Table):
+            printed += part.lines(terminal_width(), painted)
         else:
-            printed += lines(each).split("\n")
+            printed += lines(part).split("\n")
     print_lines(printed)
 
 
@@ -84,7 +84,7 @@ def print_json(data: object) -> None:
 
 def faults_of(error: DemandOpsError) -> list[Json]:
     faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
-    return [asdict(each) for each in dict.fromkeys(faults)]
+    return [asdict(fault) for fault in dict.fromkeys(faults)]
 
 
 def time_data(moment: datetime | None) -> str | None:

@@ -83,8 +83,8 @@ def load(name: str) -> click.Command:
     module = COMMANDS[name][0]
     ros = module.split(".")[0] == "demandops_ros"
     try:
-        found = import_module(module if ros else f"demandops.cli.{module}")
-        command: click.Command = getattr(found, name.replace("-", "_"))
+        imported = import_module(module if ros else f"demandops.cli.{module}")
+        command: click.Command = getattr(imported, name.replace("-", "_"))
     except ModuleNotFoundError as error:
         missing = str(error.name).split(".")[0]
         if missing in ("demandops", "demandops_ros"):
@@ -155,8 +155,8 @@ def run(args: list[str] | None = None) -> int:
         errors.print(f"error: {error}")
         return ExitCode.PROGRAM_ERROR
     except DemandOpsError as error:
-        for each in error.faults if isinstance(error, InvalidInput) else [error]:
-            errors.print(f"error: {each}")
+        for fault in error.faults if isinstance(error, InvalidInput) else [error]:
+            errors.print(f"error: {fault}")
         return ExitCode.USER_ERROR
     except BrokenPipeError:  # `demandops log | head`; Python would report it again at the exit
         sys.stderr.close()

@@ -132,7 +132,7 @@ def _chosen_context(around: Path | None) -> Context | None:
         context = named(name, "--context")
     elif around is not None:
         places = {str(around), origin_of(around)}
-        same = (each for each in content.contexts.values() if each.state_repo in places)
+        same = (context for context in content.contexts.values() if context.state_repo in places)
         context = next(same, None)
     else:
         context = content.contexts[content.current] if content.current else None
@@ -313,5 +313,5 @@ def _names(repo: Reader, kind: str) -> Iterator[str]:
             "domains": world.config.domains,
             "overrides": world.config.overrides,
             "appdefs": world.config.appdefs,
-            "services": {name: 0 for each in world.config.services.values() for name in each},
+            "services": {name: 0 for own in world.config.services.values() for name in own},
         }[kind]

@@ -57,7 +57,7 @@ def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
     # of the chart and of the libraries that it needs, missing or not
     needed = [folder]
     for chart in needed:  # which grows meanwhile
-        libraries = dict.fromkeys(each.folder for each in dependencies(chart, files))
+        libraries = dict.fromkeys(library.folder for library in dependencies(chart, files))
         needed += [library for library in libraries if library and library not in needed]
         if len(needed) > _MOST_LIBRARIES:  # with_libraries refuses such a chart
             break
@@ -83,7 +83,7 @@ def with_libraries(
         for path in below(here, paths):
             origins[prefix + path[len(here) + 1 :]] = path
             characters += len(files[path])
-        libraries = {each.name: each for each in dependencies(here, files) if each.folder}
+        libraries = {needed.name: needed for needed in dependencies(here, files) if needed.folder}
         if (
             len(waiting) + len(libraries) > _MOST_LIBRARIES
             or len(origins) > _MOST_FILES

@@ -335,7 +335,7 @@ def validator(text: str, file: str) -> Any:  # noqa: ANN401
         if reason.endswith('is not a "regex"'):
             reason += ", or needs a look-around or back reference, which Go's patterns lack too"
         faults = [fault("", f"is not a valid JSON schema: {reason}; fix it")]
-    raise InvalidInput(each.within(file) for each in faults)
+    raise InvalidInput(fault.within(file) for fault in faults)
 
 
 def _refuse(uri: str) -> None:

@@ -68,7 +68,7 @@ class ClusterWatch:
         # Health is judged by the file that the cluster has applied. Judged by the newest commit,
         # everything would be `waiting` for seconds after each commit.
         reported = statuses(targets, commit, caches, repository, repository.changed_paths)
-        status_of = {target.name: each for target, each in zip(targets, reported, strict=True)}
+        status_of = {target.name: status for target, status in zip(targets, reported, strict=True)}
         at = self._runtime.monotonic()
         for name, status in status_of.items():
             before, after = self._states.get(name, ""), word_of(status)

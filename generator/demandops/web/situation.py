@@ -166,7 +166,7 @@ class CommitState:
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
         for subject in subjects:
-            was, now = (each.active.ledger.claims_on(subject) for each in (before, self))
+            was, now = (state.active.ledger.claims_on(subject) for state in (before, self))
             gone |= {id(claim) for claim in was} - {id(claim) for claim in now}
             before_ids = {id(claim) for claim in was}
             fresh[subject.kind][subject.id] = [

@@ -162,7 +162,7 @@ def strip(
         is_chosen = chosen is not None and any(event.commit == chosen[1] for event in group)
         x, radius = (place + 0.5) * _STRIP_WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
         dots.append(Dot(lane, x, radius, count, label, newest.commit, tone, is_chosen))
-    step = next((each for each in _STEPS_S if length / each <= _TICKS), length / _TICKS)
+    step = next((step for step in _STEPS_S if length / step <= _TICKS), length / _TICKS)
     form = "%H:%M:%S" if step < 60 else "%H:%M" if step < 86400 else "%m-%d"
     ticks, at = list[Tick](), math.ceil(start.timestamp() / step) * step
     while at <= now.timestamp():
@@ -268,12 +268,12 @@ class _PlotMaker:
 
     def medians(self, title: str, samples: Iterable[Sample], about: str) -> Plot:
         bins = self._bins(samples)
-        every = sorted(value for each in bins for value in each)
+        every = sorted(value for samples in bins for value in samples)
         summary = "no values in this span of time"
         if every:
             late = every[math.ceil(0.95 * len(every)) - 1]
             summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, {len(every)} values"
-        values = [median(each) if each else 0.0 for each in bins]
+        values = [median(measured) if measured else 0.0 for measured in bins]
         return self._plot(title, "in seconds", about, values, summary, " s")
 
     def _bins(self, samples: Iterable[Sample]) -> list[list[float]]:

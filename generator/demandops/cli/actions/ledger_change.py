@@ -96,8 +96,8 @@ def print_consequences(decision: Decision) -> None:
 
 def print_refusal(title: str, faults: Iterable[Json]) -> None:
     errors.print(title)
-    for each in faults:
-        errors.print(f"  {Fault(**each)}")
+    for fault in faults:
+        errors.print(f"  {Fault(**fault)}")
 
 
 def claim_text(claim: Json) -> str:
@@ -192,7 +192,7 @@ def _dry_run_decommission(goal: Json, state_repo: str, output: str) -> Json:
 
 def _is_unclaimed_node(error: Refused, goal: Json, snapshot: Snapshot) -> bool:
     # a node that holds nothing is no error; any other name that holds nothing may be misspelled
-    codes = {each.code for each in error.faults}
+    codes = {fault.code for fault in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 
 
@@ -305,7 +305,7 @@ def _consequences(decision: Decision | None) -> Json:
         assert claim is not None  # noqa: S101 - a change has at least one side
         claims[word if change.after else "dropped"].append(claim_data(claim))
     releases = decision.releases if decision else ()
-    return {**claims, "releases": [asdict(each) for each in releases]}
+    return {**claims, "releases": [asdict(release) for release in releases]}
 
 
 def _roll_back(state_repo: str, goal: Json, signing_key: Path | None, base: str) -> Json:
@@ -336,7 +336,7 @@ def _rollback_lines(result: Json, dry_run: bool) -> Iterator[str]:
         for claim in result[word]:
             what = f"claim of {', '.join(claim['requesters'])} on {claim_text(claim)}"
             yield f"  {sign} {what} ({word.replace('_', ' ')})"
-    releases = (ReleaseChange(**each) for each in result["releases"])
+    releases = (ReleaseChange(**release) for release in result["releases"])
     yield from (f"  {line}" for line in release_lines(releases, "release "))
     if result["configuration_since"]:
         yield (

@@ -239,8 +239,8 @@ def name_of(selected: dict[str, tuple[str, ...]]) -> str:
 
 def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
     # another override may have the same name
-    selectors = [each.model_dump(exclude_none=True) for each in override.select]
-    return [{kind: {*values} for kind, values in each.items()} for each in selectors] == [
+    selectors = [select.model_dump(exclude_none=True) for select in override.select]
+    return [{kind: {*values} for kind, values in select.items()} for select in selectors] == [
         {kind: {*values} for kind, values in selector(selected).items()}
     ]
 

@@ -103,7 +103,7 @@ def request(
         goals = enumerate(strict_yaml.load_all(text, name))
         documents += [Document(name, goal, text, at) for at, goal in goals if goal is not None]
     if release:
-        documents = [replace(each, goal=_release_of(each.goal)) for each in documents]
+        documents = [replace(document, goal=_release_of(document.goal)) for document in documents]
     if not documents:
         raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     if any(form_faults(document.goal) for document in documents):
@@ -267,7 +267,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
                 "warnings": decision.warnings,
                 "not_held": decision.changes.not_held,
                 "placed": decision.placed,
-                "releases": [asdict(each) for each in decision.releases],
+                "releases": [asdict(release) for release in decision.releases],
                 "files": sorted(decision.files),
             }
             more |= {"approval": decision.approval} if decision.approval else {}

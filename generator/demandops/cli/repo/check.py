@@ -260,16 +260,16 @@ def _data(checked: CheckResult) -> Json:
         {"file": file.path, "change": file.change, "diff": diffs.get(file.path)} for file in files
     ]
     return {
-        "faults": [asdict(each) for each in checked.faults],
-        "warnings": [asdict(each) for each in checked.warnings],
-        "suggestions": [asdict(each) for each in checked.suggestions],
+        "faults": [asdict(fault) for fault in checked.faults],
+        "warnings": [asdict(warning) for warning in checked.warnings],
+        "suggestions": [asdict(override) for override in checked.suggestions],
         "charts": charts,
         "base": checked.base,
         "base_valid": checked.base_valid,
-        "releases": [asdict(each) for each in merge.releases] if merge else None,
+        "releases": [asdict(release) for release in merge.releases] if merge else None,
         "files": changes if merge else None,
         "diff_lines_left_out": left_out,
-        "bookkeeping": None if entries is None else [asdict(each) for each in entries],
+        "bookkeeping": None if entries is None else [asdict(entry) for entry in entries],
     }
 
 

@@ -152,13 +152,13 @@ def _role(name: str) -> str:
 def _appdef(plan: ApplicationPlan, config: Config) -> str:
     # Names of releases begin with the prefix of their service, so each service needs its own.
     taken = {kind.word for kind in CONNECTION_TYPES}
-    taken |= {service.prefix for each in config.services.values() for service in each.values()}
+    taken |= {service.prefix for own in config.services.values() for service in own.values()}
     taken |= {definition.prefix for definition in config.definitions.values()}
     services: dict[str, Any] = {}
     for service, inputs in _chain(plan):
         letters = re.sub("[^a-z0-9]", "", service.name)[:8]
         prefixes = (letters, *(f"{letters}{number}" for number in range(2, 100)))
-        prefix = next(each for each in prefixes if each not in taken)
+        prefix = next(word for word in prefixes if word not in taken)
         taken.add(prefix)
         services[service.name] = {
             "prefix": prefix,

@@ -38,8 +38,8 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     with reader.opened(state_repo) as repo:
         entries, changes = differences(repo, before, after)
     data = {
-        "bookkeeping": [asdict(each) for each in entries],
-        "releases": [asdict(each) for each in changes.releases],
+        "bookkeeping": [asdict(entry) for entry in entries],
+        "releases": [asdict(release) for release in changes.releases],
         "other_files": list(changes.other_files),
     }
     bookkeeping_lines = list(entry_lines(entries)) or ["no difference in bookkeeping"]

@@ -107,7 +107,7 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         return _by_path(repo, snapshot, name)
     running_names = {release.name for release in explanations.releases(world)}
     names = {*running_names, *repo.stopped_release_names(str(snapshot.commit))}
-    names |= {id for each in SubjectKind for id in world.ledger.subjects(each)}
+    names |= {id for subject_kind in SubjectKind for id in world.ledger.subjects(subject_kind)}
     names |= {*world.config.nodes, *world.config.appdefs, *world.config.overrides}
     names |= {id for kind in ("demand", "requester") for id in world.ledger.indexed_names(kind)}
     parts = {part for running_name in running_names for part in running_name.split("-")}
@@ -141,7 +141,7 @@ def _by_looser_match(
             return
     # what runs or is held comes before what has ended
     if kind in (None, "release"):
-        parts = {each.name: each for each in explanations.releases(world) if name in each.name}
+        parts = {r.name: r for r in explanations.releases(world) if name in r.name}
         if parts:
             release = parts[_the_only_name(name, [*parts])]
             yield Match("release", release.name, path_of(release), release)
@@ -155,7 +155,7 @@ def _by_looser_match(
             yield Match("demand", name)
             return
     if kind in (None, "release"):
-        ended = sorted(each for each in repo.stopped_release_names(commit) if name in each)
+        ended = sorted(part for part in repo.stopped_release_names(commit) if name in part)
         if ended:
             only = _the_only_name(name, ended)
             yield Match("release", only, repo.release_path(only, commit) or "")
@@ -226,9 +226,9 @@ def lines_of(answer: Json) -> Iterator[str]:
         yield f"  pending     a generator has yet to write or remove {path}"
     if answer.get("denied_by"):
         yield f"  denied by   {_override_text(answer['denied_by'])}"
-    for each in answer.get("releases", ()) if runs else ():
+    for release in answer.get("releases", ()) if runs else ():
         word = _OF_RELEASES.get(answer["kind"], "needs")
-        yield f"  {word:11} {each['name']} on {each['node']} ({each['file']})"
+        yield f"  {word:11} {release['name']} on {release['node']} ({release['file']})"
     if answer.get("claims"):
         yield from _claim_lines(answer["claims"])
     if answer.get("shaped_by"):
@@ -238,7 +238,7 @@ def lines_of(answer: Json) -> Iterator[str]:
             yield f"  {place['file']}{at}: {place['what']}"
     if answer.get("overrides"):
         yield "overridden by"
-        yield from (f"  {_override_text(each)}" for each in answer["overrides"])
+        yield from (f"  {_override_text(override)}" for override in answer["overrides"])
     yield from _history_lines(answer)
 
 
@@ -454,7 +454,7 @@ def _described(world: World, match: Match) -> Json:
         node, domain = config.nodes[name], config.domain_of.get(name)
         claims = [claim for claim in world.ledger if name in nodes_of(claim)]
         claims.sort(key=lambda claim: (str(claim.subject), claim.demand))
-        running = [each for each in explanations.releases(world) if each.node.id == name]
+        running = [release for release in explanations.releases(world) if release.node.id == name]
         return {
             "runs": bool(running or claims),
             "what": f"{node.type} in cluster {node.cluster}, access domain "

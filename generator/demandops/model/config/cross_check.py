@@ -350,7 +350,7 @@ def _check_charts(config: Config, reader: ConfigReader) -> None:
         for channel, source in chart.channels.items():
             _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
     tops = (source.folder for chart in config.charts.values() for source in chart.sources())
-    folders = (each for top in tops if top for each in charts.folders(top, config.files))
+    folders = (folder for top in tops if top for folder in charts.folders(top, config.files))
     for folder in dict.fromkeys(folders):  # each library once, in the order in which it is needed
         reader.faults += charts.faults(folder, config.files)
 

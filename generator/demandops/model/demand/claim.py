@@ -125,15 +125,15 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         inputs = self.inputs.get(role, ())
         start = bisect_left(inputs, InputTopic(topic, source))
         same = takewhile(
-            lambda each: (each.topic, each.source) == (topic, source), islice(inputs, start, None)
+            lambda t: (t.topic, t.source) == (topic, source), islice(inputs, start, None)
         )
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
         if not self._further:  # computed only once, because the plans of many services need it
-            for each, topic in self.all_inputs():
+            for own_role, topic in self.all_inputs():
                 if topic.further or self.separate:
-                    key = each, topic.part_in(self.own_version)
+                    key = own_role, topic.part_in(self.own_version)
                     self._further.setdefault(key, []).append(topic)
         return self._further.get((role, part), [])
 
@@ -213,7 +213,7 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     def without_topics(self, gone: Container[TopicKey]) -> Application | None:
         left = {
-            role: tuple(each for each in topics if (role, each.topic, each.source) not in gone)
+            role: tuple(t for t in topics if (role, t.topic, t.source) not in gone)
             for role, topics in self.inputs.items()
         }
         return self.with_inputs(left) if any(left.values()) else None

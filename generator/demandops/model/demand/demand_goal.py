@@ -302,7 +302,7 @@ def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requireme
     if place == GoalPlace():
         return None
     # a text of the wrong type was reported and is empty now, which would be a second fault
-    told = {each.field for each in faults}
+    told = {fault.field for fault in faults}
     labels = [tuple(label.split("=", 1)) for label in place.labels]
     for index, label in enumerate(labels):
         field = f"{where}.labels[{index}]"

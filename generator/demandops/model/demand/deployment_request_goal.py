@@ -118,7 +118,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     if not isinstance(data, dict):
         return None, [_not_a_mapping()]
     goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
-    faulty = {each.field for each in faults}
+    faulty = {fault.field for fault in faults}
     demanded = [
         _application(f"apps[{index}]", app, appdef_by_type(app.type))
         for index, app in enumerate(goal.apps)
@@ -144,7 +144,7 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         requesters = tuple(dict.fromkeys(connection.requester_ids))
         demanded.append(Demanded(held, requesters, partial(_connection_field, where)))
         if kind is None and f"{where}.type" not in faulty:
-            types = ", ".join(f"{each.number} ({each.name})" for each in by_number())
+            types = ", ".join(f"{kind.number} ({kind.name})" for kind in by_number())
             message = f"{connection.type} is not a connection type; known: {types}"
             faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
         if len(sources) != len(targets):

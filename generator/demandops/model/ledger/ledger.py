@@ -121,8 +121,8 @@ class Ledger:
         if len(keys) == len(self.index.get(("usual", source, role, excluded)) or ()):
             return  # all these claims have the topic ``excluded``
         claims = (claim for key in keys if (claim := self.get(key)))
-        inputs = (each for claim in claims for each in claim.application.inputs.get(role, ()))
-        usual = {each.topic for each in inputs if each.source == source and not each.further}
+        inputs = (topic for claim in claims for topic in claim.application.inputs.get(role, ()))
+        usual = {topic.topic for topic in inputs if topic.source == source and not topic.further}
         yield from sorted(usual - {excluded})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
