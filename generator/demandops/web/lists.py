@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -176,8 +177,7 @@ def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item]
 Values: TypeAlias = "tuple[Any, ...]"
 
 
-@dataclass(frozen=True, slots=True)
-class ListKind:
+class ListKind(ABC):
     """One of the lists, with its name in addresses.
 
     ``entries`` yields the id and the values of each entry, from which ``row`` makes a row. While
@@ -189,8 +189,10 @@ class ListKind:
     title: str
     about: str
     columns: tuple[Column, ...]
-    entries: Callable[[Situation], Iterator[tuple[str, Values]]]
     row: Callable[..., Row]
+
+    @abstractmethod
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]: ...
 
 
 def _release_part(name: str) -> Part:
@@ -213,121 +215,161 @@ def _requesters(requesters: Iterable[str]) -> Cell:
     return _linked("demands", "requester", requesters)
 
 
-def _services(now: Situation) -> Iterator[tuple[str, Values]]:
-    for release, _ in now.commit_state.targets:
-        if isinstance(release, ServiceRelease):
-            name = release.name
-            claims = now.commit_state.claims_of_releases[name]
-            yield name, (release, claims, word_of(now.status(name)))
-
-
-def _service(world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
-    return Row(
-        {
-            "release": cell(_release_part(release.name)),
-            "service": cell(release.key.service),
-            "node": _linked("services", "node", [release.node.id]),
-            "cluster": cell(release.node.cluster),
-            "application": _linked("services", "application", release.applications),
-            "version": cell(release.version.name or release.chart.version),
-            "requester": _requesters(release.requesters),
-            "health": _health_cell(word),
-        },
-        {"demand": [*dict.fromkeys(claim.demand for claim in claims)], "type": [release.node.type]},
-    )
-
-
-def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
-    ledger = now.commit_state.active.ledger
-    clients_of: dict[str, list[str]] = {}
-    for name, release in now.commit_state.releases.items():
-        if not isinstance(release, ServiceRelease):
-            for id in release.connections:
-                clients_of.setdefault(id, []).append(name)
-    for id in ledger.subjects(SubjectKind.CONNECTION):
-        claims, clients = ledger.connection_claims(id), clients_of.get(id, [])
-        if claims:  # at least one claim is not suspended
-            yield id, (claims, clients, worst_word(map(now.status, clients)))
-
-
-def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], word: str) -> Row:
-    held = claims[0].connection
-    return Row(
-        {
-            "connection": cell(held.id),
-            "by": cell(held.type.word if held.type else ""),
-            "from": _linked("connections", "from", [held.source]),
-            "to": _linked("connections", "to", [held.target]),
-            "topic": cell(*(route.source for route in connection_topics(claims))),
-            "requester": _requesters(requesters_of(claims)),
-            "release": cell(*map(_release_part, clients)),
-            "health": _health_cell(word),
-        },
-        {"demand": [claim.demand for claim in claims], "node": [held.source, held.target]},
-    )
-
-
-def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
-    commit_state = now.commit_state
-    for id, claims in commit_state.claims_of_demands.items():
-        releases = commit_state.releases_of_demands.get(id, [])
-        yield id, (claims, releases, worst_word(map(now.status, releases)))
-    for demand in commit_state.state.ledger.waiting.values():
-        yield f"waiting {demand.demand}", (demand, [], "waiting")
-
-
-def _demand(
-    world: World, holds: list[Claim] | WaitingDemand, releases: list[str], word: str
-) -> Row:
-    if isinstance(holds, WaitingDemand):
-        held = demand_lists.waiting_demand(holds)
-    else:
-        held = demand_lists.held_demand(holds, world)
-    health = _health_cell(word)
-    if held.state == "suspended":
-        health = cell("suspended", tone="bad", order=0.0)
-    elif held.state == "waiting":
-        health = cell("waits for room", tone="busy", order=RANKS["waiting"])
-    return Row(
-        {
-            "demand": cell(_demand_part(held.name)),
-            "request": cell(*held.requests),
-            "requester": _requesters(held.requesters),
-            "application": _linked("services", "application", held.applications),
-            "connection": _linked("connections", "connection", held.connections),
-            "since": Cell(time=held.since),
-            "lease": Cell(time=held.lease.until if held.lease else None),
-            "health": health,
-        },
-        {"release": releases, "node": held.nodes},
-    )
-
-
-def _leases(now: Situation) -> Iterator[tuple[str, Values]]:
-    for claim in now.commit_state.state.ledger:
-        if claim.lease is not None:
-            yield f"{claim.subject} {claim.demand}", (claim,)
-
-
-def _lease(world: World, claim: Claim) -> Row:
-    lease = claim.lease
-    assert lease is not None  # noqa: S101 - only claims with a lease are listed
-    return Row(
-        {
-            "ends": Cell(time=lease.until),
-            "subject": cell(claim.subject.id),
-            "kind": cell(claim.subject.kind.value[:-1]),
-            "demand": cell(_demand_part(claim.demand)),
-            "requester": _requesters(claim.requesters),
-            "term": cell(duration_text(lease.seconds), order=float(lease.seconds)),
-            "slack": cell(duration_text(lease.slack), order=float(lease.slack)),
-        },
-        {"node": demand_lists.nodes_of(claim)},
-    )
-
-
 def _columns(keys_and_titles: str) -> tuple[Column, ...]:
     return tuple(Column(*column.split("|")) for column in keys_and_titles.split(", "))
+
+
+class DemandsList(ListKind):
+    name = "demands"
+    title = "Demands"
+    about = "What requesters hold, until they release it or its lease ends."
+    columns = _columns(
+        "demand|Demand, health|Health, requester|Requesters, application|Applications, "
+        "connection|Connections, since|Since, lease|Lease until, request|Request"
+    )
+
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
+        commit_state = now.commit_state
+        for id, claims in commit_state.claims_of_demands.items():
+            releases = commit_state.releases_of_demands.get(id, [])
+            yield id, (claims, releases, worst_word(map(now.status, releases)))
+        for demand in commit_state.state.ledger.waiting.values():
+            yield f"waiting {demand.demand}", (demand, [], "waiting")
+
+    def row(
+        self, world: World, holds: list[Claim] | WaitingDemand, releases: list[str], word: str
+    ) -> Row:
+        if isinstance(holds, WaitingDemand):
+            held = demand_lists.waiting_demand(holds)
+        else:
+            held = demand_lists.held_demand(holds, world)
+        health = _health_cell(word)
+        if held.state == "suspended":
+            health = cell("suspended", tone="bad", order=0.0)
+        elif held.state == "waiting":
+            health = cell("waits for room", tone="busy", order=RANKS["waiting"])
+        return Row(
+            {
+                "demand": cell(_demand_part(held.name)),
+                "request": cell(*held.requests),
+                "requester": _requesters(held.requesters),
+                "application": _linked("services", "application", held.applications),
+                "connection": _linked("connections", "connection", held.connections),
+                "since": Cell(time=held.since),
+                "lease": Cell(time=held.lease.until if held.lease else None),
+                "health": health,
+            },
+            {"release": releases, "node": held.nodes},
+        )
+
+
+class ServicesList(ListKind):
+    name = "services"
+    title = "Services"
+    about = "One row for each Helm release: a service on a node, shared by all who need it."
+    columns = _columns(
+        "release|Release, health|Health, service|Service, node|Node, cluster|Cluster, "
+        "application|For, version|Version, requester|Requesters"
+    )
+
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
+        for release, _ in now.commit_state.targets:
+            if isinstance(release, ServiceRelease):
+                name = release.name
+                claims = now.commit_state.claims_of_releases[name]
+                yield name, (release, claims, word_of(now.status(name)))
+
+    def row(self, world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
+        return Row(
+            {
+                "release": cell(_release_part(release.name)),
+                "service": cell(release.key.service),
+                "node": _linked("services", "node", [release.node.id]),
+                "cluster": cell(release.node.cluster),
+                "application": _linked("services", "application", release.applications),
+                "version": cell(release.version.name or release.chart.version),
+                "requester": _requesters(release.requesters),
+                "health": _health_cell(word),
+            },
+            {
+                "demand": [*dict.fromkeys(claim.demand for claim in claims)],
+                "type": [release.node.type],
+            },
+        )
+
+
+class ConnectionsList(ListKind):
+    name = "connections"
+    title = "Connections"
+    about = "Topics that are carried from one node to another."
+    columns = _columns(
+        "connection|Connection, health|Health, by|By, from|From, to|To, topic|Topics, "
+        "requester|Requesters, release|Releases"
+    )
+
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
+        ledger = now.commit_state.active.ledger
+        clients_of: dict[str, list[str]] = {}
+        for name, release in now.commit_state.releases.items():
+            if not isinstance(release, ServiceRelease):
+                for id in release.connections:
+                    clients_of.setdefault(id, []).append(name)
+        for id in ledger.subjects(SubjectKind.CONNECTION):
+            claims, clients = ledger.connection_claims(id), clients_of.get(id, [])
+            if claims:  # at least one claim is not suspended
+                yield id, (claims, clients, worst_word(map(now.status, clients)))
+
+    def row(self, world: World, claims: tuple[Claim, ...], clients: list[str], word: str) -> Row:
+        held = claims[0].connection
+        return Row(
+            {
+                "connection": cell(held.id),
+                "by": cell(held.type.word if held.type else ""),
+                "from": _linked("connections", "from", [held.source]),
+                "to": _linked("connections", "to", [held.target]),
+                "topic": cell(*(route.source for route in connection_topics(claims))),
+                "requester": _requesters(requesters_of(claims)),
+                "release": cell(*map(_release_part, clients)),
+                "health": _health_cell(word),
+            },
+            {"demand": [claim.demand for claim in claims], "node": [held.source, held.target]},
+        )
+
+
+class LeasesList(ListKind):
+    name = "leases"
+    title = "Leases"
+    about = "Claims that end unless their requester renews them. The first to end comes first."
+    columns = _columns(
+        "ends|Ends, subject|Holds, kind|Kind, demand|Demand, requester|Requesters, "
+        "term|Term, slack|Slack"
+    )
+
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
+        for claim in now.commit_state.state.ledger:
+            if claim.lease is not None:
+                yield f"{claim.subject} {claim.demand}", (claim,)
+
+    def row(self, world: World, claim: Claim) -> Row:
+        lease = claim.lease
+        assert lease is not None  # noqa: S101 - only claims with a lease are listed
+        return Row(
+            {
+                "ends": Cell(time=lease.until),
+                "subject": cell(claim.subject.id),
+                "kind": cell(claim.subject.kind.value[:-1]),
+                "demand": cell(_demand_part(claim.demand)),
+                "requester": _requesters(claim.requesters),
+                "term": cell(duration_text(lease.seconds), order=float(lease.seconds)),
+                "slack": cell(duration_text(lease.slack), order=float(lease.slack)),
+            },
+            {"node": demand_lists.nodes_of(claim)},
+        )
+
+
+LISTS: dict[str, ListKind] = {
+    kind.name: kind for kind in (DemandsList(), ServicesList(), ConnectionsList(), LeasesList())
+}
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
@@ -344,54 +386,3 @@ def rows_of(now: Situation, name: str) -> list[Row]:
             rows[id] = before
         reusable = commit_state.rows[name] = ReusableRows(now.statuses, rows)
     return [row for _, row in reusable.rows.values()]
-
-
-LISTS = {
-    kind.name: kind
-    for kind in (
-        ListKind(
-            "demands",
-            "Demands",
-            "What requesters hold, until they release it or its lease ends.",
-            _columns(
-                "demand|Demand, health|Health, requester|Requesters, application|Applications, "
-                "connection|Connections, since|Since, lease|Lease until, request|Request"
-            ),
-            _demands,
-            _demand,
-        ),
-        ListKind(
-            "services",
-            "Services",
-            "One row for each Helm release: a service on a node, shared by all who need it.",
-            _columns(
-                "release|Release, health|Health, service|Service, node|Node, cluster|Cluster, "
-                "application|For, version|Version, requester|Requesters"
-            ),
-            _services,
-            _service,
-        ),
-        ListKind(
-            "connections",
-            "Connections",
-            "Topics that are carried from one node to another.",
-            _columns(
-                "connection|Connection, health|Health, by|By, from|From, to|To, topic|Topics, "
-                "requester|Requesters, release|Releases"
-            ),
-            _connections,
-            _connection,
-        ),
-        ListKind(
-            "leases",
-            "Leases",
-            "Claims that end unless their requester renews them. The first to end comes first.",
-            _columns(
-                "ends|Ends, subject|Holds, kind|Kind, demand|Demand, requester|Requesters, "
-                "term|Term, slack|Slack"
-            ),
-            _leases,
-            _lease,
-        ),
-    )
-}
