@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
-from typing import Any
+from typing import Any, ClassVar
 
 import click
 
@@ -69,15 +70,16 @@ class Source:
     not_rendered: Collection[str] = ()  # files that a generator has yet to write or remove
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
+class Kind(ABC):
     """A kind of thing: its items, each with a ``name``, and how they are shown."""
 
-    items: Callable[[Source], list[Json]]
     columns: Sequence[tuple[Column, CellOf]]
     wide: Sequence[tuple[Column, CellOf]]  # further columns for `-o wide`
     # An item is listed if the option matches one of the values that its filter returns.
-    filters: Mapping[str, Values] = field(default_factory=dict)
+    filters: ClassVar[Mapping[str, Values]]
+
+    @abstractmethod
+    def items(self, source: Source) -> list[Json]: ...
 
     def table(self, items: Iterable[Json], now: datetime, *, wide: bool = False) -> Table:
         shown = [*self.columns, *(self.wide if wide else ())]
@@ -92,105 +94,8 @@ def _column(
     return Column(title, rank, wraps), cell_of
 
 
-def _demands(source: Source) -> list[Json]:
-    return [
-        {
-            **asdict(demand),
-            "state": _state_now(demand.state, demand.lease, source.now),
-            "since": time_data(demand.since),
-            "lease": lease_data(demand.lease),
-        }
-        for demand in demand_lists.demands(source.snapshot.state)
-    ]
-
-
 def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
-
-
-def _nodes(source: Source) -> list[Json]:
-    world = source.snapshot.state
-    return [
-        {**asdict(node), "position": node.position.model_dump() if node.position else None}
-        for node in demand_lists.nodes(world, explanations.releases(world))
-    ]
-
-
-def _proposals(source: Source) -> list[Json]:
-    repo, pending = source.repo, list(pending_proposals(source.repo.repository))
-    # without a forge, a token or an answer, the proposals are listed without links
-    token_file, forge = settings.forge_token_file(), None
-    if pending and token_file is not None:
-        try:
-            configured = repo.config().repo_settings.proposals
-        except InvalidInput:
-            configured = Proposals()
-        try:
-            forge = forge_for(configured, token_file)
-        except ForgeError as error:
-            errors.print(f"warning: {error}")
-    rows = []
-    for proposal in pending:
-        link = None
-        try:
-            request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
-            link = request.link if request else None
-        except ForgeError as error:
-            errors.print(f"warning: {error}")
-        since = time_data(proposal.since)
-        rows.append({"name": proposal.branch, **asdict(proposal), "since": since, "link": link})
-    return rows
-
-
-def _services(source: Source) -> list[Json]:
-    world = source.snapshot.state
-    return [
-        {
-            "name": name,
-            "domains": demand_lists.domains_of([service.node], world.config),
-            **asdict(service),
-        }
-        for name, service in bookkeeping(world).services.items()
-    ]
-
-
-def _connections(source: Source) -> list[Json]:
-    world = source.snapshot.state
-    return [
-        {
-            "name": name,
-            "domains": demand_lists.domains_of([entry.source, entry.target], world.config),
-            **asdict(entry),
-        }
-        for name, entry in bookkeeping(world).connections.items()
-    ]
-
-
-def _claims(source: Source) -> list[Json]:
-    world = source.snapshot.state
-    claims = sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand))
-    return [
-        {
-            "name": (data := claim_data(claim))["file"],
-            "state": _state_now(demand_lists.state_of(claim, world), claim.lease, source.now),
-            "nodes": (nodes := demand_lists.nodes_of(claim)),
-            "domains": demand_lists.domains_of(nodes, world.config),
-            **data,
-        }
-        for claim in claims
-    ]
-
-
-def _overrides(source: Source) -> list[Json]:
-    return [
-        {
-            **override_data(entry.override),
-            "state": override_state(entry, source.snapshot.state, source.not_rendered),
-            "releases": [release_data(release) for release in entry.releases],
-            "claims": [claim_data(claim) for claim in entry.claims],
-        }
-        for entry in override_report(source.snapshot.state, source.now)
-    ]
 
 
 def _lease_text(item: Json, now: datetime) -> str:
@@ -252,177 +157,271 @@ def _key(name: str) -> Values:
 
 _COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _key("domains")}
 
-KINDS: dict[str, Kind] = {
-    "claims": Kind(
-        _claims,
-        (
-            _column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
-            _column("Requesters", _joined("requesters"), 1, wraps=True),
-            _column("State", "state", 2),
-            _column("Since", _ago("since"), 3),
-            _column("Lease", _lease_text, 4, wraps=True),
-            _column("Demand", "demand", 5),
+
+class _Claims(Kind):
+    columns = (
+        _column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
+        _column("Requesters", _joined("requesters"), 1, wraps=True),
+        _column("State", "state", 2),
+        _column("Since", _ago("since"), 3),
+        _column("Lease", _lease_text, 4, wraps=True),
+        _column("Demand", "demand", 5),
+    )
+    wide = (
+        _column("Request", "request"),
+        _column("Since (UTC)", _utc("since")),
+        _column("File", "file"),
+    )
+    filters = _COMMON | {
+        "application": lambda item: (
+            [item["subject"]["id"]] if item["subject"]["kind"] == "application" else []
+        )
+    }
+
+    def items(self, source: Source) -> list[Json]:
+        world = source.snapshot.state
+        claims = sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand))
+        return [
+            {
+                "name": (data := claim_data(claim))["file"],
+                "state": _state_now(demand_lists.state_of(claim, world), claim.lease, source.now),
+                "nodes": (nodes := demand_lists.nodes_of(claim)),
+                "domains": demand_lists.domains_of(nodes, world.config),
+                **data,
+            }
+            for claim in claims
+        ]
+
+
+class _Connections(Kind):
+    columns = (
+        _column("Connection", "name"),
+        _column("Type", "type", 2),
+        _column("From", "source", 1),
+        _column("To", "target", 1),
+        _column("Requesters", _joined("requesters"), 3, wraps=True),
+    )
+    wide = (_column("Topics", lambda item, now: list(item["topics"])),)
+    filters = _COMMON | {"node": lambda item: [item["source"], item["target"]]}
+
+    def items(self, source: Source) -> list[Json]:
+        world = source.snapshot.state
+        return [
+            {
+                "name": name,
+                "domains": demand_lists.domains_of([entry.source, entry.target], world.config),
+                **asdict(entry),
+            }
+            for name, entry in bookkeeping(world).connections.items()
+        ]
+
+
+class _Demands(Kind):
+    columns = (
+        _column("Demand", "name"),
+        _column("State", "state", 3),
+        _column("Requesters", _joined("requesters"), 1, wraps=True),
+        _column("Holds", _holds, 2),
+        _column("Since", _ago("since"), 5),
+        _column("Lease", _lease_text, 4, wraps=True),
+    )
+    wide = (
+        _column("Requests", "requests"),
+        _column("Nodes", "nodes"),
+        _column("Since (UTC)", _utc("since")),
+        _column("Suspended by", "suspended_by"),
+    )
+    filters = _COMMON | {"application": _key("applications")}
+
+    def items(self, source: Source) -> list[Json]:
+        return [
+            {
+                **asdict(demand),
+                "state": _state_now(demand.state, demand.lease, source.now),
+                "since": time_data(demand.since),
+                "lease": lease_data(demand.lease),
+            }
+            for demand in demand_lists.demands(source.snapshot.state)
+        ]
+
+
+class _Leases(Kind):
+    columns = (
+        _column("Demand", "name"),
+        _column("Requesters", _joined("requesters"), 2, wraps=True),
+        _column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
+        _column(
+            "Ends",
+            lambda item, now: _lease_text(item, now).removeprefix("ends "),
+            1,
+            wraps=True,
         ),
-        (
-            _column("Request", "request"),
-            _column("Since (UTC)", _utc("since")),
-            _column("File", "file"),
-        ),
-        _COMMON
-        | {
-            "application": lambda item: (
-                [item["subject"]["id"]] if item["subject"]["kind"] == "application" else []
-            )
-        },
-    ),
-    "connections": Kind(
-        _connections,
-        (
-            _column("Connection", "name"),
-            _column("Type", "type", 2),
-            _column("From", "source", 1),
-            _column("To", "target", 1),
-            _column("Requesters", _joined("requesters"), 3, wraps=True),
-        ),
-        (_column("Topics", lambda item, now: list(item["topics"])),),
-        _COMMON | {"node": lambda item: [item["source"], item["target"]]},
-    ),
-    "demands": Kind(
-        _demands,
-        (
-            _column("Demand", "name"),
-            _column("State", "state", 3),
-            _column("Requesters", _joined("requesters"), 1, wraps=True),
-            _column("Holds", _holds, 2),
-            _column("Since", _ago("since"), 5),
-            _column("Lease", _lease_text, 4, wraps=True),
-        ),
-        (
-            _column("Requests", "requests"),
-            _column("Nodes", "nodes"),
-            _column("Since (UTC)", _utc("since")),
-            _column("Suspended by", "suspended_by"),
-        ),
-        _COMMON | {"application": _key("applications")},
-    ),
-    "leases": Kind(
-        lambda source: sorted(
-            (demand for demand in _demands(source) if demand["lease"]),
-            # "~" sorts a lease that has not started behind every time
-            key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]),
-        ),
-        (
-            _column("Demand", "name"),
-            _column("Requesters", _joined("requesters"), 2, wraps=True),
-            _column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
-            _column(
-                "Ends",
-                lambda item, now: _lease_text(item, now).removeprefix("ends "),
-                1,
-                wraps=True,
-            ),
-        ),
-        (
-            _column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
-            _column("Holds", _holds),
-        ),
-        _COMMON | {"application": _key("applications")},
-    ),
-    "nodes": Kind(
-        _nodes,
-        (
-            _column("Node", "name"),
-            _column("Type", "type", 2),
-            _column("Domain", "domain", 3),
-            _column("Cluster", "cluster", 5),
-            _column("State", _node_state, 1),
-            _column("Releases", lambda item, now: str(len(item["releases"])), 4),
-            _column("Requesters", _joined("requesters"), 6, wraps=True),
-        ),
-        (
-            _column("Capabilities", "capabilities"),
-            _column(
-                "Properties",
-                lambda item, now: [
-                    f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
-                ],
-            ),
-            _column("Names of releases", "releases"),
-        ),
-        {
-            "node": _key("name"),
-            "requester": _key("requesters"),
-            "application": _key("applications"),
-            "domain": _key("domain"),
-        },
-    ),
-    "overrides": Kind(
-        _overrides,
-        (
-            _column("Override", "name"),
-            _column("State", "state", 1),
-            _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
-            _column("Until", _ago("until"), 3),
-            _column("Owner", "owner", 4),
-            _column(
-                "To",
-                lambda item, now: [
-                    *dict.fromkeys(release["name"] for release in item["releases"]),
-                    *dict.fromkeys("{kind} {id}".format(**c["subject"]) for c in item["claims"]),
-                ],
-                5,
-            ),
-            _column("Reason", "reason", 6, wraps=True),
-        ),
-        (
-            _column("Priority", lambda item, now: str(item["priority"])),
-            _column("Until (UTC)", _utc("until")),
-        ),
-        {
-            "node": lambda item: [release["node"] for release in item["releases"]],
-            "domain": lambda item: [release["domain"] for release in item["releases"]],
-            "requester": lambda item: [
-                who for claim in item["claims"] for who in claim["requesters"]
+    )
+    wide = (
+        _column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
+        _column("Holds", _holds),
+    )
+    filters = _COMMON | {"application": _key("applications")}
+
+    def items(self, source: Source) -> list[Json]:
+        leased = [demand for demand in KINDS["demands"].items(source) if demand["lease"]]
+        # "~" sorts a lease that has not started behind every time
+        return sorted(leased, key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]))
+
+
+class _Nodes(Kind):
+    columns = (
+        _column("Node", "name"),
+        _column("Type", "type", 2),
+        _column("Domain", "domain", 3),
+        _column("Cluster", "cluster", 5),
+        _column("State", _node_state, 1),
+        _column("Releases", lambda item, now: str(len(item["releases"])), 4),
+        _column("Requesters", _joined("requesters"), 6, wraps=True),
+    )
+    wide = (
+        _column("Capabilities", "capabilities"),
+        _column(
+            "Properties",
+            lambda item, now: [
+                f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
             ],
-        },
-    ),
-    "proposals": Kind(
-        _proposals,
-        (
-            _column("Branch", "branch"),
-            _column("Commit", lambda item, now: item["commit"][:10]),
-            _column("Requesters", _joined("requesters"), 1, wraps=True),
-            _column("Since", _ago("since"), 2),
-            _column("What", "summary", 3, wraps=True),
-            _column("Link", "link", 5),
         ),
-        (_column("Demands", "demands"), _column("Since (UTC)", _utc("since"))),
-        {"requester": _key("requesters")},
-    ),
-    "services": Kind(
-        _services,
-        (
-            _column("Service", "name"),
-            _column("Kind", "service", 4),
-            _column("Version", lambda item, now: version_lines(item), 5),
-            _column("Node", "node", 1),
-            _column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
-            _column("Requesters", _joined("requesters"), 2, wraps=True),
+        _column("Names of releases", "releases"),
+    )
+    filters = _COMMON | {
+        "node": _key("name"),
+        "application": _key("applications"),
+        "domain": _key("domain"),
+    }
+
+    def items(self, source: Source) -> list[Json]:
+        world = source.snapshot.state
+        return [
+            {**asdict(node), "position": node.position.model_dump() if node.position else None}
+            for node in demand_lists.nodes(world, explanations.releases(world))
+        ]
+
+
+class _Overrides(Kind):
+    columns = (
+        _column("Override", "name"),
+        _column("State", "state", 1),
+        _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
+        _column("Until", _ago("until"), 3),
+        _column("Owner", "owner", 4),
+        _column(
+            "To",
+            lambda item, now: [
+                *dict.fromkeys(release["name"] for release in item["releases"]),
+                *dict.fromkeys("{kind} {id}".format(**c["subject"]) for c in item["claims"]),
+            ],
+            5,
         ),
-        (
-            _column(
-                "Takes in",
-                lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
-            ),
-            _column(
-                "Parameters",
-                lambda item, now: [
-                    f"{name} = {value}" for name, value in item["parameters"].items()
-                ],
-            ),
+        _column("Reason", "reason", 6, wraps=True),
+    )
+    wide = (
+        _column("Priority", lambda item, now: str(item["priority"])),
+        _column("Until (UTC)", _utc("until")),
+    )
+    filters = _COMMON | {
+        "node": lambda item: [release["node"] for release in item["releases"]],
+        "domain": lambda item: [release["domain"] for release in item["releases"]],
+        "requester": lambda item: [who for claim in item["claims"] for who in claim["requesters"]],
+    }
+
+    def items(self, source: Source) -> list[Json]:
+        return [
+            {
+                **override_data(entry.override),
+                "state": override_state(entry, source.snapshot.state, source.not_rendered),
+                "releases": [release_data(release) for release in entry.releases],
+                "claims": [claim_data(claim) for claim in entry.claims],
+            }
+            for entry in override_report(source.snapshot.state, source.now)
+        ]
+
+
+class _Proposals(Kind):
+    columns = (
+        _column("Branch", "branch"),
+        _column("Commit", lambda item, now: item["commit"][:10]),
+        _column("Requesters", _joined("requesters"), 1, wraps=True),
+        _column("Since", _ago("since"), 2),
+        _column("What", "summary", 3, wraps=True),
+        _column("Link", "link", 5),
+    )
+    wide = (_column("Demands", "demands"), _column("Since (UTC)", _utc("since")))
+    filters: ClassVar[Mapping[str, Values]] = {"requester": _key("requesters")}
+
+    def items(self, source: Source) -> list[Json]:
+        repo, pending = source.repo, list(pending_proposals(source.repo.repository))
+        # without a forge, a token or an answer, the proposals are listed without links
+        token_file, forge = settings.forge_token_file(), None
+        if pending and token_file is not None:
+            try:
+                configured = repo.config().repo_settings.proposals
+            except InvalidInput:
+                configured = Proposals()
+            try:
+                forge = forge_for(configured, token_file)
+            except ForgeError as error:
+                errors.print(f"warning: {error}")
+        rows = []
+        for proposal in pending:
+            link = None
+            try:
+                request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
+                link = request.link if request else None
+            except ForgeError as error:
+                errors.print(f"warning: {error}")
+            since = time_data(proposal.since)
+            rows.append({"name": proposal.branch, **asdict(proposal), "since": since, "link": link})
+        return rows
+
+
+class _Services(Kind):
+    columns = (
+        _column("Service", "name"),
+        _column("Kind", "service", 4),
+        _column("Version", lambda item, now: version_lines(item), 5),
+        _column("Node", "node", 1),
+        _column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
+        _column("Requesters", _joined("requesters"), 2, wraps=True),
+    )
+    wide = (
+        _column(
+            "Takes in",
+            lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
         ),
-        _COMMON | {"node": _key("node"), "application": _key("applications")},
-    ),
+        _column(
+            "Parameters",
+            lambda item, now: [f"{name} = {value}" for name, value in item["parameters"].items()],
+        ),
+    )
+    filters = _COMMON | {"node": _key("node"), "application": _key("applications")}
+
+    def items(self, source: Source) -> list[Json]:
+        world = source.snapshot.state
+        return [
+            {
+                "name": name,
+                "domains": demand_lists.domains_of([service.node], world.config),
+                **asdict(service),
+            }
+            for name, service in bookkeeping(world).services.items()
+        ]
+
+
+KINDS: dict[str, Kind] = {
+    "claims": _Claims(),
+    "connections": _Connections(),
+    "demands": _Demands(),
+    "leases": _Leases(),
+    "nodes": _Nodes(),
+    "overrides": _Overrides(),
+    "proposals": _Proposals(),
+    "services": _Services(),
 }
 
 
