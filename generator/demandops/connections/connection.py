@@ -37,28 +37,22 @@ from demandops.model.config.registry import ClientSettings
 class Route:
     """One topic that a connection carries.
 
-    ``source`` is the topic's name on the source node, and ``target`` its name on the target node.
-    With ``reverse``, messages go from the target to the source. ``type`` is the ROS message type
-    (``std_msgs/msg/String``), empty if not given. An option that has its default leaves the
-    client's own behavior unchanged.
-
-    ``qos`` (0 to 2), ``retained`` and ``primitive`` (the payload is plain text or a number, not a
-    ROS message) are options of MQTT. ``reliability``, ``durability`` and ``queue`` are options of
-    the clients' ROS publishers and subscribers. ``rate`` is the highest rate in Hz, 0 for all
-    messages.
+    An option that has its default leaves the client's own behavior unchanged.
     """
 
-    source: str
+    source: str  # the topic's name on the source node
     target: str
-    type: str = ""
-    reverse: bool = False
+    type: str = ""  # the ROS message type, like `std_msgs/msg/String`
+    reverse: bool = False  # messages go from the target to the source
+    # Options of MQTT; with `primitive`, the payload is plain text or a number, not a ROS message
     qos: int = 0
     retained: bool = False
     primitive: bool = False
+    # Options of the clients' ROS publishers and subscribers
     reliability: str = ""
     durability: str = ""
     queue: int = 0
-    rate: float = 0.0
+    rate: float = 0.0  # the highest one in Hz; 0 for all messages
 
     def options(self) -> dict[str, Any]:
         return {

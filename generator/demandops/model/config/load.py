@@ -100,7 +100,15 @@ def load(files: Mapping[str, str]) -> Config:
         name: _services_of(appdef, definitions, nodes.values(), reader)
         for name, appdef in appdefs.items()
     }
-    clients, client_files = _read_clients(reader)
+    clients, client_files = DEFAULT_SETTINGS, dict[str, str]()
+    for file in reader.files_of(CLIENTS_FILE):
+        part = reader.read_file(file, ClientsFile)
+        words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
+        for word in sorted(words):
+            first = client_files.setdefault(word, file)
+            if first != file:
+                reader.add_duplicate(word, (first, word), (file, word))
+            clients = clients.model_copy(update={word: getattr(part, word)})
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
     clusters = reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name")
@@ -137,19 +145,6 @@ def load(files: Mapping[str, str]) -> Config:
     if reader.faults:
         raise InvalidInput(dict.fromkeys(reader.faults))
     return config
-
-
-def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
-    clients, files = DEFAULT_SETTINGS, dict[str, str]()
-    for file in reader.files_of(CLIENTS_FILE):
-        part = reader.read_file(file, ClientsFile)
-        words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
-        for word in sorted(words):
-            first = files.setdefault(word, file)
-            if first != file:
-                reader.add_duplicate(word, (first, word), (file, word))
-            clients = clients.model_copy(update={word: getattr(part, word)})
-    return clients, files
 
 
 def _refuse_unread(reader: ConfigReader) -> None:

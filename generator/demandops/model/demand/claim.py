@@ -164,7 +164,15 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
     def booked(self) -> Application:
         # The order of a goal's lists must not reach the ledger, because the same demand in another
         # order would make a commit.
-        inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items())}
+        inputs: dict[str, tuple[InputTopic, ...]] = {}
+        for role, topics in sorted(self.inputs.items()):
+            merged: dict[tuple[str, str], InputTopic] = {}
+            for topic in topics:
+                first = merged.setdefault((topic.topic, topic.source), topic)
+                # only some goals give the type of a topic, and the others must not take it away
+                if topic.type and not first.type:
+                    merged[topic.topic, topic.source] = topic
+            inputs[role] = tuple(topic for _, topic in sorted(merged.items()))
         place = self.place and self.place.united(self.place)
         deliver = tuple(sorted({*self.deliver}))
         return replace(self, deliver=deliver, place=place).with_inputs(inputs)
@@ -253,16 +261,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
 def _exact(values: Mapping[str, object]) -> str:
     return json.dumps(dict(values), sort_keys=True, default=repr) if values else ""
-
-
-def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
-    merged: dict[tuple[str, str], InputTopic] = {}
-    for topic in topics:
-        first = merged.setdefault((topic.topic, topic.source), topic)
-        # only some goals give the type of a topic, and the others must not take it away
-        if topic.type and not first.type:
-            merged[topic.topic, topic.source] = topic
-    return tuple(topic for _, topic in sorted(merged.items()))
 
 
 # ---- leases: how long a claim stays booked without a renewal ----

@@ -270,7 +270,21 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         for index, app in enumerate(goal.applications)
     )
     connections = (
-        Demanded(_connection(connection), requesters, partial(_field, f"connections[{index}]"))
+        Demanded(
+            Connection(
+                id=connection.id,
+                type=None if connection.type == "auto" else type_named(connection.type),
+                source=connection.source,
+                target=connection.target,
+                topics=tuple(
+                    r.route(absolute_topic(r.source), absolute_topic(r.target or r.source))
+                    for r in connection.topics
+                ),
+                broker=connection.broker,
+            ),
+            requesters,
+            partial(_field, f"connections[{index}]"),
+        )
         for index, connection in enumerate(goal.connections)
     )
     positions: dict[str, Position] = {}
@@ -384,17 +398,3 @@ def _value_problem(value: object, depth: int) -> str:
     parts = [*value, *value.values()] if isinstance(value, dict) else value
     nested = parts if isinstance(parts, list) else ()
     return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")
-
-
-def _connection(connection: GoalConnection) -> Connection:
-    return Connection(
-        id=connection.id,
-        type=None if connection.type == "auto" else type_named(connection.type),
-        source=connection.source,
-        target=connection.target,
-        topics=tuple(
-            route.route(absolute_topic(route.source), absolute_topic(route.target or route.source))
-            for route in connection.topics
-        ),
-        broker=connection.broker,
-    )
