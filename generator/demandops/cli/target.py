@@ -57,26 +57,26 @@ class ContextsFile(FileModel):
         return self
 
 
-def path() -> Path:
+def contexts_file() -> Path:
     root = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
     return Path(root) / "demandops" / "contexts.yaml"
 
 
-def read() -> ContextsFile:
+def read_contexts() -> ContextsFile:
     try:
-        text = path().read_text(encoding="utf-8")
+        text = contexts_file().read_text(encoding="utf-8")
     except FileNotFoundError:
         return ContextsFile(apiVersion=API_VERSION, kind="Contexts")
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInput.at(
-            "", f"cannot be read: {error}; replace the file", file=str(path())
+            "", f"cannot be read: {error}; replace the file", file=str(contexts_file())
         ) from None
     with located_in(text):
-        return parse_file(ContextsFile, text, str(path()))
+        return parse_file(ContextsFile, text, str(contexts_file()))
 
 
-def write(content: ContextsFile) -> None:
-    file = path()
+def write_contexts(content: ContextsFile) -> None:
+    file = contexts_file()
     file.parent.mkdir(parents=True, exist_ok=True)
     data = content.model_dump(by_alias=True, exclude_none=True)
     # written beside the file and then renamed, so that no other command reads half a file
@@ -86,12 +86,12 @@ def write(content: ContextsFile) -> None:
     new.replace(file)
 
 
-def named(name: str, field: str = "") -> Context:
+def context_named(name: str, field: str = "") -> Context:
     # a fault names `field` as the place of the name
-    contexts = read().contexts
+    contexts = read_contexts().contexts
     if name not in contexts:
         message = f"there is no context '{name}'{suggestion(name, contexts)}"
-        raise InvalidInput.at(field, message, file=str(path()))
+        raise InvalidInput.at(field, message, file=str(contexts_file()))
     return contexts[name]
 
 
@@ -126,10 +126,10 @@ def _chosen_context(around: Path | None) -> Context | None:
     # clusters and signing key of a context apply only to its own state repo
     ctx = click.get_current_context()
     name = ctx.meta.get(_NAME)
-    content = read()
+    content = read_contexts()
     context: Context | None
     if name is not None:
-        context = named(name, "--context")
+        context = context_named(name, "--context")
     elif around is not None:
         places = {str(around), origin_of(around)}
         same = (context for context in content.contexts.values() if context.state_repo in places)
@@ -189,7 +189,7 @@ def _remember_name(ctx: click.Context, param: click.Parameter, value: str | None
 
 
 def context_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    return [name for name in read().contexts if name.startswith(incomplete)]
+    return [name for name in read_contexts().contexts if name.startswith(incomplete)]
 
 
 _context_option = click.option(
