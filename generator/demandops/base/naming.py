@@ -88,7 +88,7 @@ def ros_name(release: str) -> str:
     return release.replace("-", "_")  # ROS forbids dashes in the names of nodes
 
 
-# ---- rules for ids, topic names and message types, and how messages explain a field's pattern ----
+# ---- rules for ids, topic names and message types ----
 
 # The maximum length of an id, in characters. A file or an object that is named after a long id has
 # a shortened name with a hash.

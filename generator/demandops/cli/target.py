@@ -24,7 +24,7 @@ from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.views import explanations
 
-# ---- contexts: the fleets that a person works with, from a file in the user's config folder ----
+# ---- contexts: the fleets that a person works with ----
 #
 # A context replaces options that a person would repeat: the state repo, the access to the clusters,
 # the signing key. docs/commands.md describes the file.
@@ -272,7 +272,7 @@ clusters_option = click.option(
 )
 
 
-# ---- names from the state repo, by which a shell completes a command's arguments ----
+# ---- names from the state repo, for a shell's completion ----
 
 Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 

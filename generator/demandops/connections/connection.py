@@ -159,7 +159,7 @@ def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
     return tuple(merged[source] for source in sorted(merged))
 
 
-# ---- connections: demands list them, claims hold them, and clients carry them ----
+# ---- connections ----
 
 
 @dataclass(frozen=True, slots=True)

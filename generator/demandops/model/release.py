@@ -19,7 +19,7 @@ from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import Instance, Kept, Steps
 
-# ---- the number of replicas of a service; its definition derives it from the demands ----
+# ---- the number of replicas of a service ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,7 +88,7 @@ def most_replicas(replicas: int | Autoscaler) -> int:
     return replicas.max if isinstance(replicas, Autoscaler) else replicas
 
 
-# ---- releases: the planner returns one for each service instance and each client ----
+# ---- releases: one for each service instance and each client ----
 
 
 @dataclass(frozen=True, slots=True)

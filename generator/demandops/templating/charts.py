@@ -307,7 +307,7 @@ def _rows(
             yield from _rows(value, f"{path}.", words, leaves and path not in words)
 
 
-# ---- the ``values.schema.json`` of a chart, for its own values and the values that it imports ----
+# ---- the ``values.schema.json`` of a chart ----
 #
 # Neither Helm nor the generator follows a reference to another schema file. So this module copies
 # the library's schema into the chart's schema.

@@ -24,7 +24,7 @@ from demandops.base.strict_yaml import not_writable
 from demandops.templating import charts
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
 
-# ---- the line of a values template that produced a faulty line of the rendered text ----
+# ---- the line of a template that wrote a faulty line ----
 
 _EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
 _PLACE = re.compile(r"line (\d+)")

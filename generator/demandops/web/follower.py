@@ -100,7 +100,7 @@ class ClusterWatch:
             cache.close()
 
 
-# ---- the state repo: the newest situation, those at earlier commits, and the newest commits ----
+# ---- the state repo, and its newest commits ----
 #
 # One thread fetches new commits and publishes each new situation. The threads that answer requests
 # read the published situation.

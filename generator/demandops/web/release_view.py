@@ -25,7 +25,7 @@ from demandops.views import explanations
 from demandops.views.explanations import how_to_release, is_released_by_demand_id
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of
 
-# ---- the view of one demand: what it holds, and what would change if it were released ----
+# ---- the view of one demand ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +77,7 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand
     return ExplainedDemand(id, claims, requesters, releases, consequence)
 
 
-# ---- the view of one release: why it runs, its file, the last change, its history and status ----
+# ---- the view of one release ----
 
 MOST_CHANGES = 20
 

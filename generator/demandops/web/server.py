@@ -40,7 +40,7 @@ from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Link, Row, rows_of
 from demandops.web.situation import Situation
 
-# ---- the views: for each address, the function that returns a template and its data ----
+# ---- the views, by address ----
 
 # The parameters that a link to another view keeps: the chosen commit or time, and the filter.
 _KEPT = ("at", "q")
@@ -189,7 +189,7 @@ VIEWS: Mapping[str, View] = {
 }
 
 
-# ---- the site: views as pages, events, and headers that keep other sites out ----
+# ---- the site ----
 #
 # No request changes anything, and no page loads anything from another host. Templates escape the
 # HTML in every value that they print. They also escape invisible characters, except in the fields
@@ -397,7 +397,7 @@ def _clock(at: datetime, now: datetime) -> str:
     return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")
 
 
-# ---- the web server of the page, which has its own thread and its own address ----
+# ---- the web server ----
 
 # How many connections may be open; at most half of them are streams of events (`Site`).
 _MOST_CONNECTIONS = 200

@@ -34,7 +34,7 @@ from demandops.repo.write.proposal_branch import PendingProposal
 from demandops.views import explanations
 from demandops.views.explanations import Entry, override_report
 
-# ---- the health of a release in one word, and the color of this word on the page ----
+# ---- the health of a release in one word ----
 
 # The words for a health, each with its color on the page, from the worst to the best health.
 WORDS = {
@@ -70,7 +70,7 @@ def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
     return min(map(word_of, statuses), key=RANKS.__getitem__, default="unknown")
 
 
-# ---- the state at one commit, and the situation: this state with what the clusters report ----
+# ---- the state at one commit, and with it what the clusters report ----
 
 _UNKNOWN = ReleaseStatus(Health("waiting"))
 

@@ -14,7 +14,7 @@ from demandops.repo.history.commit_log import PROPOSAL
 from demandops.web.lists import Filter, Row, cell
 from demandops.web.situation import WORDS, Commit, HealthChange
 
-# ---- the time line, with the events of demands, overrides, people's commits and health ----
+# ---- the time line of events ----
 
 # The title of each lane of the time line, from top to bottom, by the lane's name.
 LANES = {

@@ -104,7 +104,7 @@ def claim_text(claim: Json) -> str:
     return f"{claim['subject']['kind']} '{claim['subject']['id']}'"
 
 
-# ---- ``demandops decommission``: release all claims of a node or a requester, in one commit ----
+# ---- ``demandops decommission``: release all claims of a node or a requester ----
 
 
 @click.command()
@@ -221,7 +221,7 @@ def _decommission_lines(row: Json, dry_run: bool) -> Iterator[str]:
         yield f"'{row['name']}' is decommissioned in {row['commit']}"
 
 
-# ---- ``demandops rollback``: restore the ledger of an earlier commit, by a new commit ----
+# ---- ``demandops rollback``: restore the ledger of an earlier commit ----
 
 _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 

@@ -34,7 +34,7 @@ from demandops.model.config.override import OVERRIDES_ROOT, Override, format_tim
 from demandops.repo.reader import Reader
 from demandops.views.explanations import Entry
 
-# ---- ``demandops override``: create or end an override, by a commit in the caller's own name ----
+# ---- ``demandops override``: create or end an override ----
 
 
 @click.group()

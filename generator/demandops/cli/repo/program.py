@@ -19,7 +19,7 @@ from demandops.cli.table import Column, Table
 from demandops.cli.target import context_names
 from demandops.model.config.base_model import parse
 
-# ---- ``demandops version``: the versions of the program and of the formats that it writes ----
+# ---- ``demandops version`` ----
 
 
 @click.command()
@@ -55,7 +55,7 @@ def version(output: str) -> None:
     show(output, data, lines)
 
 
-# ---- ``demandops completion``: a script with which a shell completes commands and names ----
+# ---- ``demandops completion`` ----
 
 VARIABLE = "_DEMANDOPS_COMPLETE"
 

@@ -29,7 +29,7 @@ def document(path: str, schema: str, kind: str, fields: Mapping[str, Any], note:
     return modeline(path, schema) + comment + text
 
 
-# ---- a new container file and new pipelines for the repository of a ROS package ----
+# ---- a container file and pipelines for a ROS package ----
 
 _PATHS = {
     "Containerfile": "Containerfile",
@@ -74,7 +74,7 @@ def image_files(
     }
 
 
-# ---- a new application: its definition, values, chart, registry entries, README and demand ----
+# ---- a new application ----
 #
 # The application's services form a chain: the first service reads the application's inputs, and
 # each further service reads the outputs of the service before it. One image contains the launch

@@ -136,7 +136,7 @@ def init(
     show(output, data, lines)
 
 
-# ---- ``demandops upgrade``: render with this version, or for the other GitOps controller ----
+# ---- ``demandops upgrade``: render everything again ----
 
 _MOST_PATHS = 50
 _SWITCH = (
@@ -271,7 +271,7 @@ def _upgrade_lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
         yield from (f"      {command}" for command in step["commands"])
 
 
-# ---- ``demandops verify``: a proof that commits match their ledger and configuration ----
+# ---- ``demandops verify``: render commits again and compare ----
 
 
 @click.command()

@@ -45,7 +45,7 @@ from demandops.views import explanations
 from demandops.views.demand_lists import nodes_of
 from demandops.views.explanations import affected_releases, override_report
 
-# ---- the release, demand, node or other object that has the given name ----
+# ---- the object that has the given name ----
 
 KINDS = (
     "release",
@@ -323,7 +323,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
         yield f"    carries out commit {each['commit'][:10]} of {each['author']}: {each['summary']}"
 
 
-# ---- the command: the requesters, configuration, overrides and commits behind what runs ----
+# ---- the command ----
 
 _MOST_CARRIED_OUT = 5
 

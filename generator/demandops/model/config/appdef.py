@@ -38,7 +38,7 @@ from demandops.model.config.inventory import (
 )
 from demandops.model.config.policy import Duration
 
-# ---- the number of replicas of a service, and the fields of a definition that decide it ----
+# ---- the number of replicas of a service ----
 
 Count = Annotated[int, Field(ge=0, le=1000)]
 
@@ -148,7 +148,7 @@ class Scaling(CamelModel):
         return self.max if self.per or self.autoscaler else self.min
 
 
-# ---- services as people define them: those of one appdef, and those that several appdefs use ----
+# ---- services as people define them ----
 
 # The name of an output's topic. `{instance}` stands for the source, the application or the node
 # that the service runs for.
@@ -311,7 +311,7 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         yield f"{place}: '{name}' has the default {default}, which is not a size{hint}"
 
 
-# ---- one type of application, as people define it: `appdefs/<name>/appdef.yaml` ----
+# ---- applications as people define them: ``appdefs/<name>/appdef.yaml`` ----
 
 # What happens if demands that share an application or a service ask for different versions.
 # `refuse`: the later demand is refused. `separate`: a version other than the default runs in an
@@ -375,7 +375,7 @@ class ApplicationDefinition(FileModel):
         return self
 
 
-# ---- the services of an appdef, and where the inputs of each service come from ----
+# ---- the services of an appdef, with the origins of their inputs ----
 
 
 class Service(Deployed):

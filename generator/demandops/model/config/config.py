@@ -247,7 +247,7 @@ class Config:
         return f"appdefs/{service.folder}/{service.values}"
 
 
-# ---- the reader of configuration files: item by item, to find the faults of every item ----
+# ---- the reader: item by item, to find the faults of every item ----
 
 Model = TypeVar("Model", bound=BaseModel)
 Valid = TypeVar("Valid")
@@ -263,9 +263,11 @@ class ConfigReader:
         self._by_collection = defaultdict[str | None, list[str]](list)
         for path in sorted(files):
             self._by_collection[collection_of(path)].append(path)
-        self._places: dict[str, dict[str, tuple[str, str]]] = {}
+        # The file and the path of each item, by collection and name
+        self.places: dict[str, dict[str, tuple[str, str]]] = {}
         self._incomplete: set[str] = set()
-        self._heads: dict[str, BaseModel] = {}
+        # The valid files with items, but without the items
+        self.heads: dict[str, BaseModel] = {}
 
     def add_fault(self, file: str, field: str, message: str) -> None:
         self._counts[file] += 1
@@ -294,7 +296,7 @@ class ConfigReader:
         else a mapping.
         """
         items: dict[str, Model] = {}
-        places = self._places[collection] = {}
+        places = self.places[collection] = {}
         kind: type[Any] = list if key else dict
         for file in self.files_of(collection) or [collection]:
             entries: Any = None
@@ -305,7 +307,7 @@ class ConfigReader:
                     entries = raw
                     # without the items, each of which is parsed below, so that an invalid item
                     # hides neither the others nor the faults of the file's other fields
-                    self._heads[file] = parse(whole, {**data, field: kind()}, file)
+                    self.heads[file] = parse(whole, {**data, field: kind()}, file)
                 else:
                     self.read_file(file, whole)
             except InvalidInput as error:
@@ -345,25 +347,18 @@ class ConfigReader:
     def entry_files(self) -> dict[str, dict[str, str]]:
         return {
             collection: {name: file for name, (file, _) in places.items()}
-            for collection, places in self._places.items()
+            for collection, places in self.places.items()
         }
 
-    def head(self, file: str, model: type[Model]) -> Model | None:
-        head = self._heads.get(file)
-        return head if isinstance(head, model) else None
-
     def place_of(self, collection: str, name: str) -> tuple[str, str]:
-        return self._places[collection][name]
-
-    def add_alias(self, collection: str, name: str, item: str) -> None:
-        self._places[collection][name] = self._places[collection][item]
+        return self.places[collection][name]
 
     def is_complete(self, collection: str) -> bool:
         return collection not in self._incomplete
 
     def is_missing(self, collection: str, name: str) -> bool:
         # an invalid item may be the missing one, and has faults of its own
-        return self.is_complete(collection) and name not in self._places[collection]
+        return self.is_complete(collection) and name not in self.places[collection]
 
     def check_reference(self, file: str, field: str, name: str, collection: str) -> None:
         if self.is_missing(collection, name):
@@ -371,7 +366,7 @@ class ConfigReader:
             where = where.replace("inventory/", "")
             # thousands of names may be unknown, and only the first faults of a file are listed
             is_listed = self._counts[file] < MOST_FAULTS
-            hint = suggestion(name, self._places[collection]) if is_listed else ""
+            hint = suggestion(name, self.places[collection]) if is_listed else ""
             self.add_fault(file, field, f"'{name}' is not in {where}{hint}")
 
     def _valid(

@@ -116,8 +116,8 @@ def load(files: Mapping[str, str]) -> Config:
     charts = reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart)
     images = reader.read_items(IMAGES_FILE, ImagesFile, "images", Image)
     for name, image in images.items():
-        head = reader.head(reader.place_of(IMAGES_FILE, name)[0], ImagesFile)
-        if head is not None and head.registry is not None:
+        head = reader.heads.get(reader.place_of(IMAGES_FILE, name)[0])
+        if isinstance(head, ImagesFile) and head.registry is not None:
             images[name] = image.pulled_from(head.registry)
     versions: Mapping[str, VersionList] = {}
     if reader.files_of(VERSIONS_FILE):  # unlike the other collections, this one may have no file
@@ -282,7 +282,7 @@ def _in_further_domains(
                     reader.add_fault(file, f"{where}.name", message)
                 # the first domain keeps the plain name, so a further one changes nothing that runs
                 nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
-                reader.add_alias(NODES_FILE, id, node.id)
+                reader.places[NODES_FILE][id] = (file, place)
     return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
 
 

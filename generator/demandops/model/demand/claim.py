@@ -15,7 +15,7 @@ from demandops.base import naming
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections.connection import Connection
 
-# ---- applications: demands list them, claims hold them, and services are planned from them ----
+# ---- applications ----
 
 
 class InputTopic(NamedTuple):

@@ -345,7 +345,7 @@ def claim_changes(
     return tuple(change for change in changes if change.before != change.after)
 
 
-# ---- the world: the configuration and the ledger in effect at one time, as one value ----
+# ---- the world: the configuration and the ledger in effect ----
 
 
 @dataclass(frozen=True, slots=True)

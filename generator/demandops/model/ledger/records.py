@@ -29,7 +29,7 @@ from demandops.model.ledger.claim_file import (
     segment,
 )
 
-# ---- kept replicas: those that a service keeps for a while although its demands need fewer ----
+# ---- kept replicas ----
 #
 # A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service
 # has the highest number of replicas that its demands needed within this time. Its record, the file
@@ -165,7 +165,7 @@ def read_all_replicas(files: Mapping[str, str]) -> KeptReplicas:
     return kept
 
 
-# ---- recent shutdowns, so that a shutdown that is sent again within 15 minutes is recognized ----
+# ---- recent shutdowns ----
 #
 # A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
 # record of the first shutdown, the repeat could release another demand of the same requesters. If a
@@ -415,7 +415,7 @@ def read_all_waiting(files: Mapping[str, str]) -> WaitingDemands:
     return HashTrieMap({demand.demand: demand for demand in demands})
 
 
-# ---- markers: files of the ledger that record which overrides ended, and when ----
+# ---- markers: which overrides ended, and when ----
 #
 # The repo alone, not the clock, decides whether an override applies, because a replay and
 # ``verify`` must give the same bytes as the original run. So the generator commits a marker when an
