@@ -296,6 +296,24 @@ def names_of(*kinds: str) -> Complete:
     return complete
 
 
+def name_options(helps: dict[str, str], **more: Any) -> Callable[[Command], Command]:  # noqa: ANN401
+    """Add an option for each name, which a shell completes; one for several is named in plural."""
+
+    def add(command: Command) -> Command:
+        for name, text in reversed(helps.items()):
+            option = click.option(
+                f"--{name}",
+                f"{name}s" if more.get("multiple") else name,
+                shell_complete=names_of(f"{name}s"),
+                help=text,
+                **more,
+            )
+            command = option(command)
+        return command
+
+    return add
+
+
 def _names(repo: Reader, kind: str) -> Iterator[str]:
     if kind == "proposals":
         yield from (proposal.branch for proposal in pending_proposals(repo.repository))

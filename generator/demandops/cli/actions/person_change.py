@@ -28,7 +28,7 @@ from demandops.cli.output import errors, progress
 from demandops.cli.target import (
     dry_run_option,
     hint_to_pull,
-    names_of,
+    name_options,
     signing_option,
     writable_repo_option,
 )
@@ -212,20 +212,14 @@ def print_edit(edit: Edit, entry: Entry, published: Published | None, output: st
     show(output, data, lines)
 
 
-SELECTORS = ("application", "appdef", "service", "connection", "node", "requester")
-
-
-def selecting(command: Command) -> Command:
-    for name in reversed(SELECTORS):
-        command = click.option(
-            f"--{name}",
-            f"{name}s",
-            metavar="NAME",
-            multiple=True,
-            shell_complete=names_of(f"{name}s"),
-            help=f"Select this {name}; * matches any text, ? one character. May be repeated.",
-        )(command)
-    return command
+selecting = name_options(
+    {
+        name: f"Select this {name}; * matches any text, ? one character. May be repeated."
+        for name in ("application", "appdef", "service", "connection", "node", "requester")
+    },
+    metavar="NAME",
+    multiple=True,
+)
 
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:

@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import click
 
@@ -39,7 +39,7 @@ from demandops.cli.output import (
     warn_of_not_rendered,
 )
 from demandops.cli.table import Cell, Column, Table
-from demandops.cli.target import names_of, state_repo_option
+from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.model.config.base_model import duration_text, relative
 from demandops.model.config.override import parse_time
 from demandops.model.config.policy import matches
@@ -462,17 +462,6 @@ def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
     return names_of(kinds[kind])(ctx, param, incomplete) if kind in kinds else []
 
 
-def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
-    for name in reversed(FILTERS):
-        command = click.option(
-            f"--{name}",
-            metavar="NAME",
-            shell_complete=names_of(f"{name}s"),
-            help=f"List only items of this {name}; * matches any text, ? one character.",
-        )(command)
-    return command
-
-
 @click.command()
 @click.argument(
     "kind",
@@ -483,7 +472,13 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
 )
 @click.argument("names", nargs=-1, metavar="[NAME…]", shell_complete=_item_names)
 @state_repo_option
-@_filters
+@name_options(
+    {
+        name: f"List only items of this {name}; * matches any text, ? one character."
+        for name in FILTERS
+    },
+    metavar="NAME",
+)
 @at_option
 @click.option(
     "-w",

@@ -14,7 +14,7 @@ from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
 from demandops.cli.output import busy
 from demandops.cli.table import Column, Table
-from demandops.cli.target import names_of, state_repo_option
+from demandops.cli.target import name_options, state_repo_option
 from demandops.model.config.base_model import relative
 from demandops.model.config.override import parse_time
 from demandops.repo import reader
@@ -62,42 +62,20 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
 @click.command()
 @click.argument("commit_range", required=False, metavar="[REV|A..B]")
 @state_repo_option
-@click.option(
-    "--requester",
+@name_options(
+    {
+        "requester": "List only commits about claims or waiting demands of this requester.",
+        "application": "List only commits about this application.",
+        "connection": "List only commits about this connection.",
+        "node": "List only commits that change a release on this node or a claim that names this "
+        "node.",
+    },
     metavar="ID",
-    shell_complete=names_of("requesters"),
-    help="List only commits about claims or waiting demands of this requester.",
 )
-@click.option(
-    "--application",
-    metavar="ID",
-    shell_complete=names_of("applications"),
-    help="List only commits about this application.",
+@name_options(
+    {"release": "List only commits that changed the file of this release."}, metavar="NAME"
 )
-@click.option(
-    "--connection",
-    metavar="ID",
-    shell_complete=names_of("connections"),
-    help="List only commits about this connection.",
-)
-@click.option(
-    "--node",
-    metavar="ID",
-    shell_complete=names_of("nodes"),
-    help="List only commits that change a release on this node or a claim that names this node.",
-)
-@click.option(
-    "--release",
-    metavar="NAME",
-    shell_complete=names_of("releases"),
-    help="List only commits that changed the file of this release.",
-)
-@click.option(
-    "--demand",
-    metavar="ID",
-    shell_complete=names_of("demands"),
-    help="List only commits about this demand.",
-)
+@name_options({"demand": "List only commits about this demand."}, metavar="ID")
 @click.option(
     "--operation",
     type=click.Choice(OPERATIONS),
