@@ -24,7 +24,7 @@ def is_visible(text: str) -> bool:
     return text.isprintable() and not _HIDDEN.search(text)
 
 
-def escaped(text: str, kept: str = "") -> str:  # like `\\u202e`
+def escaped(text: str, kept: str = "") -> str:  # like `\u202e`
     if is_visible(text):
         return text
     return "".join(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
+from functools import partial
 from statistics import median
 
 from demandops.model.config.base_model import span
@@ -228,82 +229,65 @@ def plots(
         if entry.authored and entry.first("Operation") in _BOOKED | _RELEASED
     ]
     ready = [(change.time, change.lasted_s) for change in health if change.lasted_s is not None]
-    make = _PlotMaker(start, span_s)
+    by_people = [(commit.entry.time, 1.0) for commit in commits if not commit.entry.by_generator]
+    rate = partial(_plot, start, span_s, True)
+    latency = partial(_plot, start, span_s, False)
     return [
-        make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
-        make.counts(
+        rate("Demands booked", "commits that book a demand", _counted(commits, _BOOKED)),
+        rate(
             "Demands released",
-            _times(commits, _RELEASED),
             "commits that release demands, or end demands whose lease expired",
+            _counted(commits, _RELEASED),
         ),
-        make.counts(
-            "People's commits",
-            [commit.entry.time for commit in commits if not commit.entry.by_generator],
-            "commits that no generator made",
-        ),
-        make.medians("From received to committed", waits, "median (Git records whole seconds)"),
-        make.medians(
+        rate("People's commits", "commits that no generator made", by_people),
+        latency("From received to committed", "median (Git records whole seconds)", waits),
+        latency(
             "Until healthy again",
-            ready,
             "median time that releases were not healthy, since this page was started",
+            ready,
         ),
     ]
 
 
-def _times(commits: Iterable[Commit], operations: set[str]) -> list[datetime]:
+def _counted(commits: Iterable[Commit], operations: set[str]) -> list[Sample]:
     entries = (commit.entry for commit in commits)
-    return [entry.time for entry in entries if entry.first("Operation") in operations]
+    return [(entry.time, 1.0) for entry in entries if entry.first("Operation") in operations]
 
 
-class _PlotMaker:
-    def __init__(self, start: datetime, span_s: float) -> None:
-        self._start, self._bin_s = start, span_s / _RATE_BINS
-        self._span = span_s
-
-    def counts(self, title: str, times: Iterable[datetime], about: str) -> Plot:
-        values = [float(len(events)) for events in self._bins((at, 1.0) for at in times)]
-        total = int(sum(values))
-        summary = f"{total} in all, {total * 3600 / self._span:.3g} an hour"
-        return self._plot(title, f"per {span(self._bin_s)}", about, values, summary, "")
-
-    def medians(self, title: str, samples: Iterable[Sample], about: str) -> Plot:
-        bins = self._bins(samples)
-        every = sorted(value for samples in bins for value in samples)
-        summary = "no values in this span of time"
+def _plot(
+    start: datetime, span_s: float, is_rate: bool, title: str, about: str, samples: list[Sample]
+) -> Plot:
+    bin_s, bins = span_s / _RATE_BINS, [list[float]() for _ in range(_RATE_BINS)]
+    for time, value in samples:
+        place = int((time - start).total_seconds() / bin_s)
+        if time >= start:
+            bins[min(place, _RATE_BINS - 1)].append(value)
+    every = sorted(value for measured in bins for value in measured)
+    if is_rate:
+        unit, suffix = f"per {span(bin_s)}", ""
+        values = [float(len(measured)) for measured in bins]
+        summary = f"{len(every)} in all, {len(every) * 3600 / span_s:.3g} an hour"
+    else:
+        unit, suffix, summary = "in seconds", " s", "no values in this span of time"
+        values = [median(measured) if measured else 0.0 for measured in bins]
         if every:
             late = every[math.ceil(0.95 * len(every)) - 1]
             summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, {len(every)} values"
-        values = [median(measured) if measured else 0.0 for measured in bins]
-        return self._plot(title, "in seconds", about, values, summary, " s")
-
-    def _bins(self, samples: Iterable[Sample]) -> list[list[float]]:
-        bins: list[list[float]] = [[] for _ in range(_RATE_BINS)]
-        for time, value in samples:
-            place = int((time - self._start).total_seconds() / self._bin_s)
-            if time >= self._start:
-                bins[min(place, _RATE_BINS - 1)].append(value)
-        return bins
-
-    def _plot(
-        self, title: str, unit: str, about: str, values: list[float], summary: str, suffix: str
-    ) -> Plot:
-        top = max(*values, 1.0)  # at least 1, so that bins without a value divide by no zero
-        width = WIDTH / _RATE_BINS
-        starts = [self._start + timedelta(seconds=self._bin_s * n) for n in range(_RATE_BINS)]
-        texts = [f"{value:.3g}{suffix}" for value in values]
-        bars = tuple(
-            Bar(
-                round(n * width + 1, 2),
-                round(HEIGHT * (1 - value / top), 2),
-                round(width - 2, 2),
-                round(HEIGHT * value / top, 2),
-                f"{starts[n]:%Y-%m-%d %H:%M:%S} UTC: {texts[n]}",
-            )
-            for n, value in enumerate(values)
-            if value
+    top = max(*values, 1.0)  # at least 1, so that bins without a value divide by no zero
+    width = WIDTH / _RATE_BINS
+    starts = [start + timedelta(seconds=bin_s * n) for n in range(_RATE_BINS)]
+    texts = [f"{value:.3g}{suffix}" for value in values]
+    bars = tuple(
+        Bar(
+            round(n * width + 1, 2),
+            round(HEIGHT * (1 - value / top), 2),
+            round(width - 2, 2),
+            round(HEIGHT * value / top, 2),
+            f"{starts[n]:%Y-%m-%d %H:%M:%S} UTC: {texts[n]}",
         )
-        table = tuple((starts[n], texts[n]) for n, value in enumerate(values) if value)
-        end = self._start + timedelta(seconds=self._span)
-        return Plot(
-            title, unit, about, bars, f"{top:.3g}{suffix}", self._start, end, summary, table
-        )
+        for n, value in enumerate(values)
+        if value
+    )
+    table = tuple((starts[n], texts[n]) for n, value in enumerate(values) if value)
+    end = start + timedelta(seconds=span_s)
+    return Plot(title, unit, about, bars, f"{top:.3g}{suffix}", start, end, summary, table)

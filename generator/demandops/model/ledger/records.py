@@ -449,7 +449,7 @@ def ended_override_text(override: Override) -> str:
 
 
 def read_ended_override(files: Mapping[str, str]) -> dict[str, str]:
-    # by name; `stale_markers` lists the files that are not valid for removal
+    # by name; `stale_markers` lists what is not valid, so that it is removed
     ended = {}
     for path, text in files.items():
         name = path.removeprefix(f"{MARKERS_ROOT}/").removesuffix(".yaml")
