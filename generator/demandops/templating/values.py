@@ -131,6 +131,7 @@ def _concatenated(parts: list[Any]) -> str:
     return "".join(map(str, parts))
 
 
+# `~` makes text of anything, so a filter takes its place, whose operands must be data
 class _Concatenations(NodeTransformer):
     def __init__(self, environment: Sandbox) -> None:
         self._environment = environment

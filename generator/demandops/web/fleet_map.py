@@ -131,7 +131,7 @@ def by_place(
     placed: dict[str, NodeCard] = {}
     for id, spot in sorted(spots.items(), key=lambda pair: (-pair[1].y, pair[1].x, pair[0])):
         x = (spot.x - min(xs)) * scale
-        y = (max(ys) - spot.y) * scale
+        y = (max(ys) - spot.y) * scale  # north is at the top
         card = replace(cards[id], x=x, y=y)
         # move it down until it overlaps no other card
         for other in sorted(placed.values(), key=lambda other: other.y):

@@ -425,7 +425,7 @@ class Claim:
         held = self.held.without_topics(gone) if gone else self.held
         return None if held is None else self.with_holders(held, holders)
 
-    def without_node(self, node: str) -> Claim | None:
+    def without_node(self, node: str) -> Claim | None:  # the claim must need the node
         held = self.held.without_node(node)
         if held is None:
             return None
