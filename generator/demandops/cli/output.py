@@ -102,13 +102,14 @@ at_option = click.option(
 )
 
 
-def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
-    from demandops.model.config.base_model import seconds_of  # noqa: PLC0415 - --help must be fast
+def read_by(parse: Callable[[str], Any]) -> Callable[..., Any]:
+    def value(ctx: click.Context, param: click.Parameter, text: str) -> Any:  # noqa: ANN401
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise click.BadParameter(str(error)) from None
 
-    try:
-        return seconds_of(text)
-    except ValueError as error:
-        raise click.BadParameter(str(error)) from None
+    return value
 
 
 def version_lines(data: Mapping[str, Any]) -> list[str]:

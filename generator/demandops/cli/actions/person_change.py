@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import wraps
@@ -26,6 +26,7 @@ from demandops.cli.json_output import (
 )
 from demandops.cli.output import errors, progress
 from demandops.cli.target import (
+    Command,
     dry_run_option,
     hint_to_pull,
     name_options,
@@ -43,8 +44,6 @@ from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published
 from demandops.views.explanations import Entry, override_report
-
-Command = Callable[..., Any]
 
 reason_option = click.option(
     "-m",

@@ -14,9 +14,9 @@ from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, output_option, release_data, show, version_data
 from demandops.cli.output import (
     busy,
-    duration,
     errors,
     progress,
+    read_by,
     version_lines,
     warn_of_not_rendered,
 )
@@ -28,7 +28,7 @@ from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.release_status import OldBootstrap, Orphan, old_bootstraps, orphans, statuses
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.warnings import MissingInput, missing_inputs
-from demandops.model.config.base_model import duration_text
+from demandops.model.config.base_model import duration_text, seconds_of
 from demandops.repo import reader
 from demandops.repo.git.repository import RemoteAway
 from demandops.repo.load.last_valid_config import Problem
@@ -53,7 +53,7 @@ _PATIENCE_S = 10
     metavar="DURATION",
     default="10m",
     show_default=True,
-    callback=duration,
+    callback=read_by(seconds_of),
     help="How long --wait waits: 90s, 10m or 1h30m.",
 )
 @click.option(
@@ -61,7 +61,7 @@ _PATIENCE_S = 10
     metavar="DURATION",
     default=duration_text(_PATIENCE_S),
     show_default=True,
-    callback=duration,
+    callback=read_by(seconds_of),
     help="How long a cluster may take to answer. All clusters are asked at the same time.",
 )
 @output_option
