@@ -7,7 +7,7 @@ import shlex
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import replace
-from datetime import datetime, timezone
+from datetime import timezone
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -250,7 +250,12 @@ class Site:
         )
         self._templates.filters |= {
             "when": lambda at: escaped(f"{at.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S UTC}"),
-            "clock": _clock,
+            # the date only if it is not today's
+            "clock": lambda at, now: at.astimezone(timezone.utc).strftime(
+                "%H:%M:%S UTC"
+                if at.astimezone(timezone.utc).date() == now.astimezone(timezone.utc).date()
+                else "%Y-%m-%d %H:%M UTC"
+            ),
             "ago": relative,
             "iso": lambda at: f"{at.astimezone(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
             "sh": shlex.quote,
@@ -389,12 +394,6 @@ def _is_foreign(headers: Headers) -> bool:
         and "sec-purpose" not in headers
     )
     return site not in ("same-origin", "none") and not is_link
-
-
-def _clock(at: datetime, now: datetime) -> str:
-    # the date only if it is not today's
-    at, today = at.astimezone(timezone.utc), now.astimezone(timezone.utc).date()
-    return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")
 
 
 # ---- the web server ----
