@@ -183,11 +183,6 @@ def _from_context(field: str) -> Callable[[], str | None]:
     return default
 
 
-def _remember_name(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
-    if value is not None:
-        ctx.meta[_NAME] = value
-
-
 def context_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
     return [name for name in read_contexts().contexts if name.startswith(incomplete)]
 
@@ -197,7 +192,7 @@ _context_option = click.option(
     metavar="NAME",
     expose_value=False,
     is_eager=True,
-    callback=_remember_name,
+    callback=lambda ctx, param, value: ctx.meta.update({_NAME: value} if value is not None else {}),
     shell_complete=context_names,
     help="The context to use, instead of the current one (docs/commands.md).",
 )

@@ -49,18 +49,12 @@ def describe(schema: dict[str, Any], root: str) -> None:
             if entry:
                 description, *example = entry
                 field["description"] = description
-                field["examples"] = example or _only_values(field)
-
-
-def _only_values(field: dict[str, Any]) -> list[Any]:
-    for part in (field, *field.get("anyOf", ())):
-        if "const" in part:
-            return [part["const"]]
-        if "enum" in part:
-            return [part["enum"][-1]]
-        if part.get("type") == "boolean":
-            return [True]
-    return []
+                only = (
+                    [part["const"]] if "const" in part else part.get("enum", [True])[-1:]
+                    for part in (field, *field.get("anyOf", ()))
+                    if "const" in part or "enum" in part or part.get("type") == "boolean"
+                )
+                field["examples"] = example or next(only, [])
 
 
 @lru_cache(maxsize=1)

@@ -107,14 +107,14 @@ def readable_by(parse: Callable[[str], object]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _hidden(value: str) -> str:
-    control = control_character(re.sub(r"[\n\t]", " ", value))
-    return control and f"{quoted(value)} has the control character {control}; remove it"
-
-
 # A validator that rejects control characters, and characters that reorder text. Line breaks and
 # tabs are valid.
-Visible = without(_hidden)
+Visible = without(
+    lambda value: (
+        (control := control_character(re.sub(r"[\n\t]", " ", value)))
+        and f"{quoted(value)} has the control character {control}; remove it"
+    )
+)
 
 # Any text that `Visible` accepts
 Text = Annotated[str, Visible]

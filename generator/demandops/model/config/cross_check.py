@@ -47,7 +47,18 @@ _INDEXED = ("nodes", "services", "applications", "connections", "appdefs")
 def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
     contests = defaultdict[tuple[int, tuple[str, ...]], list[tuple[Override, str]]](list)
     for override in by_rank(config.overrides.values()):
-        for what, token in _settings(override):
+        # (what, token) for all that the override sets; another token contradicts it
+        settings: list[tuple[tuple[str, ...], str]] = [
+            ((name,), str(value))
+            for name in _SINGLE
+            if (value := getattr(override, name)) is not None
+        ]
+        settings += _leaves(("values",), override.values or {})
+        pins = (override.images or {}).items()
+        settings += ((("images", name), pin.model_dump_json()) for name, pin in pins)
+        if override.hold or any(name in _FROZEN for name in override.effects()):
+            settings.append((("hold",), str(override.hold)))
+        for what, token in settings:
             contests[override.priority, what].append((override, token))
     rivals = defaultdict[str, dict[str, Override]](dict)
     for contenders in contests.values():
@@ -63,18 +74,6 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
                 f"is {override.priority}, as in {rival.path}, and both overrides may set {names} "
                 "of the same release; change one of the priorities, or select different releases",
             )
-
-
-def _settings(override: Override) -> Iterator[tuple[tuple[str, ...], str]]:
-    # (what, token) for all that an override sets; another token contradicts it
-    for name in _SINGLE:
-        if (value := getattr(override, name)) is not None:
-            yield (name,), str(value)
-    yield from _leaves(("values",), override.values or {})
-    for name, pin in (override.images or {}).items():
-        yield ("images", name), pin.model_dump_json()
-    if override.hold or any(name in _FROZEN for name in override.effects()):
-        yield ("hold",), str(override.hold)
 
 
 def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, ...], str]]:
