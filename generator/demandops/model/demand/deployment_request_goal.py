@@ -119,10 +119,30 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
         return None, [_not_a_mapping()]
     goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
     faulty = {fault.field for fault in faults}
-    demanded = [
-        _application(f"apps[{index}]", app, appdef_by_type(app.type))
-        for index, app in enumerate(goal.apps)
-    ]
+    demanded: list[Demanded] = []
+    for index, app in enumerate(goal.apps):
+        appdef, body = appdef_by_type(app.type), app.object_detection_fusion_app
+        wire = appdef.deployment_request if appdef else None
+        roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
+        inputs: dict[str, tuple[InputTopic, ...]] = {}
+        for name in ("ego_data_topics", "pointcloud_topics"):
+            topics: list[WireTopic] = getattr(body, name)
+            role = roles.get(name) or name
+            if topics:
+                # the appdef may give both lists to one role
+                inputs[role] = inputs.get(role, ()) + tuple(
+                    InputTopic(absolute_topic(topic.topic_name), topic.source_node_id, topic.type)
+                    for topic in topics
+                )
+        application = Application(
+            id=app.header.id,
+            appdef=appdef.name if appdef else f"#{app.type}",
+            node=app.header.node_id,
+            inputs=MappingProxyType(inputs),
+        )
+        lists = {role: name for name, role in roles.items()}
+        place = partial(_application_field, f"apps[{index}]", lists)
+        demanded.append(Demanded(application, tuple(dict.fromkeys(body.requester_ids)), place))
     for index, connection in enumerate(goal.connections):
         where = f"connections[{index}]"
         # an invalid type becomes None, so that nothing is checked that depends on the type
@@ -171,31 +191,3 @@ def _not_a_mapping() -> Fault:
         "or with id, apps, connections and shutdown"
     )
     return fault("", message)
-
-
-def _application(
-    where: str, app: WireApplication, appdef: ApplicationDefinition | None
-) -> Demanded:
-    body = app.object_detection_fusion_app
-    wire = appdef.deployment_request if appdef else None
-    roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
-    inputs: dict[str, tuple[InputTopic, ...]] = {}
-    for name in ("ego_data_topics", "pointcloud_topics"):
-        topics: list[WireTopic] = getattr(body, name)
-        role = roles.get(name) or name
-        if topics:
-            # the appdef may give both lists to one role
-            inputs[role] = inputs.get(role, ()) + tuple(
-                InputTopic(absolute_topic(topic.topic_name), topic.source_node_id, topic.type)
-                for topic in topics
-            )
-    return Demanded(
-        Application(
-            id=app.header.id,
-            appdef=appdef.name if appdef else f"#{app.type}",
-            node=app.header.node_id,
-            inputs=MappingProxyType(inputs),
-        ),
-        tuple(dict.fromkeys(body.requester_ids)),
-        partial(_application_field, where, {role: name for name, role in roles.items()}),
-    )
