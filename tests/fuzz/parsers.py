@@ -241,15 +241,15 @@ def waiting_demand(data: bytes) -> None:
 
 def contexts_file(data: bytes) -> None:
     os.environ["XDG_CONFIG_HOME"] = str(_folder())
-    target.path().parent.mkdir(exist_ok=True)
-    target.path().write_bytes(data)
+    target.contexts_file().parent.mkdir(exist_ok=True)
+    target.contexts_file().write_bytes(data)
     try:
-        content = target.read()
+        content = target.read_contexts()
     except InvalidInput as error:
         _told(error)
         return
-    target.write(content)
-    assert target.read() == content
+    target.write_contexts(content)
+    assert target.read_contexts() == content
 
 
 def detector_rules(data: bytes) -> None:

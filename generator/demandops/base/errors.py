@@ -48,7 +48,6 @@ class Fault:
 
     @property
     def place(self) -> str:
-        """``inventory/nodes.yaml:12``, as far as file and line are known."""
         return place_text(self.file, self.line)
 
     def within(self, file: str) -> Fault:
@@ -56,7 +55,7 @@ class Fault:
 
 
 def place_text(file: str, line: int | None) -> str:
-    """Return ``file:line``, which editors and terminals turn into a link."""
+    # editors and terminals turn `file:line` into a link
     if line is None:
         return file
     return f"{file}:{line}" if file else f"line {line}"
@@ -170,8 +169,7 @@ def fault(field: str, message: str, *, code: str = "invalid", line: int | None =
     return Fault(code=code, field=field, message=message, line=line)
 
 
-def field_path(location: tuple[int | str, ...]) -> str:
-    """Return ``nodes[3].cluster`` for ``("nodes", 3, "cluster")``."""
+def field_path(location: tuple[int | str, ...]) -> str:  # like `nodes[3].cluster`
     path = ""
     for part in location:
         if isinstance(part, int):
@@ -186,7 +184,7 @@ def internal(error: Exception) -> StateRepoError:
 
 
 def closest(word: str, words: Iterable[str]) -> str | None:
-    """Return one of ``words`` that is similar to ``word``; among many it may be missed."""
+    # among many words, one that is similar may be missed
     names = tuple(words)
     forwards, backwards = _orders(names)
     compared = forwards

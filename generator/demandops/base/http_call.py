@@ -43,16 +43,10 @@ class NoAnswer(DemandOpsError):
 
 @dataclass(frozen=True, slots=True)
 class HttpAnswer:
-    """An answer: its status, the status in words, and the body.
-
-    ``asks_to_wait`` says whether the service asks to call again later, mostly because it got too
-    many calls.
-    """
-
     status: int
-    reason: str
+    reason: str  # the status in words
     body: bytes
-    asks_to_wait: bool = False
+    asks_to_wait: bool = False  # mostly because the service got too many calls
 
     @property
     def is_success(self) -> bool:
@@ -64,8 +58,8 @@ def call(
 ) -> HttpAnswer:
     """Send a request and return the answer, whatever its status.
 
-    ``timeout`` is how many seconds it may take to connect, to send, and to receive each part of the
-    answer. An answer that is not complete within twice this time is refused.
+    It may take ``timeout`` seconds to connect, to send, and to receive each part of the answer, and
+    twice this time in all.
     """
     import httpx  # noqa: PLC0415 - slow (a tenth of a second), so only on use
 

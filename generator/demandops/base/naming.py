@@ -22,7 +22,6 @@ from demandops.base.quoting import is_visible, quoted
 # for a release name. Topic names are made as the reference makes them, so the ids ``a/b`` and
 # ``a-b`` both give ``a_b`` in a topic name.
 
-
 MAX_NAME = 53  # Helm's limit for a release name
 # 48 bits: a longer hash would only raise the price of a search, and people read names
 _HASH = 12
@@ -73,8 +72,7 @@ def object_name(prefix: str, *ids: str) -> str:
 def topic_part(id: str, extra: str = "") -> str:
     """Return an id as part of a topic name: ``edge/lane-view`` gives ``edge_lane_view``.
 
-    ``extra`` distinguishes names that are made from the same id, for example for two point clouds
-    of one source; such a name has a hash.
+    ``extra`` distinguishes names that are made from the same id; such a name has a hash.
     """
     plain = re.sub("[-/]", "_", id)
     # exactly the reference's name, so that subscribers of a fleet that moves over still hear it
@@ -90,7 +88,7 @@ def ros_name(release: str) -> str:
     return release.replace("-", "_")  # ROS forbids dashes in the names of nodes
 
 
-# ---- rules for ids, topic names and message types, and how messages explain a field's pattern ----
+# ---- rules for ids, topic names and message types ----
 
 # The maximum length of an id, in characters. A file or an object that is named after a long id has
 # a shortened name with a hash.
@@ -108,13 +106,11 @@ _BIDI = frozenset("\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
 
 
 def absolute_topic(topic: str) -> str:
-    """Return a topic name as ROS resolves it in the root namespace: ``scan`` gives ``/scan``."""
     # an empty or private name (`~…`) stays as it is, so that `topic_problem` refuses it
     return topic if topic.startswith(("/", "~")) or not topic else f"/{topic}"
 
 
-def control_character(text: str) -> str:
-    """Return the name of a text's first control character, like ``U+202E``, or an empty text."""
+def control_character(text: str) -> str:  # the first one, like `U+202E`
     if text.isprintable():  # Python calls no such character printable
         return ""
     for char in text:
@@ -124,7 +120,6 @@ def control_character(text: str) -> str:
 
 
 def id_problem(value: str) -> str:
-    """Return what is wrong with an id, or an empty string."""
     if not value:
         return "is empty; give an id"
     if len(value) > MAX_ID:
@@ -143,7 +138,6 @@ def id_problem(value: str) -> str:
 
 
 def topic_problem(name: str) -> str:
-    """Return why ROS 2 (rmw) rejects a fully qualified topic name, or an empty string."""
     if not name:
         return "is empty; give a topic name"
     if name.startswith("~"):
@@ -159,7 +153,6 @@ def topic_problem(name: str) -> str:
 
 
 def message_type_problem(name: str) -> str:
-    """Return what is wrong with the name of a ROS 2 message type, or an empty string."""
     if _MESSAGE_TYPE.fullmatch(name):
         return ""
     return f"{quoted(name)} is not a message type; write it like std_msgs/msg/String"

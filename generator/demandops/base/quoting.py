@@ -21,12 +21,10 @@ _HIDDEN = re.compile(f"[{_INVISIBLE}\U0001d159\U000e0100-\U000e01ef]")
 
 
 def is_visible(text: str) -> bool:
-    """Return whether text is one line without control, bidirectional or invisible characters."""
     return text.isprintable() and not _HIDDEN.search(text)
 
 
-def escaped(text: str, kept: str = "") -> str:
-    """Return text with an escape like ``\\u202e`` for what is neither visible nor ``kept``."""
+def escaped(text: str, kept: str = "") -> str:  # like `\u202e`
     if is_visible(text):
         return text
     return "".join(
@@ -68,7 +66,6 @@ def one_line(text: str, most: int = LONGEST_LINE) -> str:
 
 
 def lines(text: str) -> str:
-    """Return text, escaped except for line breaks and tabs."""
     return escaped(text, kept="\n\t")
 
 
@@ -91,7 +88,7 @@ def json_escaped(text: str) -> str:
 
 
 class OneLineFormatter(logging.Formatter):
-    """Formats a log record as one line. A traceback follows on lines of its own."""
+    """A traceback follows on lines of its own."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         record.message = one_line("; ".join(record.message.splitlines()))

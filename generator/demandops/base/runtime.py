@@ -31,14 +31,11 @@ _LONGEST_REASON = 300
 
 
 class Runtime:
-    """Time, random numbers and threads of this machine; a test's subclass replaces them.
-
-    ``unsound`` is the error because of which the process must end, or None. ``when_unsound`` is
-    called after such an error.
-    """
+    """Time, random numbers and threads of this machine; a test's subclass replaces them."""
 
     def __init__(self) -> None:
         self._failures: dict[str, tuple[str, float]] = {}
+        # the error because of which the process must end, and what is called after it
         self.unsound: Unsound | None = None
         self.when_unsound: Callable[[], object] = lambda: None
 
@@ -84,13 +81,12 @@ class Runtime:
 
     @property
     def failures(self) -> dict[str, str]:
-        """The last failure of each thread that has not recovered since, by the thread's name."""
+        # the last one of each thread that has not recovered since
         now = self.monotonic()
         failures = sorted(self._failures.items())
         return {name: text for name, (text, at) in failures if now - at < _STEADY_S}
 
     def failed(self, name: str, error: Exception) -> None:
-        """Record and log that the work of a thread failed."""
         # a fault that lasts, such as a host that is down, must not fill the log
         is_known = self.failures.get(name) == _reason(error)
         self._failures[name] = (_reason(error), self.monotonic())

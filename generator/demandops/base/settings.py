@@ -48,8 +48,7 @@ GENERATED_ROOTS = ("bootstrap", "clusters")
 SCHEMAS_ROOT = "schemas"
 
 
-def modeline(path: str, schema: str) -> str:
-    """Return the comment line that makes editors check a file of the state repo with a schema."""
+def modeline(path: str, schema: str) -> str:  # with it, editors check a file with a schema
     up = "../" * path.count("/")
     return f"# yaml-language-server: $schema={up}{SCHEMAS_ROOT}/{schema}.json\n"
 
@@ -62,7 +61,6 @@ _CHECKOUT = _PACKAGE.parents[1]
 
 
 def data_folder(name: str) -> Path:
-    """Return the folder of packaged data: ``templates``, ``appdefs`` or ``skeleton``."""
     packaged = _PACKAGE / "_data" / name
     if packaged.is_dir():  # in an installed wheel
         return packaged
@@ -71,7 +69,6 @@ def data_folder(name: str) -> Path:
 
 
 def documentation() -> Path | None:
-    """Return the folder of the documentation's site, or None if it was not built."""
     # the wheel of a published version contains the site; in a checkout, `make docs` builds it
     folders = (_PACKAGE / "_data" / "docs", _CHECKOUT / "build" / "site")
     return next((folder for folder in folders if (folder / "index.html").is_file()), None)
@@ -82,14 +79,12 @@ def forge_token_file() -> Path | None:
     return Path(named).expanduser() if named else None
 
 
-def alive_file() -> Path | None:
-    """Return the file that a generator touches as long as it works, or None."""
+def alive_file() -> Path | None:  # a generator touches it as long as it works
     named = os.environ.get("DEMANDOPS_ALIVE_FILE")
     return Path(named).expanduser() if named else None
 
 
-def data_home(state_repo: str) -> Path:
-    """Return the folder of the generator's journal and clone for one state repo."""
+def data_home(state_repo: str) -> Path:  # for the generator's journal and clone
     if Path(state_repo).exists():  # all spellings of a path give the same folder
         state_repo = str(Path(state_repo).resolve())
     root: str | Path | None = os.environ.get("DEMANDOPS_DATA_HOME")

@@ -48,12 +48,10 @@ _MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, Recursi
 _EXPONENT = re.compile(r'"(?:[^"\\]|\\.)*"|(?<![0-9.])([0-9]+)(?=e)')
 _UNPRINTABLE = re.compile("[\x7f-\x9f\u2028\u2029\ud800-\udfff\ufeff\ufffe\uffff]")
 
-
 _TAG = "tag:yaml.org,2002:"
 _TEXT = f"{_TAG}str"
 _RESOLVER, _CONSTRUCTOR = yaml.resolver.Resolver(), yaml.constructor.SafeConstructor()
 _REPRESENTER = yaml.representer.SafeRepresenter()
-
 
 _Result = TypeVar("_Result")
 _LONGEST_WORD = 1_000
@@ -99,11 +97,9 @@ class _Misread(Exception):
 
 
 class _Parser:
-    """Builds the values of a text in one pass over PyYAML's events.
+    """Builds the values of a text in one pass over PyYAML's events."""
 
-    ``lists`` maps each placeholder (:data:`_STAND_IN`) in the text to the list that it replaces.
-    """
-
+    # `lists` maps each placeholder (`_STAND_IN`) in the text to the list that it replaces
     def __init__(self, text: str, lists: Mapping[str, list[str]] = MappingProxyType({})) -> None:
         self._next, self._lists = LOADER(text).get_event, dict(lists)
 
@@ -197,7 +193,7 @@ def _number(value: object) -> str:
 
 @_cached
 def _text(text: str) -> yaml.ScalarEvent:
-    """Return PyYAML's event that writes a text, in quotes if a parser could misread the text."""
+    """Return PyYAML's event that writes a text, in quotes if a parser could misread it."""
     if _PLAIN.fullmatch(text) and text.lower() not in _WORDS:
         return yaml.ScalarEvent(None, None, (True, False), text)
     # a literal block has no escapes, and with another begin or end it would need an indicator
@@ -213,7 +209,6 @@ def _text(text: str) -> yaml.ScalarEvent:
 
 
 def short_repr(value: object) -> str:
-    """Return a short form of any value for a message, as YAML or Python writes it."""
     if value is None or isinstance(value, bool):
         return json.dumps(value)
     try:
@@ -240,10 +235,7 @@ def _strict(file: str) -> Iterator[None]:
 
 
 def load_all(text: str, file: str = "", most: float = math.inf) -> Iterator[Any]:
-    """Yield the documents of ``text``; more than ``most`` are an error.
-
-    The error may come only after some documents.
-    """
+    # an error may come only after some documents
     if len(text) > MAX_LENGTH:
         message = f"has {len(text)} characters; at most {MAX_LENGTH} are allowed"
         raise InvalidInput.at("", message, file=file)
@@ -261,13 +253,11 @@ _LONG = 200
 # The prefix of the stand-ins: words that replace long lists while PyYAML reads the other text
 _STAND_IN = "demandops-list"
 
-
 # How many characters a text may have for its value to be cached
 _MOST_CACHED = 10_000
 
 
 def load(text: str, file: str = "") -> Any:  # noqa: ANN401 - raw YAML, which models then parse
-    """Return the only document of ``text``, or ``None`` if ``text`` has no document."""
     try:
         if len(text) > _MOST_CACHED:
             return _only_document(text)
@@ -305,7 +295,6 @@ def _only_document(text: str) -> Any:  # noqa: ANN401
 
 
 def dump(data: Mapping[str, Any]) -> str:
-    """Return ``data`` as block YAML, in its order."""
     try:
         return _block(data, "").lstrip("\n ") + "\n"
     except _NotSimple:
@@ -324,8 +313,8 @@ _LONGEST_KEY = 100  # PyYAML writes longer ones (128) on a line of their own, af
 
 
 def _block(value: Any, indent: str) -> str:  # noqa: ANN401
-    """Return the YAML text that follows ``key:`` or ``-``; further lines begin with ``indent``."""
-    # PyYAML writes the same text, but takes ten times as long
+    # PyYAML writes the same text, but takes ten times as long. The first line follows `key:` or
+    # `-`, and further lines begin with `indent`.
     if isinstance(value, str):
         return f" {_simple_text(value)}"
     inner = f"{indent}  "
@@ -358,8 +347,7 @@ def _simple_text(text: str) -> str:
 def set_key(text: str, key: str, value: object) -> str:
     """Return a file's text with one top-level key set; the rest stays, including comments.
 
-    A text, number, truth value or null is replaced in place. A missing key is added at the end. A
-    form that does not permit this, such as a list, is a fault.
+    A form that does not permit this, such as a list, is a fault.
     """
     with _strict(""):
         node = yaml.compose(text, Loader=yaml.SafeLoader)
@@ -384,11 +372,7 @@ def set_key(text: str, key: str, value: object) -> str:
 
 
 def to_json(value: object) -> str:
-    """Return ``value`` as JSON that is also valid YAML. ``{{ … }}`` in a template writes this text.
-
-    Raises TypeError for a part that is no data, for example a method, and ValueError for a number
-    that is infinite or not a number.
-    """
+    """Return JSON that is also valid YAML; ``{{ … }}`` in a template writes this text."""
     text = _JSON.encode(value)
     if "e-" in text or "e+" in text:
         text = _EXPONENT.sub(lambda match: f"{match[1]}.0" if match[1] else match[0], text)
@@ -396,7 +380,6 @@ def to_json(value: object) -> str:
 
 
 def not_writable(value: object) -> str:
-    """Return the message about a value that a template must not write, because it is no data."""
     kind = getattr(type(value), "__name__", "object")
     if callable(value):
         kind += "; add '()' to call it"
@@ -421,11 +404,7 @@ def faults_in(error: InvalidInput, file: str) -> list[Fault]:
 
 
 def lines(text: str, document: int = 0) -> dict[str, int]:
-    """Return the line of each field of a document; a field is a path like ``nodes[3].cluster``.
-
-    ``document`` is the index of the document in the text. The result is empty if the text has no
-    such document, or if :func:`load_all` refuses the text.
-    """
+    """Return the line of each field of a document; empty if :func:`load_all` refuses the text."""
     by_field: dict[str, int] = {}
 
     def add(node: yaml.Node | None, path: str) -> None:
@@ -455,14 +434,12 @@ class FieldLines:
         self._lines: dict[str, Mapping[str, int]] = {}
 
     def of(self, file: str, field: str) -> int | None:
-        """Return the line of a field, as :func:`nearest` finds it in the file."""
         if field and file not in self._lines:
             self._lines[file] = lines(self._text_of(file) or "")
         return nearest(field, self._lines.get(file, {}))
 
 
 def nearest(field: str, lines: Mapping[str, int]) -> int | None:
-    """Return the line of a field or else of the nearest part that contains it, if there is one."""
     # the field of a fault may be missing in the file, or be only a part of a text
     while field and field not in lines:
         field = field[: max(field.rfind("."), field.rfind("["), 0)]
@@ -470,7 +447,6 @@ def nearest(field: str, lines: Mapping[str, int]) -> int | None:
 
 
 def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) -> list[Fault]:
-    """Return the faults, each with its line; a fault that has a line keeps it."""
     lines = FieldLines(text_of)
     return [
         replace(fault, line=fault.line or lines.of(fault.file, fault.field)) for fault in faults
@@ -479,18 +455,17 @@ def with_lines(faults: Iterable[Fault], text_of: Callable[[str], str | None]) ->
 
 @contextmanager
 def located_in(text: str) -> Iterator[None]:
-    """Add the line in ``text`` to each fault that the block raises."""
     try:
         yield
     except InvalidInput as error:
         raise InvalidInput(with_lines(error.faults, lambda _: text)) from None
 
 
-# ---- reads files that a person names for a command or for the service: texts and secrets ----
+# ---- files that a person names for a command or for the service: texts and secrets ----
 
 
 def read_input(file: str | Path) -> tuple[str, str]:
-    """Return a file's name, as messages give it, and its text. ``-`` is standard input."""
+    # the name as messages give it; `-` is standard input
     name = "standard input" if file == "-" else str(file)
     try:
         data = sys.stdin.buffer.read() if file == "-" else Path(file).read_bytes()
@@ -503,7 +478,7 @@ def read_input(file: str | Path) -> tuple[str, str]:
 
 
 def read_secret(path: Path, *, private: bool = False) -> bytes:
-    """Return the secret in a file; ``private`` refuses a file on which everybody has a right."""
+    # `private` refuses a file on which everybody has a right
     secret = b""
     try:
         # the group may have rights: a Secret's volume in Kubernetes gives the file to fsGroup

@@ -66,16 +66,15 @@ output_option = output_formats("text", "json")
 
 
 def show(output: str, data: object, text: Iterable[str | Table]) -> None:
-    """Print ``data`` as JSON if ``output`` is ``json``; otherwise print the lines and tables."""
     if output == "json":
         print_json(data)
         return
     printed: list[str] = []
-    for each in text:
-        if isinstance(each, Table):
-            printed += each.lines(terminal_width(), painted)
+    for part in text:
+        if isinstance(part, Table):
+            printed += part.lines(terminal_width(), painted)
         else:
-            printed += lines(each).split("\n")
+            printed += lines(part).split("\n")
     print_lines(printed)
 
 
@@ -84,9 +83,8 @@ def print_json(data: object) -> None:
 
 
 def faults_of(error: DemandOpsError) -> list[Json]:
-    """Return an error's faults as JSON data; an error without faults becomes one fault."""
     faults = error.faults if isinstance(error, InvalidInput) else [fault("", str(error))]
-    return [asdict(each) for each in dict.fromkeys(faults)]
+    return [asdict(fault) for fault in dict.fromkeys(faults)]
 
 
 def time_data(moment: datetime | None) -> str | None:
@@ -94,7 +92,6 @@ def time_data(moment: datetime | None) -> str | None:
 
 
 def time_text(time: str) -> str:
-    """Return a time of the JSON output in a form for people, without fractions of a second."""
     return f"{time[:19].rstrip('Z').replace('T', ' ')} UTC"
 
 
@@ -153,7 +150,6 @@ def version_data(release: Release, ledger: Ledger) -> Json:
 
 
 def override_data(override: Override, effects: Iterable[str] | None = None) -> Json:
-    """Return an override as JSON data, with all its effects or only those in ``effects``."""
     names = override.effects() if effects is None else effects
     return {
         "name": override.name,
@@ -167,7 +163,7 @@ def override_data(override: Override, effects: Iterable[str] | None = None) -> J
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401
-    """Return an effect's value as the override's file has it, including the nulls of a patch."""
+    # as the override's file has it, including the nulls of a patch
     if isinstance(value, dict):
         return {name: _plain(item) for name, item in value.items()}
     return value.model_dump(exclude_none=True) if isinstance(value, ImagePin) else value

@@ -63,11 +63,9 @@ COMMANDS = {
     "why": ("views.why", "Explain why something runs or ran."),
 }
 
-
 # These commands run until they are stopped. They log or fill the screen, so they do not show the
 # progress of git operations.
 _LONG_RUNNING = ("detect", "parameter-sync", "serve", "watch", "web")
-
 
 # Errors about a file: its path is wrong, or permissions are missing.
 _OF_A_PATH = (FileExistsError, IsADirectoryError, NotADirectoryError, PermissionError)
@@ -82,12 +80,11 @@ class ExitCode(IntEnum):
 
 
 def load(name: str) -> click.Command:
-    """Import and return a command; a ClickException says if git or a Python package is missing."""
     module = COMMANDS[name][0]
     ros = module.split(".")[0] == "demandops_ros"
     try:
-        found = import_module(module if ros else f"demandops.cli.{module}")
-        command: click.Command = getattr(found, name.replace("-", "_"))
+        imported = import_module(module if ros else f"demandops.cli.{module}")
+        command: click.Command = getattr(imported, name.replace("-", "_"))
     except ModuleNotFoundError as error:
         missing = str(error.name).split(".")[0]
         if missing in ("demandops", "demandops_ros"):
@@ -158,8 +155,8 @@ def run(args: list[str] | None = None) -> int:
         errors.print(f"error: {error}")
         return ExitCode.PROGRAM_ERROR
     except DemandOpsError as error:
-        for each in error.faults if isinstance(error, InvalidInput) else [error]:
-            errors.print(f"error: {each}")
+        for fault in error.faults if isinstance(error, InvalidInput) else [error]:
+            errors.print(f"error: {fault}")
         return ExitCode.USER_ERROR
     except BrokenPipeError:  # `demandops log | head`; Python would report it again at the exit
         sys.stderr.close()

@@ -30,12 +30,10 @@ Progress = Callable[[int, int], None]
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a console for stdout or stderr; elsewhere than on a terminal, without colors."""
+    """Return a console for stdout or stderr."""
     from rich.console import Console  # noqa: PLC0415
 
     class QuotingConsole(Console):
-        """A console that escapes control characters, in lines and in tables."""
-
         def render_str(self, text: str, **how: Any) -> Text:  # noqa: ANN401 - as rich has it
             return super().render_str(quoting.lines(text), **how)
 
@@ -55,7 +53,6 @@ def terminal_width() -> int | None:
 
 
 def painted(text: str, style: str) -> str:
-    """Return text in a style (``bold``, ``dim`` or a color), or unchanged without colors."""
     # NO_COLOR is a convention of many programs: https://no-color.org
     colors = sys.stdout.isatty() and not os.environ.get("NO_COLOR")
     if not colors or not style or os.environ.get("TERM") == "dumb":
@@ -66,7 +63,6 @@ def painted(text: str, style: str) -> str:
 
 
 def print_lines(lines: list[str]) -> None:
-    """Print lines; use a pager if the terminal has too few rows for them."""
     text = "".join(f"{line}\n" for line in lines)
     is_long = len(lines) >= shutil.get_terminal_size().lines
     pager = os.environ.get("PAGER")
@@ -106,20 +102,18 @@ at_option = click.option(
 )
 
 
-def duration(ctx: click.Context, param: click.Parameter, text: str) -> int:
-    from demandops.model.config.base_model import seconds_of  # noqa: PLC0415 - --help must be fast
+def read_by(parse: Callable[[str], Any]) -> Callable[..., Any]:
+    def value(ctx: click.Context, param: click.Parameter, text: str) -> Any:  # noqa: ANN401
+        try:
+            return parse(text)
+        except ValueError as error:
+            raise click.BadParameter(str(error)) from None
 
-    try:
-        return seconds_of(text)
-    except ValueError as error:
-        raise click.BadParameter(str(error)) from None
+    return value
 
 
 def version_lines(data: Mapping[str, Any]) -> list[str]:
-    """Return a line with a release's version, and a line for each version that demands ask for.
-
-    ``data`` has the form that :func:`.json_output.version_data` returns.
-    """
+    # of what `json_output.version_data` returns
     asked = data["versions_asked"].items()
     return [
         data["application_version"] or data["version"] or "",
@@ -127,8 +121,7 @@ def version_lines(data: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def show_slow(text: str) -> None:
-    """Show on a terminal which slow operation is in progress; an empty text clears it."""
+def show_slow(text: str) -> None:  # an empty text clears the line
     if sys.stderr.isatty():
         sys.stderr.write(f"\r\x1b[2K{quoting.lines(text)}")
         sys.stderr.flush()
@@ -138,7 +131,7 @@ def show_slow(text: str) -> None:
 def busy(title: str) -> Iterator[Callable[[str], None]]:
     """Show the title and the elapsed seconds on a terminal if the block takes a second or longer.
 
-    Yield a function that replaces the title.
+    The function that it yields replaces the title.
     """
 
     def say(text: str) -> None:

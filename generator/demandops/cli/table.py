@@ -25,11 +25,10 @@ Cell = str | Sequence[str]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column: its title, and how soon a narrow table leaves it out.
+    """A column of a table.
 
-    Columns get room in the order of ``rank``, from low to high. A column that does not fit is left
-    out, even if a narrower one of a higher rank fits. A column of rank 0 is never left out. If
-    ``wraps``, its text may wrap between words.
+    Columns get room in the order of ``rank``. One that does not fit is left out, even if a narrower
+    one of a higher rank fits. A column of rank 0 is never left out.
     """
 
     title: str
@@ -39,8 +38,6 @@ class Column:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """A table: its columns, and its rows with one cell for each column."""
-
     columns: Sequence[Column]
     rows: Sequence[Sequence[Cell]]
     title: str = ""
@@ -51,9 +48,8 @@ class Table:
     whole: bool = False
 
     def lines(self, width: int | None, style: Callable[[str, str], str] | None = None) -> list[str]:
-        """Return the table as lines.
+        """Return the table as lines; without a ``width``, one for each row, however long.
 
-        ``width`` is the width of the terminal; None makes one line for each row, however long.
         ``style`` returns a text in a style (``bold``, ``dim`` or a color); None is plain text.
         """
         width = None if self.whole else width
@@ -71,7 +67,17 @@ class Table:
         ]
         if width is None:
             rows = [[[", ".join(filter(None, cell))] for cell in row] for row in rows]
-        shown = range(len(self.columns)) if width is None else self._fitting(rows, width)
+        shown = list(range(len(self.columns)))
+        if width is not None:
+            used = [at for at in shown if any(any(row[at]) for row in rows)]
+            shown = [at for at in shown if self.columns[at].rank == 0]
+            room = width - sum(self._least(rows, at) + len(_GAP) for at in shown) + len(_GAP)
+            for at in sorted(set(used) - set(shown), key=lambda at: (self.columns[at].rank, at)):
+                needed = self._least(rows, at) + len(_GAP)
+                if needed <= room:
+                    shown.append(at)
+                    room -= needed
+            shown.sort()
         widths = natural = [self._natural(rows, at) for at in shown]
         if width is not None:
             widths = [self._least(rows, at) for at in shown]
@@ -95,24 +101,11 @@ class Table:
             lines += [paint(line, "dim") for line in _wrapped([note], width or 0)]
         return [*title, *lines]
 
-    def _fitting(self, rows: list[list[list[str]]], width: int) -> list[int]:
-        """Return the indexes of the columns to show, in ascending order."""
-        used = [at for at in range(len(self.columns)) if any(any(row[at]) for row in rows)]
-        shown = [at for at, column in enumerate(self.columns) if column.rank == 0]
-        room = width - sum(self._least(rows, at) + len(_GAP) for at in shown) + len(_GAP)
-        for at in sorted(set(used) - set(shown), key=lambda at: (self.columns[at].rank, at)):
-            needed = self._least(rows, at) + len(_GAP)
-            if needed <= room:
-                shown.append(at)
-                room -= needed
-        return sorted(shown)
-
     def _natural(self, rows: list[list[list[str]]], at: int) -> int:
         lengths = [cell_len(line) for row in rows for line in row[at]]
         return max([cell_len(self.columns[at].title), *lengths])
 
     def _least(self, rows: list[list[list[str]]], at: int) -> int:
-        """Return the smallest width of the column with index ``at`` that cuts no word."""
         natural = self._natural(rows, at)
         if not self.columns[at].wraps:
             return natural
@@ -122,7 +115,6 @@ class Table:
 
 
 def _wrapped(lines: Iterable[str], width: int) -> list[str]:
-    """Return lines wrapped between words; a word that is too long stays whole."""
     wrapped: list[str] = []
     for line in lines:
         if cell_len(line) <= width:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import click
 from click.core import ParameterSource
@@ -24,10 +24,7 @@ from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.views import explanations
 
-if TYPE_CHECKING:
-    pass  # DROPPED
-
-# ---- contexts: the fleets that a person works with, from a file in the user's config folder ----
+# ---- contexts: the fleets that a person works with ----
 #
 # A context replaces options that a person would repeat: the state repo, the access to the clusters,
 # the signing key. docs/commands.md describes the file.
@@ -60,28 +57,26 @@ class ContextsFile(FileModel):
         return self
 
 
-def path() -> Path:
+def contexts_file() -> Path:
     root = os.environ.get("XDG_CONFIG_HOME") or str(Path.home() / ".config")
     return Path(root) / "demandops" / "contexts.yaml"
 
 
-def read() -> ContextsFile:
-    """Return the contexts in the file; without a file there are none."""
+def read_contexts() -> ContextsFile:
     try:
-        text = path().read_text(encoding="utf-8")
+        text = contexts_file().read_text(encoding="utf-8")
     except FileNotFoundError:
         return ContextsFile(apiVersion=API_VERSION, kind="Contexts")
     except (OSError, UnicodeDecodeError) as error:
         raise InvalidInput.at(
-            "", f"cannot be read: {error}; replace the file", file=str(path())
+            "", f"cannot be read: {error}; replace the file", file=str(contexts_file())
         ) from None
     with located_in(text):
-        return parse_file(ContextsFile, text, str(path()))
+        return parse_file(ContextsFile, text, str(contexts_file()))
 
 
-def write(content: ContextsFile) -> None:
-    """Write the contexts to the file, which only its owner may read."""
-    file = path()
+def write_contexts(content: ContextsFile) -> None:
+    file = contexts_file()
     file.parent.mkdir(parents=True, exist_ok=True)
     data = content.model_dump(by_alias=True, exclude_none=True)
     # written beside the file and then renamed, so that no other command reads half a file
@@ -91,18 +86,16 @@ def write(content: ContextsFile) -> None:
     new.replace(file)
 
 
-def named(name: str, field: str = "") -> Context:
-    """Return the context of this name; a fault names ``field`` as the place of the name."""
-    contexts = read().contexts
+def context_named(name: str, field: str = "") -> Context:
+    # a fault names `field` as the place of the name
+    contexts = read_contexts().contexts
     if name not in contexts:
         message = f"there is no context '{name}'{suggestion(name, contexts)}"
-        raise InvalidInput.at(field, message, file=str(path()))
+        raise InvalidInput.at(field, message, file=str(contexts_file()))
     return contexts[name]
 
 
-# ---- target ----
-#
-# Which state repo a command works on, and with which access: options, environment, contexts.
+# ---- which state repo a command works on, and with which access ----
 #
 # The first of these that is given decides:
 #
@@ -130,19 +123,16 @@ _NO_STATE_REPO = (
 
 
 def _chosen_context(around: Path | None) -> Context | None:
-    """Return the context that applies, and remember it for :func:`_from_context`."""
-    pass  # DROPPED
-
     # clusters and signing key of a context apply only to its own state repo
     ctx = click.get_current_context()
     name = ctx.meta.get(_NAME)
-    content = read()
+    content = read_contexts()
     context: Context | None
     if name is not None:
-        context = named(name, "--context")
+        context = context_named(name, "--context")
     elif around is not None:
         places = {str(around), origin_of(around)}
-        same = (each for each in content.contexts.values() if each.state_repo in places)
+        same = (context for context in content.contexts.values() if context.state_repo in places)
         context = next(same, None)
     else:
         context = content.contexts[content.current] if content.current else None
@@ -151,13 +141,12 @@ def _chosen_context(around: Path | None) -> Context | None:
 
 
 def _checkout() -> Path | None:
-    """Return the checkout around the current folder; None outside one, or with ``--context``."""
+    # `--context` goes before the checkout around the current folder
     named = _NAME in click.get_current_context().meta
     return None if named else checkout_around(Path.cwd())
 
 
 def readable_repo() -> str | None:
-    """Return the default state repo of a command that only reads; None if there is none."""
     around = _checkout()
     context = _chosen_context(around)
     return str(around) if around else context.state_repo if context else None
@@ -181,15 +170,12 @@ def _writable() -> str | None:
 
 
 def hint_to_pull() -> list[str]:
-    """Return a hint to pull if the command works on the remote of a checkout, as a list."""
     # the new commit is not in the checkout yet, and commands that only read use the checkout
     behind = click.get_current_context().meta.get(_BEHIND)
     return ["to see the new commit in this checkout: git pull"] if behind else []
 
 
 def _from_context(field: str) -> Callable[[], str | None]:
-    """Return a function that returns ``field`` of the context that applies."""
-
     def default() -> str | None:
         context = click.get_current_context().meta.get(_CONTEXT)
         return getattr(context, field) if context else None
@@ -197,15 +183,8 @@ def _from_context(field: str) -> Callable[[], str | None]:
     return default
 
 
-def _remember_name(ctx: click.Context, param: click.Parameter, value: str | None) -> None:
-    if value is not None:
-        ctx.meta[_NAME] = value
-
-
 def context_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
-    pass  # DROPPED
-
-    return [name for name in read().contexts if name.startswith(incomplete)]
+    return [name for name in read_contexts().contexts if name.startswith(incomplete)]
 
 
 _context_option = click.option(
@@ -213,7 +192,7 @@ _context_option = click.option(
     metavar="NAME",
     expose_value=False,
     is_eager=True,
-    callback=_remember_name,
+    callback=lambda ctx, param, value: ctx.meta.update({_NAME: value} if value is not None else {}),
     shell_complete=context_names,
     help="The context to use, instead of the current one (docs/commands.md).",
 )
@@ -288,15 +267,13 @@ clusters_option = click.option(
 )
 
 
-# ---- name completion ----
-#
-# Completers for names from the state repo, by which a shell completes a command's arguments.
+# ---- names from the state repo, for a shell's completion ----
 
 Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
 
 def names_of(*kinds: str) -> Complete:
-    """Return a completer for names of these kinds; it offers no names if an error occurs."""
+    """Return a completer for names of these kinds."""
 
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         try:
@@ -312,6 +289,24 @@ def names_of(*kinds: str) -> Complete:
             return []
 
     return complete
+
+
+def name_options(helps: dict[str, str], **more: Any) -> Callable[[Command], Command]:  # noqa: ANN401
+    """Add an option for each name, which a shell completes; one for several is named in plural."""
+
+    def add(command: Command) -> Command:
+        for name, text in reversed(helps.items()):
+            option = click.option(
+                f"--{name}",
+                f"{name}s" if more.get("multiple") else name,
+                shell_complete=names_of(f"{name}s"),
+                help=text,
+                **more,
+            )
+            command = option(command)
+        return command
+
+    return add
 
 
 def _names(repo: Reader, kind: str) -> Iterator[str]:
@@ -331,5 +326,5 @@ def _names(repo: Reader, kind: str) -> Iterator[str]:
             "domains": world.config.domains,
             "overrides": world.config.overrides,
             "appdefs": world.config.appdefs,
-            "services": {name: 0 for each in world.config.services.values() for name in each},
+            "services": {name: 0 for own in world.config.services.values() for name in own},
         }[kind]

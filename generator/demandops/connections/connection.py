@@ -7,7 +7,7 @@ from bisect import bisect_left
 from collections.abc import Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Protocol, TypeVar
+from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar
 
 from pydantic import Field
 
@@ -28,41 +28,31 @@ from demandops.model.config.override import UNSHAPED, Shaping, patched_settings
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ClientSettings
 
-if TYPE_CHECKING:
-    pass  # DROPPED
-
 # ---- routes: one topic of a connection, with its names, direction and options ----
 #
-# Requests and claims contain routes, and the configuration of clients follows from the routes. This
-# module knows all valid options. Each connection type knows which of these options it supports.
+# All valid options are here. Each connection type knows which of them it supports.
 
 
 @dataclass(frozen=True, slots=True)
 class Route:
     """One topic that a connection carries.
 
-    ``source`` is the topic's name on the source node, and ``target`` its name on the target node.
-    With ``reverse``, messages go from the target to the source. ``type`` is the ROS message type
-    (``std_msgs/msg/String``), empty if not given. An option that has its default leaves the
-    client's own behavior unchanged.
-
-    ``qos`` (0 to 2), ``retained`` and ``primitive`` (the payload is plain text or a number, not a
-    ROS message) are options of MQTT. ``reliability``, ``durability`` and ``queue`` are options of
-    the clients' ROS publishers and subscribers. ``rate`` is the highest rate in Hz, 0 for all
-    messages.
+    An option that has its default leaves the client's own behavior unchanged.
     """
 
-    source: str
+    source: str  # the topic's name on the source node
     target: str
-    type: str = ""
-    reverse: bool = False
+    type: str = ""  # the ROS message type, like `std_msgs/msg/String`
+    reverse: bool = False  # messages go from the target to the source
+    # Options of MQTT; with `primitive`, the payload is plain text or a number, not a ROS message
     qos: int = 0
     retained: bool = False
     primitive: bool = False
+    # Options of the clients' ROS publishers and subscribers
     reliability: str = ""
     durability: str = ""
     queue: int = 0
-    rate: float = 0.0
+    rate: float = 0.0  # the highest one in Hz; 0 for all messages
 
     def options(self) -> dict[str, Any]:
         return {
@@ -70,13 +60,11 @@ class Route:
         }
 
     @property
-    def read_topic(self) -> str:
-        """The topic's name on the node that the messages come from."""
+    def read_topic(self) -> str:  # on the node that the messages come from
         return self.target if self.reverse else self.source
 
     @property
-    def written_topic(self) -> str:
-        """The topic's name on the node that the messages go to."""
+    def written_topic(self) -> str:  # on the node that the messages go to
         return self.source if self.reverse else self.target
 
     @property
@@ -171,23 +159,22 @@ def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
     return tuple(merged[source] for source in sorted(merged))
 
 
-# ---- connections: demands list them, claims hold them, and clients carry them ----
+# ---- connections ----
 
 
 @dataclass(frozen=True, slots=True)
 class Connection:
     """One connection and the topics that it carries.
 
-    ``type`` is ``None`` if a demand leaves the type open. ``broker`` is empty if the generator
-    chooses the broker. The connection of a claim has a type, and its routes are sorted by source
-    topic, without duplicates (:meth:`booked`).
+    The connection of a claim has a type, and its routes are sorted by source topic, without
+    duplicates (:meth:`booked`).
     """
 
     id: str
-    type: ConnectionType | None
+    type: ConnectionType | None  # None if a demand leaves it open
     source: str
     target: str
-    broker: str
+    broker: str  # empty if the generator chooses one
     topics: tuple[Route, ...]
 
     @property
@@ -196,18 +183,16 @@ class Connection:
 
     @property
     def home(self) -> str:
-        """The target; its access domain sets leases and quotas for the connection."""
+        # its access domain sets leases and quotas for the connection
         return self.target
 
     @property
     def nodes(self) -> tuple[str, str]:
-        """Both ends. An override's selector may match either of them."""
         return (self.source, self.target)
 
     @property
     def known_type(self) -> ConnectionType:
-        """The type of the connection, for callers that know that a type is chosen."""
-        assert self.type is not None, self.id  # noqa: S101
+        assert self.type is not None, self.id  # noqa: S101 - the callers know that one is chosen
         return self.type
 
     def route(self, source: str) -> Route | None:
@@ -227,7 +212,6 @@ class Connection:
         return replace(more, topics=topics, broker=broker)
 
     def matches_listed(self, listed: object) -> bool:
-        """Return whether a shutdown that lists ``listed`` means this connection of the same id."""
         return (  # what the shutdown leaves out matches any value
             isinstance(listed, Connection)
             and listed.source in ("", self.source)
@@ -254,7 +238,6 @@ class Connection:
         return replace(self, topics=left) if left else None
 
     def without_node(self, node: str) -> Connection | None:
-        """Return what is left of the connection without an end or without its broker."""
         return None if node in self.nodes else replace(self, broker="")
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
@@ -269,8 +252,7 @@ class Connection:
 
 # ---- the interface of a connection type, and of the clients that it plans ----
 #
-# Each type has one module with a subclass of :class:`ConnectionType` and its clients. The subclass
-# defines what the type supports and needs, and plans the clients of each connection as data.
+# Each type has a module with a subclass of :class:`ConnectionType`, which plans clients as data.
 # :mod:`.manifests` makes a client's file from that data and from ``templates/connections/<type>/``.
 # In that folder, ``client.yaml.j2`` is the template of a Deployment with the client's name, and
 # ``schema.json`` lists the fields that the client's program reads.
@@ -280,13 +262,10 @@ Side = Literal["source", "target"]
 
 @dataclass(frozen=True, slots=True)
 class ClientKey:
-    """The identity of a client: of one end of a connection, or of all at a node.
-
-    With a ``side``, ``id`` is the connection of which the client is one end. Without a side, ``id``
-    is the node whose connections of this type share the client.
-    """
+    """The identity of a client: of one end of a connection, or of all at a node."""
 
     type: ConnectionType
+    # With a side, of the connection; without, of the node whose connections share the client.
     id: str
     side: Side | None = None
 
@@ -297,8 +276,6 @@ class ClientKey:
 
 @dataclass(frozen=True, slots=True)
 class Client(ABC):
-    """The desired state of one communication client."""
-
     type: ConnectionType
     name: str
     node: Node
@@ -327,7 +304,7 @@ class Client(ABC):
         return strict_yaml.dump(configuration)
 
     def read_at_start(self, configuration: dict[str, Any]) -> dict[str, Any]:
-        """Return the part of a configuration with whose change the client restarts."""
+        # the part with whose change the client restarts
         return configuration
 
     def settings(self, config: Config) -> ClientSettings:
@@ -337,7 +314,7 @@ class Client(ABC):
         return settings
 
     def environment(self, settings: ClientSettings) -> dict[str, str]:
-        """Return the environment variables that the program needs besides those of ``settings``."""
+        # what the program needs besides the variables of `settings`
         return {}
 
     def shaping_entries(self, config: Config) -> Iterable[tuple[str, str, str]]:
@@ -350,9 +327,7 @@ class Client(ABC):
 
 @dataclass(frozen=True, slots=True)
 class End(Client):
-    """A client at one end of one connection."""
-
-    side: Side
+    side: Side  # of its one connection
     peer: str
     topics: tuple[Route, ...]
 
@@ -365,12 +340,11 @@ class End(Client):
         return [route.fact for route in self.topics]
 
     def reads(self, route: Route) -> bool:
-        """Return whether this end reads the topic from ROS. If not, it publishes the topic."""
+        # from ROS; otherwise, this end publishes the topic
         return route.reverse is (self.side == "target")
 
 
 def message_type(route: Route, sender: str, config: Config) -> str:
-    """Return the message type of a route whose messages come from ``sender``; empty if unknown."""
     node = config.nodes.get(sender)
     return route.type or (node.types.get(route.read_topic, "") if node else "")
 
@@ -420,7 +394,6 @@ class ConnectionType(ABC):
         return self.name.lower()
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        """Yield the faults of a configuration that prevent this type from working."""
         return iter(())
 
     def shares_clients(self, config: Config) -> bool:
@@ -428,49 +401,36 @@ class ConnectionType(ABC):
 
     @abstractmethod
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
-        """Yield a fault for each reason why the type cannot link the two nodes of a connection.
-
-        Unknown nodes are no fault here, because :mod:`.admission` reports them.
-        """
+        """Yield why the type cannot link two nodes; the admission reports unknown nodes."""
 
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        """Yield those faults of a route that only this type can find.
-
-        ``where`` is the route's path in the connection, such as ``topics[0]``. ``sender`` is the
-        node that the messages come from.
-        """
+        # those that only this type can find; `where` is the route's path in the connection
         return iter(())
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
-        """Return the connection as clients will carry it, and a note of how it differs, if it does.
-
-        The generator checks the connection only after this call, so it may have faults.
-        """
+        # as clients will carry it, and a note of how it differs; it may have faults, because the
+        # generator checks it only after this call
         return connection, ""
 
     def access(self, connection: Connection, config: Config) -> list[tuple[str, str]]:
-        """Return the access that a demand for the connection needs besides access to its nodes.
-
-        Each item is a field of a policy's rule, and the value that this field must allow.
-        """
+        """Return (field of a policy's rule, value that it must allow), besides the nodes."""
         return []
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
-        """Return the keys of the clients that a connection needs. By default, each end has one."""
+        # by default, each end has a client
         return ClientKey(self, connection, "source"), ClientKey(self, connection, "target")
 
     def names(self, key: ClientKey) -> Iterator[tuple[str, str]]:
-        """Yield (what it names, name) for each name that only the client at ``key`` may have."""
+        # (what it names, name) for each name that only the client at `key` may have
         yield "release", key.name
 
     @abstractmethod
     def client(self, key: ClientKey, connections: Connections, config: Config) -> Client | None:
-        """Return the client that ``key`` identifies, or ``None`` if the client carries no topic.
+        """Return the client at ``key``, or ``None`` if it carries no topic.
 
-        Raises Refused if connections contradict each other, or the configuration no longer has what
-        they need.
+        Raises Refused if connections contradict each other, or miss what they need.
         """
 
 
@@ -479,9 +439,8 @@ def make_end(
     key: ClientKey,
     connection: Connection,
     config: Config,
-    **more: Any,  # noqa: ANN401 - any field
+    **more: Any,  # noqa: ANN401 - the fields that the class `end` adds
 ) -> AnyEnd:
-    """Return one end of a connection; ``more`` has the fields that its own class adds."""
     own, peer = connection.source, connection.target
     if key.side == "target":
         own, peer = peer, own

@@ -30,8 +30,7 @@ def type_named(word: str) -> ConnectionType:
     return {kind.word: kind for kind in CONNECTION_TYPES}[word]
 
 
-def listed(types: Iterable[ConnectionType]) -> str:
-    """Return the names of types as text for a message: ``MQTT or ROS``."""
+def listed(types: Iterable[ConnectionType]) -> str:  # `MQTT or ROS`
     return " or ".join(kind.name for kind in types)
 
 
@@ -40,10 +39,7 @@ def by_number() -> list[ConnectionType]:
 
 
 def type_word(*before: str, after: tuple[str, ...] = ()) -> PlainValidator:
-    """Return the validator of a field that accepts the words of all types, and a few others.
-
-    Messages list the accepted words: first ``before``, then the words of the types, then ``after``.
-    """
+    """Return the validator of a field that accepts the words of all types, and a few others."""
 
     def words() -> tuple[str, ...]:  # of all types at the time of the check
         return (*before, *(kind.word for kind in by_number()), *after)
@@ -62,7 +58,6 @@ _ALWAYS = ("type", "reverse")
 
 
 def choose_type(connection: Connection, config: Config) -> ConnectionType | None:
-    """Return the first type that can carry a connection, or ``None`` if no type can."""
     for kind in CONNECTION_TYPES:
         if next(type_faults(kind, connection, config), None) is None:
             return kind
@@ -70,7 +65,6 @@ def choose_type(connection: Connection, config: Config) -> ConnectionType | None
 
 
 def no_type_fault(connection: Connection, config: Config) -> Fault:
-    """Return a fault with a reason for each type, if no type can carry a connection."""
     reasons = []
     for kind in CONNECTION_TYPES:
         reason = next(type_faults(kind, connection, config))
@@ -82,10 +76,7 @@ def no_type_fault(connection: Connection, config: Config) -> Fault:
 
 
 def type_faults(kind: ConnectionType, connection: Connection, config: Config) -> Iterator[Fault]:
-    """Yield a fault for each reason why ``kind`` cannot carry a connection.
-
-    Unknown nodes are no fault here, because :mod:`.admission` reports them.
-    """
+    # the admission reports unknown nodes
     ends = {"source": connection.source, "target": connection.target}
     if kind.image not in config.images:
         message = f"{kind.name} needs an image '{kind.image}'; add it to "
@@ -112,10 +103,6 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
 def route_faults(
     kind: ConnectionType, topics: Iterable[Route], ends: tuple[str, str], config: Config
 ) -> Iterator[Fault]:
-    """Yield a fault for everything in routes that ``kind`` does not support.
-
-    ``ends`` are the source and the target.
-    """
     for index, route in enumerate(topics):
         if topic_problem(route.source) or topic_problem(route.target):
             continue  # the checks of the request report this topic

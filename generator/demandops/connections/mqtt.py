@@ -44,8 +44,6 @@ _NO_BROKER = "no-broker"
 
 
 class Mqtt(ConnectionType):
-    """The connection type MQTT: both ends are clients of one broker."""
-
     name = "MQTT"
     number = 1
     image = "mqtt-client"
@@ -141,8 +139,6 @@ def choose_broker(connection: Connection, config: Config) -> Broker | None:
 
 @dataclass(frozen=True, slots=True)
 class MqttEnd(End):
-    """One end of an MQTT connection."""
-
     broker: Broker
     # The prefix of this connection's MQTT topics, the same at both ends
     channel: str
@@ -199,7 +195,6 @@ class MqttEnd(End):
 
 
 def _options(route: Route, *, retained: bool = False) -> dict[str, Any]:
-    """Return the parameters that a topic needs besides the client's defaults."""
     options: dict[str, Any] = {}
     if route.primitive:
         options["primitive"] = True

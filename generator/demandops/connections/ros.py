@@ -32,8 +32,6 @@ _LOCAL, _WAN = "local", "wan"
 
 
 class Ros(ConnectionType):
-    """The connection type ROS: each end is a router; one listens, and the other connects to it."""
-
     name = "ROS"
     number = 0
     image = "dds-router"
@@ -104,8 +102,7 @@ ROS = Ros()
 
 
 def _listener(connection: Connection, config: Config) -> Node | None:
-    """Return the end that listens, the target if both can, or ``None`` if neither can."""
-    for id in (connection.target, connection.source):
+    for id in (connection.target, connection.source):  # the target if both can listen
         node = config.nodes.get(id)
         if node is not None and node.wan is not None:
             return node
@@ -124,7 +121,7 @@ def _number(connection: str) -> int:
 
 @dataclass(frozen=True, slots=True)
 class RosEnd(End):
-    """One end of a ROS connection. Each route in ``topics`` has its message type set."""
+    """Each route in ``topics`` has its message type set."""
 
     # The id of the node that listens; its address is `wan`, and its port is `port`
     listener: str
@@ -189,7 +186,7 @@ class RosEnd(End):
 
 
 def _routes(sender: str, receiver: str) -> list[dict[str, Any]]:
-    """Return the router's routes that let messages pass only from ``sender`` to ``receiver``."""
+    # messages pass only from the sender to the receiver
     return [{"src": sender, "dst": [receiver]}, {"src": receiver}]
 
 

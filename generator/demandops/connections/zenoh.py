@@ -27,8 +27,6 @@ from demandops.model.config.config import NODES_FILE, Config, ConfigReader
 
 
 class Zenoh(ConnectionType):
-    """The connection type Zenoh: all Zenoh connections of a node share its bridge."""
-
     name = "ZENOH"
     number = 2
     image = "zenoh-bridge"
@@ -137,16 +135,12 @@ ZENOH = Zenoh()
 
 @dataclass(frozen=True, slots=True)
 class Bridge(Client):
-    """The desired state of a node's Zenoh bridge.
+    """The desired state of a node's Zenoh bridge."""
 
-    ``publishers`` are the topics that the bridge reads from the node's ROS graph.
-    ``subscribers`` are the topics that the bridge publishes in this graph. ``rates`` maps a topic
-    that the bridge reads to the most messages per second.
-    """
-
+    # The topics that the bridge reads from the node's ROS graph, and those that it publishes there
     publishers: tuple[str, ...]
     subscribers: tuple[str, ...]
-    rates: Mapping[str, float]
+    rates: Mapping[str, float]  # the most messages per second of a topic that the bridge reads
     connect: tuple[str, ...]
     listen: tuple[str, ...]
 

@@ -19,19 +19,16 @@ from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import Instance, Kept, Steps
 
-# ---- the number of replicas of a service; its definition derives it from the demands ----
+# ---- the number of replicas of a service ----
 
 
 @dataclass(frozen=True, slots=True)
 class Autoscaler:
-    """A HorizontalPodAutoscaler, which chooses a number of replicas from ``min`` to ``max``.
-
-    ``targets`` has the usage of each resource, in percent, that the autoscaler aims at.
-    """
+    """A HorizontalPodAutoscaler, which chooses a number of replicas from ``min`` to ``max``."""
 
     min: int
     max: int
-    targets: Mapping[Resource, int]
+    targets: Mapping[Resource, int]  # the usage of each resource that it aims at, in percent
 
     def __str__(self) -> str:
         by = ", ".join(f"{name} {percent} %" for name, percent in self.targets.items())
@@ -49,7 +46,6 @@ def replicas_of(
     claims: Collection[Claim],
     requesters: Collection[str],
 ) -> int | Autoscaler:
-    """Return how many replicas a service needs, or the autoscaler that chooses the number."""
     if scaling.autoscaler:
         return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
     if scaling.sizes:
@@ -73,11 +69,7 @@ def replicas_of(
 def with_kept(
     needed: int | Autoscaler, scaling: Scaling, steps: Steps
 ) -> tuple[int | Autoscaler, Kept | None]:
-    """Return how many replicas a service has, and the step that decides this number.
-
-    The step is ``None`` if ``needed`` decides the number. ``steps`` say how many replicas the
-    service keeps for a while (:mod:`.records`).
-    """
+    """Return how many replicas a service has, and the step that decides this, if one does."""
     if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
         return needed, None
     kept = min(steps[0].replicas, scaling.most)  # a person may have lowered the limit meanwhile
@@ -85,7 +77,6 @@ def with_kept(
 
 
 def overridden(replicas: int | Autoscaler, number: int) -> int | Autoscaler:
-    """Return the replicas of a service for which an override sets the number."""
     # Where an autoscaler owns the number, the GitOps controller ignores ``spec.replicas``. So the
     # number is set as both bounds of the autoscaler.
     if isinstance(replicas, Autoscaler):
@@ -94,13 +85,10 @@ def overridden(replicas: int | Autoscaler, number: int) -> int | Autoscaler:
 
 
 def most_replicas(replicas: int | Autoscaler) -> int:
-    """Return the highest number of replicas that may run."""
     return replicas.max if isinstance(replicas, Autoscaler) else replicas
 
 
-# ---- release ----
-#
-# Releases: the planner returns one for each service instance and each communication client.
+# ---- releases: one for each service instance and each client ----
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,14 +121,13 @@ class ServiceKey:
 
     @property
     def instance(self) -> Instance:
-        """The key of the record of kept replicas in the ledger."""
+        # of the record of kept replicas in the ledger
         named = (self.service, self.node, self.application, self.source, self.topic, self.version)
         scope = "cluster" if self.for_cluster else ""
         return ("replicas", *(name or "" for name in named), scope)
 
     @classmethod
     def of(cls, instance: Instance) -> ServiceKey:
-        """Return the key whose :attr:`instance` is ``instance``."""
         service, node, *others, version, scope = instance[1:]
         application, source, topic = (name or None for name in others)
         return cls(service, node, application, source, topic, version, scope == "cluster")
@@ -148,11 +135,7 @@ class ServiceKey:
 
 @dataclass(frozen=True, slots=True)
 class ServiceRelease:
-    """The desired state of one service instance: one Helm release.
-
-    ``chart`` is the chart of ``version``, unless an override pins another chart version. ``keeps``
-    is set while the service keeps more replicas than its demands need.
-    """
+    """The desired state of one service instance: one Helm release."""
 
     key: ServiceKey
     name: str
@@ -160,12 +143,12 @@ class ServiceRelease:
     domain: AccessDomain
     service: Service
     version: ApplicationVersion
-    chart: ChartSource
+    chart: ChartSource  # that of `version`, unless an override pins another
     inputs: Mapping[str, tuple[InputTopic, ...]]
     outputs: Mapping[str, str]
     parameters: Mapping[str, object]
     replicas: int | Autoscaler
-    keeps: Kept | None
+    keeps: Kept | None  # while the service keeps more replicas than its demands need
     applications: tuple[str, ...]
     requesters: tuple[str, ...]
     shaping: Shaping = UNSHAPED
@@ -183,16 +166,13 @@ class ServiceRelease:
 
     @property
     def description(self) -> str:
-        """What runs, where and for whom, as commit messages say it."""
+        # as commit messages say it
         for_whom = self.key.source or self.key.application
         what = f"{self.key.service} {self.key.version}".rstrip()
         return f"{what} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
 
     def facts(self) -> list[str]:
-        """Return what the release runs with, as lines; commit messages show changed lines.
-
-        Outputs, images that the version does not pin, and patches of Helm values are left out.
-        """
+        # commit messages show changed lines
         until = f" until {format_time(self.keeps.until)}" if self.keeps else ""
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
@@ -208,10 +188,7 @@ class ServiceRelease:
         ]
 
     def shaping_entries(self, config: Config) -> Iterator[tuple[str, str, str]]:
-        """Yield (file, entry, what the entry decides) for entries that shape the release.
-
-        An empty ``entry`` stands for the whole file.
-        """
+        # (file, entry, what it decides); an empty entry stands for the whole file
         folder = f"appdefs/{self.service.folder}"
         entry = "" if self.service.shared else f"services.{self.key.service}"
         yield self.service.file, entry, "its definition"
@@ -234,7 +211,6 @@ Release = ServiceRelease | Client
 
 
 def claims_of(release: Release, ledger: Ledger) -> tuple[Claim, ...]:
-    """Return the claims on a release's applications or connections."""
     if isinstance(release, ServiceRelease):
         return tuple(c for id in release.applications for c in ledger.application_claims(id))
     return tuple(c for id in release.connections for c in ledger.connection_claims(id))

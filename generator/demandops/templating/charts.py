@@ -36,35 +36,28 @@ _MOST_CHARACTERS = 20_000_000
 
 @dataclass(frozen=True, slots=True)
 class Dependency:
-    """An entry of a chart's ``dependencies``.
+    """An entry of a chart's ``dependencies``."""
 
-    ``index`` is the entry's place in the list. ``name`` and ``alias`` are names as Helm allows
-    them, so they are safe in a path. ``folder`` is the folder in ``appdefs/`` that ``repository``
-    names, or None if it names no such folder. The folder may be missing in the state repo.
-    ``imports`` lists those names in the library's ``exports`` whose values the chart imports.
-    ``optional`` says that values decide whether the chart has the dependency.
-    """
-
-    index: int
-    name: str
+    index: int  # in the list
+    name: str  # as Helm allows it, so it is safe in a path
     alias: str
     version: str
     repository: str
+    # That in `appdefs/` which `repository` names, if any; the state repo may lack the folder
     folder: str | None
-    imports: tuple[str, ...]
-    optional: bool
+    imports: tuple[str, ...]  # the names in the library's `exports` whose values are imported
+    optional: bool  # values decide whether the chart has it
 
 
 def dependencies(folder: str, files: Mapping[str, str]) -> tuple[Dependency, ...]:
-    """Return the dependencies of a chart, without those for which :func:`faults` has a fault."""
     return _metadata(folder, files.get(f"{folder}/Chart.yaml", ""))[0]
 
 
 def folders(folder: str, files: Mapping[str, str]) -> tuple[str, ...]:
-    """Return the folders of a chart and of the libraries that it needs, missing or not."""
+    # of the chart and of the libraries that it needs, missing or not
     needed = [folder]
     for chart in needed:  # which grows meanwhile
-        libraries = dict.fromkeys(each.folder for each in dependencies(chart, files))
+        libraries = dict.fromkeys(library.folder for library in dependencies(chart, files))
         needed += [library for library in libraries if library and library not in needed]
         if len(needed) > _MOST_LIBRARIES:  # with_libraries refuses such a chart
             break
@@ -79,11 +72,9 @@ def below(folder: str, paths: Sequence[str]) -> Sequence[str]:
 def with_libraries(
     folder: str, files: Mapping[str, str], paths: Sequence[str]
 ) -> tuple[dict[str, str], str]:
-    """Return the files of a chart, with the files of its libraries in ``charts/``.
+    """Return the origin of each file of a chart with its libraries, and a missing dependency.
 
-    The first result maps paths in the chart to paths in the state repo; ``paths`` are the sorted
-    paths of ``files``. The second is the name of a dependency that is neither in the state repo nor
-    in ``charts/``, or empty.
+    ``paths`` are the sorted paths of ``files``.
     """
     origins, missing, characters = dict[str, str](), "", 0
     waiting: list[tuple[str, tuple[str, ...]]] = [("", (folder,))]
@@ -92,7 +83,7 @@ def with_libraries(
         for path in below(here, paths):
             origins[prefix + path[len(here) + 1 :]] = path
             characters += len(files[path])
-        libraries = {each.name: each for each in dependencies(here, files) if each.folder}
+        libraries = {needed.name: needed for needed in dependencies(here, files) if needed.folder}
         if (
             len(waiting) + len(libraries) > _MOST_LIBRARIES
             or len(origins) > _MOST_FILES
@@ -132,7 +123,6 @@ def with_libraries(
 
 
 def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
-    """Return a chart's own values, merged over those that it imports by name from libraries."""
     imported: dict[str, Any] = {}
     for dependency in dependencies(folder, files):
         if dependency.folder and dependency.imports:
@@ -145,7 +135,7 @@ def defaults(folder: str, files: Mapping[str, str]) -> dict[str, Any]:
 
 
 def merged(below: Mapping[str, Any], above: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values ``above`` merged over the values ``below`` by Helm's rules."""
+    # by Helm's rules, so null removes a key
     result = dict(below)
     for key, value in above.items():
         if value is None:
@@ -199,7 +189,6 @@ def faults(folder: str, files: Mapping[str, str]) -> Iterator[Fault]:
 
 @lru_cache(maxsize=4096)
 def _metadata(folder: str, text: str) -> tuple[tuple[Dependency, ...], tuple[tuple[str, str], ...]]:
-    """Return the dependencies in a ``Chart.yaml``, and field and value of each wrong name."""
     metadata = _mapping(text)
     listed = metadata.get("dependencies")
     valid, wrong = list[Dependency](), list[tuple[str, str]]()
@@ -259,9 +248,7 @@ def _read(text: str) -> dict[str, Any]:
     return values if isinstance(values, dict) else {}
 
 
-# ---- chart schema ----
-#
-# The values of a chart, described by comments of ``values.yaml`` in the format of helm-docs.
+# ---- the descriptions of a chart's values: comments of ``values.yaml``, as helm-docs has them ----
 #
 # A description starts with ``# --`` above its value and goes on in the comment lines that follow.
 
@@ -271,7 +258,6 @@ _HEAD = "| Key | Type | Default | Description |\n|-----|------|---------|-------
 
 
 def descriptions(text: str) -> dict[str, str]:
-    """Return the descriptions in a ``values.yaml``, by paths like ``image.tag``."""
     described: dict[str, str] = {}
     path: list[tuple[int, str]] = []
     words: list[str] = []
@@ -293,10 +279,7 @@ def descriptions(text: str) -> dict[str, str]:
 
 
 def table(text: str, root: str = "") -> str:
-    """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``.
-
-    Callers pass a ``root`` that exists, and values that are not null.
-    """
+    """Return a Markdown table of the values below the path ``root`` in a ``values.yaml``."""
     values: Any = strict_yaml.load(text)
     prefix = f"{root}." if root else ""
     words = {
@@ -324,7 +307,7 @@ def _rows(
             yield from _rows(value, f"{path}.", words, leaves and path not in words)
 
 
-# ---- the ``values.schema.json`` of a chart, for its own values and the values that it imports ----
+# ---- the ``values.schema.json`` of a chart ----
 #
 # Neither Helm nor the generator follows a reference to another schema file. So this module copies
 # the library's schema into the chart's schema.
@@ -338,8 +321,7 @@ def composed(
 ) -> dict[str, Any]:
     """Return the schema of a chart, including the library's values and all descriptions.
 
-    ``own`` has the chart's properties that the library lacks or defines differently. ``values`` is
-    the text of the chart's ``values.yaml``, and ``shared`` that of the library's.
+    ``own`` has the chart's properties that the library lacks or defines differently.
     """
     prefix = f"exports.{EXPORT}."
     words = {

@@ -20,7 +20,6 @@ from demandops.templating.values import SchemaTask, ValuesTask, evaluate
 
 
 def serve(memory_mib: int) -> None:
-    """Answer the questions on standard input until it ends."""
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     most = pages * resource.getpagesize() + memory_mib * 1024 * 1024
     # if the machine lacks memory, the kernel ends this process rather than the generator

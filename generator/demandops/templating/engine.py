@@ -71,7 +71,6 @@ def _literal(value: str, indent: int) -> _Verbatim:
 
 
 def _bare(value: str) -> _Verbatim:
-    """Return a path as text that a template writes, unquoted, into a comment."""
     if not re.fullmatch(r"[A-Za-z0-9._/-]+", value):
         raise ValueError(f"'{value}' is not a plain path, so it cannot be written in a comment")
     return _Verbatim(value)
@@ -106,6 +105,5 @@ def _own(folder: Path) -> Environment:
     return environment
 
 
-def text(template: str, **context: object) -> str:
-    """Return the rendered text of a template of the program, such as ``flux/release.yaml.j2``."""
+def text(template: str, **context: object) -> str:  # such as `flux/release.yaml.j2`
     return _own(data_folder("templates")).get_template(template).render(**context)

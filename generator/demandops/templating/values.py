@@ -24,8 +24,7 @@ from demandops.base.strict_yaml import not_writable
 from demandops.templating import charts
 from demandops.templating.engine import FILTERS, OPTIONS, CompiledTemplates
 
-# ---- the line of a values template that produced a faulty line of the rendered text ----
-
+# ---- the line of a template that wrote a faulty line ----
 
 _EXPRESSION = re.compile(r"\{\{.*?\}\}|\{%.*?%\}|\{#.*?#\}")
 _PLACE = re.compile(r"line (\d+)")
@@ -35,7 +34,6 @@ _LONGEST = 2_000
 
 
 def with_template_lines(faults: Iterable[Fault], template: str, rendered: str) -> Iterator[Fault]:
-    """Yield faults of a rendered text, each with the template's line if this line is known."""
     template_lines, rendered_lines = template.splitlines(), rendered.splitlines()
     fields: Mapping[str, int] | None = None
     for problem in faults:
@@ -56,7 +54,7 @@ def with_template_lines(faults: Iterable[Fault], template: str, rendered: str) -
 
 
 def _may_write(line: str, rendered: str) -> bool:
-    """Return whether ``rendered`` has all text around the expressions of a template's line."""
+    # whether `rendered` has all text around the expressions of the template's line
     first, *others = _EXPRESSION.split(line)
     if not others or not "".join((first, *others)).strip() or not rendered.startswith(first):
         return False
@@ -119,7 +117,6 @@ def _as_data(value: Any) -> Any:  # noqa: ANN401
 
 @lru_cache(maxsize=256)  # each rendering has a sandbox, but all have the same filters
 def _of_data(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Change a filter or format so that its arguments must be data."""
     passed = 1 if hasattr(function, "jinja_pass_arg") else 0
 
     @wraps(function)
@@ -134,9 +131,8 @@ def _concatenated(parts: list[Any]) -> str:
     return "".join(map(str, parts))
 
 
+# `~` makes text of anything, so a filter takes its place, whose operands must be data
 class _Concatenations(NodeTransformer):
-    """Replaces each ``~`` of a template by a filter, so that its operands must be data."""
-
     def __init__(self, environment: Sandbox) -> None:
         self._environment = environment
 
@@ -180,9 +176,7 @@ class Sandbox(ImmutableSandboxedEnvironment):
         return _of_data(wrapped) if wrapped else None
 
 
-# ---- values ----
-#
-# The Helm values of a service, from what people wrote: a values template, a chart, overrides.
+# ---- the Helm values of a service: from a values template, a chart and overrides ----
 #
 # What people write may never end. So this module runs in another process, which can be killed
 # (:mod:`.evaluator`). That process starts quickly only because nothing here imports the
@@ -197,16 +191,12 @@ _REFERENCES = ("$ref", "$dynamicRef", "$recursiveRef")
 
 @dataclass(frozen=True, slots=True)
 class ValuesTask:
-    """What the values of a service are computed from; all paths are those of the state repo.
-
-    ``chart`` is the folder of the chart, whose defaults and schema the values must fit; None if the
-    chart is not in the state repo. ``patches`` are the values of overrides, each with the
-    override's path, in the order in which they apply. Every value is plain JSON.
-    """
+    """What the values of a service are computed from; all paths are those of the state repo."""
 
     template: str
     context: Mapping[str, Any]
-    chart: str | None
+    chart: str | None  # its folder, if it is in the state repo
+    # The values of overrides in the order in which they apply, each with the override's path
     patches: tuple[tuple[str, Any], ...] = ()
 
     @property
@@ -217,10 +207,7 @@ class ValuesTask:
 
 @dataclass(frozen=True, slots=True)
 class SchemaTask:
-    """A chart's ``values.schema.json`` that is checked, with values that ``origin`` gives, if any.
-
-    The result is empty.
-    """
+    """A ``values.schema.json`` to check, with values that ``origin`` gives, if any."""
 
     file: str
     values: Mapping[str, Any] | None = None
@@ -252,9 +239,6 @@ def evaluate(files: Mapping[str, str], task: ValuesTask | SchemaTask) -> dict[st
         if task.chart:
             _check(values, task.chart, files, override, "the override")
     return values
-
-
-# ---- the template ----
 
 
 _COMPILED = CompiledTemplates()
@@ -314,13 +298,9 @@ def _mapping(text: str, template: str) -> dict[str, Any]:
     return values
 
 
-# ---- the chart's schema ----
-
-
 def _check(
     values: Mapping[str, Any], chart: str, files: Mapping[str, str], origin: str, author: str
 ) -> None:
-    """Raise InvalidInput, for the file ``origin``, if values do not match a chart's schema."""
     path = f"{chart}/values.schema.json"
     if path not in files:
         return
@@ -356,7 +336,7 @@ def validator(text: str, file: str) -> Any:  # noqa: ANN401
         if reason.endswith('is not a "regex"'):
             reason += ", or needs a look-around or back reference, which Go's patterns lack too"
         faults = [fault("", f"is not a valid JSON schema: {reason}; fix it")]
-    raise InvalidInput(each.within(file) for each in faults)
+    raise InvalidInput(fault.within(file) for fault in faults)
 
 
 def _refuse(uri: str) -> None:
@@ -364,7 +344,6 @@ def _refuse(uri: str) -> None:
 
 
 def _foreign(schema: object, place: tuple[int | str, ...], id: str) -> Iterator[Fault]:
-    """Yield a fault for each reference to another document, and for each ``id`` below the root."""
     if isinstance(schema, dict):
         for key, part in schema.items():
             if not isinstance(part, str):

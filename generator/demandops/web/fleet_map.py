@@ -14,7 +14,6 @@ from demandops.web.situation import RANKS, WORDS, Situation, word_of
 
 # ---- the layout: nodes are drawn at their positions, or by cluster and type ----
 
-
 WIDTH = 1200.0
 HEAD = 30.0
 _GAP = 14.0
@@ -32,12 +31,7 @@ class ServiceMark:
 
 @dataclass(frozen=True, slots=True)
 class NodeCard:
-    """A node as it is drawn.
-
-    ``count`` is the number of all services on the node. ``services`` lists the services that the
-    card shows, and ``more`` counts the services for which the card has no room. On a small card,
-    ``services`` is empty and ``more`` is 0.
-    """
+    """A node as it is drawn; on a small card, ``services`` is empty and ``more`` is 0."""
 
     id: str
     type: str
@@ -48,11 +42,11 @@ class NodeCard:
     tone: str
     is_lit: bool
     is_drained: bool
-    count: int
+    count: int  # of all services on the node
     label: str
     title: str
     services: tuple[ServiceMark, ...] = ()
-    more: int = 0
+    more: int = 0  # how many services the card has no room for
 
     @property
     def middle(self) -> float:
@@ -71,10 +65,7 @@ class Box:
 def by_cluster(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], list[Box], float]:
-    """Return the placed cards by node id, one box for each cluster, and the height of the map.
-
-    The cards in a box are in rows, grouped by the type of the node.
-    """
+    """Return the placed cards by node id, one box for each cluster, and the height of the map."""
     clusters: dict[str, dict[str, list[NodeCard]]] = {}
     for node in sorted(nodes, key=lambda node: node.id):
         clusters.setdefault(node.cluster, {}).setdefault(node.type, []).append(cards[node.id])
@@ -127,8 +118,7 @@ def by_place(
 ) -> tuple[dict[str, NodeCard], float]:
     """Return the placed cards by node id, and the height of the map.
 
-    At least one node must have a position. A node is placed at its position, with north at the top,
-    or below it if another card is there. The nodes without a position follow in rows below.
+    At least one node must have a position. The nodes without one follow in rows below the others.
     """
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
@@ -141,7 +131,7 @@ def by_place(
     placed: dict[str, NodeCard] = {}
     for id, spot in sorted(spots.items(), key=lambda pair: (-pair[1].y, pair[1].x, pair[0])):
         x = (spot.x - min(xs)) * scale
-        y = (max(ys) - spot.y) * scale
+        y = (max(ys) - spot.y) * scale  # north is at the top
         card = replace(cards[id], x=x, y=y)
         # move it down until it overlaps no other card
         for other in sorted(placed.values(), key=lambda other: other.y):
@@ -165,10 +155,7 @@ def by_place(
     return placed, height + row
 
 
-# ---- the map: nodes with their services, and the connections between nodes ----
-#
-# Nodes are placed by position, or by cluster and type. The server computes the layout, so the same
-# state gives the same picture; the browser only draws it.
+# ---- the picture, which the browser only draws, so the same state looks the same ----
 
 _LINE = 15.0
 # Up to how many nodes are drawn with their services, with their names only, and one by one.
@@ -187,18 +174,15 @@ class Line:
     title: str
 
 
+# Many nodes or lines of one color, drawn together as one path.
 @dataclass(frozen=True, slots=True)
 class Mass:
-    """Many nodes or lines of one color, drawn together as one path."""
-
     tone: str
     path: str
 
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """The whole map. Nodes and lines that match the filter are lit."""
-
     width: float
     height: float
     boxes: tuple[Box, ...]
@@ -219,17 +203,37 @@ class Picture:
 def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
     """Return the map of a situation; services, connections and nodes that match are lit.
 
-    ``layout`` is ``place`` or ``cluster``. Any other value means ``place`` if most nodes have a
-    position, else ``cluster``. If no drawn node has a position, nodes are drawn by cluster.
+    A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a position.
+    If no drawn node has a position, nodes are drawn by cluster.
     """
     config = now.commit_state.config
     nodes = list(config.nodes.values())
-    marks = _marks(now, wanted)
+    rows = rows_of(now, "services") if wanted else []
+    lit_services = {row.cells["release"].parts[0].text for row in rows if wanted.matches(row)}
+    marks: dict[str, list[ServiceMark]] = {id: [] for id in config.nodes}
+    for release, _ in now.commit_state.targets:
+        if isinstance(release, ServiceRelease) and release.node.id in marks:
+            tone = WORDS[word_of(now.status(release.name))]
+            source = release.key.source
+            text = f"{release.key.service} · {source}" if source else release.key.service
+            mark = ServiceMark(release.name, text, tone, release.name in lit_services)
+            marks[release.node.id].append(mark)
     total, placed = len(nodes), [node for node in nodes if node.position]
     layouts = ("cluster", "place") if placed else ("cluster",)
     if layout not in layouts:
         layout = "place" if len(placed) > len(nodes) / 2 else "cluster"
-    lit = _lit_nodes(now, wanted, nodes, marks)
+    lit: set[str] = set()
+    if wanted:
+        # a node is also lit if it has a service or connection that matches
+        lit = {id for id, on_node in marks.items() if any(mark.is_lit for mark in on_node)}
+        for row in rows_of(now, "connections"):
+            if wanted.matches(row):
+                lit.update(row.hidden["node"])
+        for node in nodes:
+            row = Row({}, {"node": [node.id], "type": [node.type], "cluster": [node.cluster]})
+            if wanted.matches(row):
+                lit.add(node.id)
+        lit &= marks.keys()
     only_lit = len(nodes) > _MOST_NAMED and 0 < len(lit) <= _MOST_NAMED
     if only_lit:
         nodes = [node for node in nodes if node.id in lit]
@@ -270,10 +274,7 @@ _Drawn = TypeVar("_Drawn", "NodeCard", "Line")
 
 
 def _apart(drawn: list[_Drawn], most: int) -> tuple[list[_Drawn], list[_Drawn]]:
-    """Return the parts to draw together, and the parts to draw one by one.
-
-    No more than ``most`` are drawn one by one: all parts, else only the lit ones, else none.
-    """
+    """Return the parts to draw together, and at most ``most`` parts to draw one by one."""
     if len(drawn) <= most:
         return [], drawn
     lit = [part for part in drawn if part.is_lit]
@@ -287,38 +288,6 @@ def _by_tone(drawn: Iterable[_Drawn]) -> Iterable[tuple[str, list[_Drawn]]]:
     for part in drawn:
         groups.setdefault(part.tone, []).append(part)
     return groups.items()
-
-
-def _lit_nodes(
-    now: Situation, wanted: Filter, nodes: Iterable[Node], marks: Mapping[str, list[ServiceMark]]
-) -> set[str]:
-    """Return the ids of nodes that match, or have a service or connection that does."""
-    if not wanted:
-        return set()
-    lit = {id for id, on_node in marks.items() if any(mark.is_lit for mark in on_node)}
-    for row in rows_of(now, "connections"):
-        if wanted.matches(row):
-            lit.update(row.hidden["node"])
-    for node in nodes:
-        row = Row({}, {"node": [node.id], "type": [node.type], "cluster": [node.cluster]})
-        if wanted.matches(row):
-            lit.add(node.id)
-    return lit & {*marks}
-
-
-def _marks(now: Situation, wanted: Filter) -> dict[str, list[ServiceMark]]:
-    """Return the services of each node of the inventory."""
-    rows = rows_of(now, "services") if wanted else []
-    lit = {row.cells["release"].parts[0].text for row in rows if wanted.matches(row)}
-    marks: dict[str, list[ServiceMark]] = {id: [] for id in now.commit_state.config.nodes}
-    for release, _ in now.commit_state.targets:
-        if isinstance(release, ServiceRelease) and release.node.id in marks:
-            tone = WORDS[word_of(now.status(release.name))]
-            source = release.key.source
-            text = f"{release.key.service} · {source}" if source else release.key.service
-            mark = ServiceMark(release.name, text, tone, release.name in lit)
-            marks[release.node.id].append(mark)
-    return marks
 
 
 def _card(node: Node, marks: list[ServiceMark], is_lit: bool, total: int) -> NodeCard:
@@ -348,7 +317,7 @@ def _short(text: str, most: int) -> str:
 
 
 def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> list[Line]:
-    """Return a line for each source and target that are drawn; lit lines come last, on top."""
+    # lit lines come last, on top
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows_of(now, "connections"):
         ends = row.hidden["node"]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
 from itertools import islice
@@ -14,35 +14,24 @@ from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL, Runtime
 from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health import ClusterDomain, Target, health_reader
+from demandops.cluster.health import ClusterDomain, health_reader
 from demandops.cluster.object_cache import ObjectCache
-from demandops.cluster.release_status import (
-    OldBootstrap,
-    Orphan,
-    ReleaseStatus,
-    old_bootstraps,
-    orphans,
-    statuses,
-)
-from demandops.repo.git.repository import StateRepository, reading
+from demandops.cluster.release_status import old_bootstraps, orphans, statuses
+from demandops.repo.git.repository import reading
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.snapshot import Progress, Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
 from demandops.web.situation import Commit, CommitState, HealthChange, Situation, word_of
 
-# ---- watches the releases on their clusters, and records the changes of their health ----
-
+# ---- the releases on their clusters, and the changes of their health ----
 
 # How many changes of health are kept. They are in memory only, because the page writes nothing.
 _KEPT = 2_000
 
 
 class ClusterWatch:
-    """Watches the health of releases on clusters.
-
-    Only one thread at a time may use a watch, but any thread may read :attr:`changes`.
-    """
+    """Only one thread at a time may use a watch, but any thread may read :attr:`changes`."""
 
     def __init__(
         self, clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None], runtime: Runtime
@@ -64,20 +53,22 @@ class ClusterWatch:
 
     @property
     def changes(self) -> tuple[HealthChange, ...]:
-        """The newest changes of health since the start, oldest first."""
         # any thread may read this; to iterate would fail if the follower appended meanwhile
         return tuple(self._changes.copy())
 
-    def statuses(
-        self, targets: Iterable[Target], commit: str, repository: StateRepository
-    ) -> dict[str, ReleaseStatus]:
-        """Return the status of each release, by the name of the release."""
+    def with_reports(self, situation: Situation, reader: Reader) -> Situation:
+        commit_state, caches, repository = situation.commit_state, self._caches, reader.repository
+        targets = [target for _, target in commit_state.targets]
+        domains = rollouts.domains_of_state(commit_state.state)
+        for domain in dict.fromkeys((*(target.domain for target in targets), *domains)):
+            if domain.cluster in caches and domain not in self._domains:
+                self._domains.add(domain)
+                caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
+        commit = commit_state.commit
         # Health is judged by the file that the cluster has applied. Judged by the newest commit,
         # everything would be `waiting` for seconds after each commit.
-        targets = list(targets)
-        self._watch(target.domain for target in targets)
-        reported = statuses(targets, commit, self._caches, repository, repository.changed_paths)
-        status_of = {target.name: each for target, each in zip(targets, reported, strict=True)}
+        reported = statuses(targets, commit, caches, repository, repository.changed_paths)
+        status_of = {target.name: status for target, status in zip(targets, reported, strict=True)}
         at = self._runtime.monotonic()
         for name, status in status_of.items():
             before, after = self._states.get(name, ""), word_of(status)
@@ -97,48 +88,19 @@ class ClusterWatch:
         for name in self._states.keys() - status_of.keys():
             del self._states[name]
             self._unhealthy_from.pop(name, None)
-        return status_of
-
-    def old_bootstraps(
-        self, domains: Collection[ClusterDomain], read: Callable[[str], str | None]
-    ) -> tuple[OldBootstrap, ...]:
-        """Return the watched clusters that lack the current version of their bootstrap file.
-
-        ``read`` returns the text of a file of the state repo. Access domains that cannot be read
-        are left out.
-        """
-        self._watch(domains)
-        return tuple(old_bootstraps(domains, self._caches, read))
-
-    def orphans(
-        self,
-        domains: Collection[ClusterDomain],
-        targets: Iterable[Target],
-        commit: str,
-        repository: StateRepository,
-    ) -> tuple[Orphan, ...]:
-        """Return the orphans on the watched clusters: objects whose release is gone.
-
-        Access domains that cannot be read, or that have not applied ``commit``, are left out.
-        """
-        self._watch(domains)
-        return tuple(orphans(domains, targets, commit, self._caches, repository))
-
-    def _watch(self, domains: Iterable[ClusterDomain]) -> None:
-        for domain in dict.fromkeys(domains):
-            if domain.cluster in self._caches and domain not in self._domains:
-                self._domains.add(domain)
-                self._caches[domain.cluster].watch(health_reader(domain).objects_to_watch(domain))
+        return replace(
+            situation,
+            statuses=status_of,
+            old_bootstraps=tuple(old_bootstraps(domains, caches, reader.file_reader(commit))),
+            orphans=tuple(orphans(domains, targets, commit, caches, repository)),
+        )
 
     def close(self) -> None:
         for cache in self._caches.values():
             cache.close()
 
 
-# ---- follows the state repo, and provides what the page shows ----
-#
-# A situation is the state at a commit, with the reports of the clusters (:class:`Situation`). The
-# page shows the newest situation, situations at earlier commits, and the newest commits.
+# ---- the state repo, and its newest commits ----
 #
 # One thread fetches new commits and publishes each new situation. The threads that answer requests
 # read the published situation.
@@ -167,18 +129,12 @@ class Follower:
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Read the newest state and follow the state repo.
+        """Read the newest state and follow the state repo; :meth:`close` closes ``reader``.
 
-        Args:
-            reader: the open state repo; :meth:`close` of the follower closes it.
-            clusters: how to reach the clusters; a cluster without a kubeconfig is not watched.
-            interval: seconds between fetches from a remote. With 0, the follower fetches only after
-                :meth:`wake` or a change on a cluster.
-            progress: called while the ledger is loaded.
-            runtime: provides the time and the threads.
+        ``interval`` has the seconds between fetches from a remote. With 0, the follower fetches
+        only after :meth:`wake` or a change on a cluster.
         """
         self._reader, self._runtime = reader, runtime
-        # without an interval, the follower waits until `wake`
         self._interval = _LOOK_S if reader.repository.always_current else interval or None
         self._wake, self.closed = runtime.event(), runtime.event()
         self._watch = ClusterWatch(clusters, self._wake.set, runtime)
@@ -201,19 +157,15 @@ class Follower:
         return self._watch.changes
 
     def reader(self) -> Reader:
-        """Return a reader of the state repo for the calling thread."""
         return self._reader.for_another_thread()
 
     def reading(self) -> AbstractContextManager[None]:
-        """Return a context that raises StateRepoError if an object is missing or damaged."""
+        # raises StateRepoError if an object is missing or damaged
         repository = self._reader.repository
         return reading(repository.address, repository.objects)
 
     def at(self, revision: str) -> Situation:
-        """Return the situation at a commit or time; the newest if ``revision`` is empty.
-
-        The situation at an earlier commit has neither health nor proposals.
-        """
+        """Return the situation at a commit or time; the newest if ``revision`` is empty."""
         newest = self.newest
         if not revision:
             return newest
@@ -232,20 +184,12 @@ class Follower:
         return Situation(commit_state, newest.now, is_newest=False)
 
     def last_change(self, commit_state: CommitState, path: str) -> LogEntry | None:
-        """Return the newest commit that changed a file or folder, up to that of ``commit_state``.
-
-        Return None if none changed it, or if ``path`` is empty.
-        """
         if path not in commit_state.last_changes:
             changes = self.reader().log(commit_state.commit, path) if path else iter(())
             commit_state.last_changes[path] = next(changes, None)
         return commit_state.last_changes[path]
 
     def not_rendered(self, commit_state: CommitState) -> frozenset[str]:
-        """Return the generated files that a generator must still write or remove after a commit.
-
-        Return none if the state of the commit cannot be read or rendered.
-        """
         if commit_state.not_rendered is None:
             try:
                 commit_state.not_rendered = self.reader().not_rendered(commit_state.snapshot)
@@ -290,38 +234,24 @@ class Follower:
                 self.closed.wait(min(1.0, _PAUSE_FACTOR * (self._runtime.monotonic() - began)))
 
     def _situation_at(self, commit_state: CommitState) -> Situation:
-        self._read_history(commit_state.commit)
         watch, repository, commit = self._watch, self._reader.repository, commit_state.commit
+        last = self.history[0].entry.commit if self.history else ""
+        if commit != last:
+            new, before = None, self.history
+            if last and repository.includes(commit, last):
+                with suppress(DemandOpsError):
+                    new = list(islice(self._reader.log(f"{last}..{commit}"), MOST_COMMITS))
+            if new is None:  # the first time, or somebody has rewritten the history
+                new, before = list(islice(self._reader.log(commit), MOST_COMMITS)), ()
+            added = tuple(Commit(entry, self._reader.changed_roots(entry.commit)) for entry in new)
+            self.history = (added + before)[:MOST_COMMITS]
         situation = Situation(
             commit_state,
             self._runtime.now(),
             watched=watch.clusters,
             proposals=tuple(pending_proposals(repository)),
         )
-        if not watch.clusters:
-            return situation
-        targets = [target for _, target in commit_state.targets]
-        domains = rollouts.domains_of_state(commit_state.state)
-        return replace(
-            situation,
-            statuses=watch.statuses(targets, commit, repository),
-            old_bootstraps=watch.old_bootstraps(domains, self._reader.file_reader(commit)),
-            orphans=watch.orphans(domains, targets, commit, repository),
-        )
-
-    def _read_history(self, tip: str) -> None:
-        last = self.history[0].entry.commit if self.history else ""
-        if tip == last:
-            return
-        new = None
-        if last and self._reader.repository.includes(tip, last):
-            with suppress(DemandOpsError):
-                new = list(islice(self._reader.log(f"{last}..{tip}"), MOST_COMMITS))
-        before = self.history
-        if new is None:  # the first time, or somebody has rewritten the history
-            new, before = list(islice(self._reader.log(tip), MOST_COMMITS)), ()
-        added = tuple(Commit(entry, self._reader.changed_roots(entry.commit)) for entry in new)
-        self.history = (added + before)[:MOST_COMMITS]
+        return watch.with_reports(situation, self._reader) if watch.clusters else situation
 
 
 def _commit_state(reader: Reader, snapshot: Snapshot) -> CommitState:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -20,7 +21,6 @@ from demandops.views import demand_lists
 from demandops.web.situation import RANKS, WORDS, ReusableRows, Situation, word_of, worst_word
 
 # ---- lists that can be filtered, sorted and paged, as plain values ----
-
 
 # How many rows a page of a list has at most.
 PAGE = 100
@@ -47,16 +47,12 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """The content of one field of a row: texts, or a time.
-
-    ``tone`` is the cell's color. ``order`` is the sort key; by default it is the time or the first
-    text.
-    """
+    """A field of a row: texts, or a time; ``tone`` is its color."""
 
     parts: tuple[Part, ...] = ()
     time: datetime | None = None
     tone: str = ""
-    order: float | str | None = None
+    order: float | str | None = None  # by default the time or the first text
 
     @property
     def shown(self) -> tuple[Part, ...]:
@@ -68,7 +64,7 @@ class Cell:
 
     @property
     def rank(self) -> tuple[bool, float, str]:
-        """The key by which rows are sorted; in ascending order, empty cells come last."""
+        # in ascending order, empty cells come last
         order = self.order
         if order is None:
             order = self.time.timestamp() if self.time else self.parts[0].text if self.parts else ""
@@ -92,7 +88,7 @@ class Row:
 
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
-        """The texts of each column and hidden field; lower case, because filters ignore case."""
+        """The texts of each field; lower case, because filters ignore case."""
         all_texts = {
             key: tuple(part.text for part in cell.parts) for key, cell in self.cells.items()
         }
@@ -107,23 +103,18 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One page of a filtered and sorted list.
-
-    ``total`` counts all rows of the list, ``matching`` the rows that match the filter. ``sort`` is
-    the key of a column, with ``-`` in front for the reverse order.
-    """
+    """One page of a filtered and sorted list."""
 
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
-    total: int
+    total: int  # of all rows of the list
     matching: int
-    sort: str
+    sort: str  # the key of a column, with `-` in front for the reverse order
     page: int
     pages: int
 
 
 def cell(*texts: Text, tone: str = "", order: float | str | None = None) -> Cell:
-    """Return a cell with all of ``texts`` that are not empty."""
     parts = (text if isinstance(text, Part) else Part(str(text)) for text in texts)
     return Cell(tuple(part for part in parts if part.text), tone=tone, order=order)
 
@@ -159,17 +150,12 @@ class Filter:
 
 
 def exactly(key: str, value: str) -> str:
-    """Return the filter text for rows whose field ``key`` has exactly this value."""
     return shlex.quote(f"{key}={value}")
 
 
 def table(
     columns: Sequence[Column], rows: Iterable[Row], wanted: Filter, sort: str, page: int
 ) -> Table:
-    """Return a page of the rows that match the filter.
-
-    An unknown ``sort`` means the first column.
-    """
     every = list(rows)
     matching = [row for row in every if wanted.matches(row)]
     key = sort.removeprefix("-")
@@ -181,10 +167,6 @@ def table(
 
 
 def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item], int, int]:
-    """Return the items of a page, the number of the page, and the number of pages.
-
-    A number out of range means the nearest page.
-    """
     pages = max(1, -(-len(items) // size))
     page = min(max(page, 1), pages)
     return items[(page - 1) * size : page * size], page, pages
@@ -195,21 +177,22 @@ def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item]
 Values: TypeAlias = "tuple[Any, ...]"
 
 
-@dataclass(frozen=True, slots=True)
-class ListKind:
-    """One of the lists: its name in addresses, its title, its columns and its entries.
+class ListKind(ABC):
+    """One of the lists, with its name in addresses.
 
-    ``entries`` yields the id and the values of each entry. ``row`` makes a row from the world and
-    the values. For an entry whose values have not changed, ``row`` is called again only if the
-    configuration or the overrides have changed.
+    ``entries`` yields the id and the values of each entry, from which ``row`` makes a row. While
+    the values stay the same, ``row`` is called again only if the configuration or the overrides
+    have changed.
     """
 
     name: str
     title: str
     about: str
     columns: tuple[Column, ...]
-    entries: Callable[[Situation], Iterator[tuple[str, Values]]]
     row: Callable[..., Row]
+
+    @abstractmethod
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]: ...
 
 
 def _release_part(name: str) -> Part:
@@ -221,12 +204,10 @@ def _demand_part(id: str) -> Part:
 
 
 def _health_cell(word: str) -> Cell:
-    """Return the cell for a health word; its sort key puts the worst health first."""
     return cell(word, tone=WORDS[word], order=RANKS[word])
 
 
 def _linked(view: str, key: str, values: Iterable[str]) -> Cell:
-    """Return a cell in which each value is linked to the rows that have it in field ``key``."""
     return cell(*(Part(value, Link(view, {"q": exactly(key, value)})) for value in values))
 
 
@@ -234,125 +215,164 @@ def _requesters(requesters: Iterable[str]) -> Cell:
     return _linked("demands", "requester", requesters)
 
 
-def _services(now: Situation) -> Iterator[tuple[str, Values]]:
-    for release, _ in now.commit_state.targets:
-        if isinstance(release, ServiceRelease):
-            name = release.name
-            claims = now.commit_state.claims_of_releases[name]
-            yield name, (release, claims, word_of(now.status(name)))
+def _columns(keys_and_titles: str) -> tuple[Column, ...]:
+    return tuple(Column(*column.split("|")) for column in keys_and_titles.split(", "))
 
 
-def _service(world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
-    return Row(
-        {
-            "release": cell(_release_part(release.name)),
-            "service": cell(release.key.service),
-            "node": _linked("services", "node", [release.node.id]),
-            "cluster": cell(release.node.cluster),
-            "application": _linked("services", "application", release.applications),
-            "version": cell(release.version.name or release.chart.version),
-            "requester": _requesters(release.requesters),
-            "health": _health_cell(word),
-        },
-        {"demand": [*dict.fromkeys(claim.demand for claim in claims)], "type": [release.node.type]},
+class DemandsList(ListKind):
+    name = "demands"
+    title = "Demands"
+    about = "What requesters hold, until they release it or its lease ends."
+    columns = _columns(
+        "demand|Demand, health|Health, requester|Requesters, application|Applications, "
+        "connection|Connections, since|Since, lease|Lease until, request|Request"
     )
 
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
+        commit_state = now.commit_state
+        for id, claims in commit_state.claims_of_demands.items():
+            releases = commit_state.releases_of_demands.get(id, [])
+            yield id, (claims, releases, worst_word(map(now.status, releases)))
+        for demand in commit_state.state.ledger.waiting.values():
+            yield f"waiting {demand.demand}", (demand, [], "waiting")
 
-def _connections(now: Situation) -> Iterator[tuple[str, Values]]:
-    ledger = now.commit_state.active.ledger
-    clients_of: dict[str, list[str]] = {}
-    for name, release in now.commit_state.releases.items():
-        if not isinstance(release, ServiceRelease):
-            for id in release.connections:
-                clients_of.setdefault(id, []).append(name)
-    for id in ledger.subjects(SubjectKind.CONNECTION):
-        claims, clients = ledger.connection_claims(id), clients_of.get(id, [])
-        if claims:  # at least one claim is not suspended
-            yield id, (claims, clients, worst_word(map(now.status, clients)))
+    def row(
+        self, world: World, holds: list[Claim] | WaitingDemand, releases: list[str], word: str
+    ) -> Row:
+        if isinstance(holds, WaitingDemand):
+            held = demand_lists.waiting_demand(holds)
+        else:
+            held = demand_lists.held_demand(holds, world)
+        health = _health_cell(word)
+        if held.state == "suspended":
+            health = cell("suspended", tone="bad", order=0.0)
+        elif held.state == "waiting":
+            health = cell("waits for room", tone="busy", order=RANKS["waiting"])
+        return Row(
+            {
+                "demand": cell(_demand_part(held.name)),
+                "request": cell(*held.requests),
+                "requester": _requesters(held.requesters),
+                "application": _linked("services", "application", held.applications),
+                "connection": _linked("connections", "connection", held.connections),
+                "since": Cell(time=held.since),
+                "lease": Cell(time=held.lease.until if held.lease else None),
+                "health": health,
+            },
+            {"release": releases, "node": held.nodes},
+        )
 
 
-def _connection(world: World, claims: tuple[Claim, ...], clients: list[str], word: str) -> Row:
-    held = claims[0].connection
-    return Row(
-        {
-            "connection": cell(held.id),
-            "by": cell(held.type.word if held.type else ""),
-            "from": _linked("connections", "from", [held.source]),
-            "to": _linked("connections", "to", [held.target]),
-            "topic": cell(*(route.source for route in connection_topics(claims))),
-            "requester": _requesters(requesters_of(claims)),
-            "release": cell(*map(_release_part, clients)),
-            "health": _health_cell(word),
-        },
-        {"demand": [claim.demand for claim in claims], "node": [held.source, held.target]},
+class ServicesList(ListKind):
+    name = "services"
+    title = "Services"
+    about = "One row for each Helm release: a service on a node, shared by all who need it."
+    columns = _columns(
+        "release|Release, health|Health, service|Service, node|Node, cluster|Cluster, "
+        "application|For, version|Version, requester|Requesters"
     )
 
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
+        for release, _ in now.commit_state.targets:
+            if isinstance(release, ServiceRelease):
+                name = release.name
+                claims = now.commit_state.claims_of_releases[name]
+                yield name, (release, claims, word_of(now.status(name)))
 
-def _demands(now: Situation) -> Iterator[tuple[str, Values]]:
-    commit_state = now.commit_state
-    for id, claims in commit_state.claims_of_demands.items():
-        releases = commit_state.releases_of_demands.get(id, [])
-        yield id, (claims, releases, worst_word(map(now.status, releases)))
-    for demand in commit_state.state.ledger.waiting.values():
-        yield f"waiting {demand.demand}", (demand, [], "waiting")
+    def row(self, world: World, release: ServiceRelease, claims: list[Claim], word: str) -> Row:
+        return Row(
+            {
+                "release": cell(_release_part(release.name)),
+                "service": cell(release.key.service),
+                "node": _linked("services", "node", [release.node.id]),
+                "cluster": cell(release.node.cluster),
+                "application": _linked("services", "application", release.applications),
+                "version": cell(release.version.name or release.chart.version),
+                "requester": _requesters(release.requesters),
+                "health": _health_cell(word),
+            },
+            {
+                "demand": [*dict.fromkeys(claim.demand for claim in claims)],
+                "type": [release.node.type],
+            },
+        )
 
 
-def _demand(
-    world: World, holds: list[Claim] | WaitingDemand, releases: list[str], word: str
-) -> Row:
-    if isinstance(holds, WaitingDemand):
-        held = demand_lists.waiting_demand(holds)
-    else:
-        held = demand_lists.held_demand(holds, world)
-    health = _health_cell(word)
-    if held.state == "suspended":
-        health = cell("suspended", tone="bad", order=0.0)
-    elif held.state == "waiting":
-        health = cell("waits for room", tone="busy", order=RANKS["waiting"])
-    return Row(
-        {
-            "demand": cell(_demand_part(held.name)),
-            "request": cell(*held.requests),
-            "requester": _requesters(held.requesters),
-            "application": _linked("services", "application", held.applications),
-            "connection": _linked("connections", "connection", held.connections),
-            "since": Cell(time=held.since),
-            "lease": Cell(time=held.lease.until if held.lease else None),
-            "health": health,
-        },
-        {"release": releases, "node": held.nodes},
+class ConnectionsList(ListKind):
+    name = "connections"
+    title = "Connections"
+    about = "Topics that are carried from one node to another."
+    columns = _columns(
+        "connection|Connection, health|Health, by|By, from|From, to|To, topic|Topics, "
+        "requester|Requesters, release|Releases"
     )
 
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
+        ledger = now.commit_state.active.ledger
+        clients_of: dict[str, list[str]] = {}
+        for name, release in now.commit_state.releases.items():
+            if not isinstance(release, ServiceRelease):
+                for id in release.connections:
+                    clients_of.setdefault(id, []).append(name)
+        for id in ledger.subjects(SubjectKind.CONNECTION):
+            claims, clients = ledger.connection_claims(id), clients_of.get(id, [])
+            if claims:  # at least one claim is not suspended
+                yield id, (claims, clients, worst_word(map(now.status, clients)))
 
-def _leases(now: Situation) -> Iterator[tuple[str, Values]]:
-    for claim in now.commit_state.state.ledger:
-        if claim.lease is not None:
-            yield f"{claim.subject} {claim.demand}", (claim,)
+    def row(self, world: World, claims: tuple[Claim, ...], clients: list[str], word: str) -> Row:
+        held = claims[0].connection
+        return Row(
+            {
+                "connection": cell(held.id),
+                "by": cell(held.type.word if held.type else ""),
+                "from": _linked("connections", "from", [held.source]),
+                "to": _linked("connections", "to", [held.target]),
+                "topic": cell(*(route.source for route in connection_topics(claims))),
+                "requester": _requesters(requesters_of(claims)),
+                "release": cell(*map(_release_part, clients)),
+                "health": _health_cell(word),
+            },
+            {"demand": [claim.demand for claim in claims], "node": [held.source, held.target]},
+        )
 
 
-def _lease(world: World, claim: Claim) -> Row:
-    lease = claim.lease
-    assert lease is not None  # noqa: S101 - only claims with a lease are listed
-    return Row(
-        {
-            "ends": Cell(time=lease.until),
-            "subject": cell(claim.subject.id),
-            "kind": cell(claim.subject.kind.value[:-1]),
-            "demand": cell(_demand_part(claim.demand)),
-            "requester": _requesters(claim.requesters),
-            "term": cell(duration_text(lease.seconds), order=float(lease.seconds)),
-            "slack": cell(duration_text(lease.slack), order=float(lease.slack)),
-        },
-        {"node": demand_lists.nodes_of(claim)},
+class LeasesList(ListKind):
+    name = "leases"
+    title = "Leases"
+    about = "Claims that end unless their requester renews them. The first to end comes first."
+    columns = _columns(
+        "ends|Ends, subject|Holds, kind|Kind, demand|Demand, requester|Requesters, "
+        "term|Term, slack|Slack"
     )
 
+    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]:
+        for claim in now.commit_state.state.ledger:
+            if claim.lease is not None:
+                yield f"{claim.subject} {claim.demand}", (claim,)
 
-def _columns(*named: str) -> tuple[Column, ...]:
-    return tuple(Column(*each.split("|")) for each in named)
+    def row(self, world: World, claim: Claim) -> Row:
+        lease = claim.lease
+        assert lease is not None  # noqa: S101 - only claims with a lease are listed
+        return Row(
+            {
+                "ends": Cell(time=lease.until),
+                "subject": cell(claim.subject.id),
+                "kind": cell(claim.subject.kind.value[:-1]),
+                "demand": cell(_demand_part(claim.demand)),
+                "requester": _requesters(claim.requesters),
+                "term": cell(duration_text(lease.seconds), order=float(lease.seconds)),
+                "slack": cell(duration_text(lease.slack), order=float(lease.slack)),
+            },
+            {"node": demand_lists.nodes_of(claim)},
+        )
+
+
+LISTS: dict[str, ListKind] = {
+    kind.name: kind for kind in (DemandsList(), ServicesList(), ConnectionsList(), LeasesList())
+}
 
 
 def rows_of(now: Situation, name: str) -> list[Row]:
-    """Return the rows of a list; reuse the rows of entries that have not changed."""
     commit_state, kind = now.commit_state, LISTS[name]
     reusable = commit_state.rows.get(name, ReusableRows(None, {}))
     # the follower makes a new mapping of statuses whenever it looks, so the same mapping means that
@@ -366,77 +386,3 @@ def rows_of(now: Situation, name: str) -> list[Row]:
             rows[id] = before
         reusable = commit_state.rows[name] = ReusableRows(now.statuses, rows)
     return [row for _, row in reusable.rows.values()]
-
-
-LISTS = {
-    kind.name: kind
-    for kind in (
-        ListKind(
-            "demands",
-            "Demands",
-            "What requesters hold, until they release it or its lease ends.",
-            _columns(
-                "demand|Demand",
-                "health|Health",
-                "requester|Requesters",
-                "application|Applications",
-                "connection|Connections",
-                "since|Since",
-                "lease|Lease until",
-                "request|Request",
-            ),
-            _demands,
-            _demand,
-        ),
-        ListKind(
-            "services",
-            "Services",
-            "One row for each Helm release: a service on a node, shared by all who need it.",
-            _columns(
-                "release|Release",
-                "health|Health",
-                "service|Service",
-                "node|Node",
-                "cluster|Cluster",
-                "application|For",
-                "version|Version",
-                "requester|Requesters",
-            ),
-            _services,
-            _service,
-        ),
-        ListKind(
-            "connections",
-            "Connections",
-            "Topics that are carried from one node to another.",
-            _columns(
-                "connection|Connection",
-                "health|Health",
-                "by|By",
-                "from|From",
-                "to|To",
-                "topic|Topics",
-                "requester|Requesters",
-                "release|Releases",
-            ),
-            _connections,
-            _connection,
-        ),
-        ListKind(
-            "leases",
-            "Leases",
-            "Claims that end unless their requester renews them. The first to end comes first.",
-            _columns(
-                "ends|Ends",
-                "subject|Holds",
-                "kind|Kind",
-                "demand|Demand",
-                "requester|Requesters",
-                "term|Term",
-                "slack|Slack",
-            ),
-            _leases,
-            _lease,
-        ),
-    )
-}

@@ -22,8 +22,7 @@ from demandops.views import explanations
 from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of, worst_word
 
-# ---- who can probably fix a release that is not ready, judged by the files and the cluster ----
-
+# ---- who can probably fix a release that is not ready ----
 
 Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting", "starting"]
 
@@ -44,9 +43,7 @@ LastChange = Callable[[str], "LogEntry | None"]
 
 @dataclass(frozen=True, slots=True)
 class Remedy:
-    """Who can fix a cause, how, and by which command; all but ``who`` may be empty."""
-
-    who: str
+    who: str  # can fix the cause; all else may be empty
     how: str = ""
     command: str = ""
 
@@ -63,7 +60,7 @@ def remedy_of(
     """Return who can probably fix a release, and how.
 
     ``object`` names what is not ready: an object, such as ``Deployment perception/od-edge``, or a
-    cluster that cannot be read. ``reason`` says why.
+    cluster that cannot be read.
     """
     cluster, (word, _, name) = release.node.cluster, object.partition(" ")
     namespace, _, short = name.partition("/")
@@ -119,33 +116,27 @@ def remedy_of(
 
 
 def _changed_by(paths: Iterable[str], last_change: LastChange) -> str:
-    """Return a text that names the people who last changed each path; empty if no person did."""
     changes = filter(None, map(last_change, paths))
     people = dict.fromkeys(change.author for change in changes if change.author != GENERATOR_NAME)
     return f" (last changed by {', '.join(people)})" if people else ""
 
 
-# ---- which applications are not ready, why and since when, and who can fix the causes ----
+# ---- the causes, and the applications that they keep from being ready ----
 
 _MOST_LISTED = 3
 
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Something that keeps applications from being ready, or that needs attention.
-
-    ``told`` has details, such as a cluster's message, a fault in a file, or a person's reason.
-    ``releases`` names the releases that an override denies, or that are not healthy. It is empty
-    for a cause that is not found by release, such as a claim that an override suspends.
-    """
+    """Something that keeps applications from being ready, or that needs attention."""
 
     kind: Kind
     what: Part
     why: str
     remedy: Remedy
     since: datetime | None = None
-    told: str = ""
-    releases: tuple[str, ...] = ()
+    told: str = ""  # details, such as a cluster's message, or a person's reason
+    releases: tuple[str, ...] = ()  # empty if the cause is not found by release
     applications: tuple[str, ...] = ()
     requesters: tuple[str, ...] = ()
     demands: tuple[str, ...] = ()
@@ -166,13 +157,8 @@ class Cause:
 
 @dataclass(frozen=True, slots=True)
 class Ready:
-    """Whether an application is ready: one word for its state, and the causes if it is not.
-
-    ``word`` is a word for a health, or the kind of the first cause.
-    """
-
     application: str
-    word: str
+    word: str  # for a health, or the kind of the first cause
     causes: tuple[Cause, ...]
 
     @property
@@ -181,18 +167,14 @@ class Ready:
 
 
 def causes(
-    now: Situation, wanted: Filter, last_change: LastChange, pending: Collection[str] = ()
+    now: Situation, wanted: Filter, last_change: LastChange, not_rendered: Collection[str] = ()
 ) -> list[Cause]:
-    """Return every cause that matches the filter, the worst kind first, then the oldest.
-
-    ``last_change`` returns the newest commit that changed a file or folder. ``pending`` are the
-    generated files that a generator must still write or remove.
-    """
+    """Return every cause that matches the filter, the worst kind first, then the oldest."""
     all_causes = [
         *_unread_or_invalid(now, last_change),
         *_overridden(now.commit_state, last_change),
         *_of_releases(now, last_change),
-        *_awaited(now, sorted(pending)),
+        *_awaited(now, sorted(not_rendered)),
     ]
     places = {kind: place for place, kind in enumerate(KINDS)}
     latest = now.now.timestamp()
@@ -203,7 +185,6 @@ def causes(
 
 
 def applications(now: Situation, causes: Iterable[Cause], wanted: Filter) -> list[Ready]:
-    """Return the applications that match the filter, those with a cause in ``causes`` first."""
     by_application: dict[str, list[Cause]] = {}
     for cause in causes:
         for application in cause.applications:
@@ -270,30 +251,17 @@ def _unread_or_invalid(now: Situation, last_change: LastChange) -> Iterator[Caus
 
 
 def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[Cause]:
-    """Yield a cause for each override that suspends claims, and for each release that one denies.
-
-    The claims that need a denied release are not suspended as a whole.
-    """
-    by_override: dict[str, tuple[Override, list[Claim]]] = {}
-    for claim, override in suspended_claims(commit_state.state):
-        by_override.setdefault(override.name, (override, []))[1].append(claim)
-    denials: list[tuple[Override, Part, str, Sequence[Claim], Iterable[str], tuple[str, ...]]] = []
-    claims: Sequence[Claim]
-    applications: Iterable[str]
-    for override, claims in by_override.values():
-        names = dict.fromkeys(claim.subject.id for claim in claims)
-        what = Part(" and ".join(names), Link("overrides"))
-        applications = _applications_with(commit_state, claims)
-        denials.append((override, what, "is booked", claims, applications, ()))
-    for release, override in commit_state.denied:
-        claims = explanations.claims_behind(commit_state.active.ledger, release)
-        what = Part(release.description, Link("release", {"name": release.name}))
-        applications = release.applications if isinstance(release, ServiceRelease) else ()
-        denials.append((override, what, "is needed", claims, applications, (release.name,)))
-    for override, what, state, claims, applications, releases in denials:
+    def denial(
+        override: Override,
+        what: Part,
+        state: str,
+        claims: Sequence[Claim],
+        applications: Iterable[str],
+        releases: tuple[str, ...] = (),
+    ) -> Cause:
         ends = f", or wait until the override ends at {override.expires}"
         change = last_change(override.path)
-        yield Cause(
+        return Cause(
             "suspended",
             what,
             f"{state}, but {override.path} denies it",
@@ -310,9 +278,23 @@ def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[
             since=change.time if change else None,
         )
 
+    by_override: dict[str, tuple[Override, list[Claim]]] = {}
+    for claim, override in suspended_claims(commit_state.state):
+        by_override.setdefault(override.name, (override, []))[1].append(claim)
+    for override, suspended in by_override.values():
+        names = dict.fromkeys(claim.subject.id for claim in suspended)
+        what = Part(" and ".join(names), Link("overrides"))
+        applications = _applications_with(commit_state, suspended)
+        yield denial(override, what, "is booked", suspended, applications)
+    # the claims that need a denied release are not suspended as a whole
+    for release, override in commit_state.denied:
+        needing = explanations.claims_behind(commit_state.active.ledger, release)
+        what = Part(release.description, Link("release", {"name": release.name}))
+        served = release.applications if isinstance(release, ServiceRelease) else ()
+        yield denial(override, what, "is needed", needing, served, (release.name,))
+
 
 def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
-    """Yield what waits for room on a node, for a person's decision, or for a generator."""
     for waiting in in_turn(now.commit_state.state.ledger.waiting):
         yield Cause(
             "waiting",
@@ -373,7 +355,6 @@ def _awaited(now: Situation, not_rendered: list[str]) -> Iterator[Cause]:
 
 
 def _of_releases(now: Situation, last_change: LastChange) -> Iterator[Cause]:
-    """Yield a cause for each reason why releases on a cluster are not healthy."""
     together: dict[tuple[str, str, str, str], list[str]] = {}
     for name, release in now.commit_state.releases.items():
         status = now.status(name)

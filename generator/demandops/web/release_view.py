@@ -25,39 +25,32 @@ from demandops.views import explanations
 from demandops.views.explanations import how_to_release, is_released_by_demand_id
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of
 
-# ---- the view of one demand: what it holds, and what would change if it were released ----
+# ---- the view of one demand ----
 
 
 @dataclass(frozen=True, slots=True)
 class Consequence:
-    """What would change if a demand were released, and how to release it.
-
-    ``how`` says in words how to release the demand. ``file`` is the text of a file for ``demandops
-    request`` that releases the demand by its id; it is empty if ``how`` names another way.
-    ``approval`` has the reasons why releasing the demand needs a person's approval. ``refused`` is
-    the reason why the generator would refuse to release the demand, or empty.
-    """
+    """What would change if a demand were released, and how to release it."""
 
     releases: tuple[ReleaseChange, ...]
     how: str
+    # For `demandops request`, if the demand can be released by its id.
     file: str
-    approval: tuple[str, ...] = ()
-    refused: str = ""
+    approval: tuple[str, ...] = ()  # why the release needs a person's approval
+    refused: str = ""  # why the generator would refuse it
 
 
 @dataclass(frozen=True, slots=True)
 class ExplainedDemand:
-    """A demand and its claims; ``releases`` are the names of the releases that it needs."""
-
     id: str
     claims: Sequence[Claim]
     requesters: tuple[str, ...]
-    releases: Sequence[str]
+    releases: Sequence[str]  # the names of those that it needs
     consequence: Consequence
 
 
 def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand:
-    """Return a demand and what would change if it were released; refuse one that holds nothing."""
+    """Return a demand and what would change without it; refuse one that holds nothing."""
     claims = now.commit_state.claims_of_demands.get(id)
     if not claims:
         waiting = now.commit_state.state.ledger.waiting.values()
@@ -84,31 +77,24 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand
     return ExplainedDemand(id, claims, requesters, releases, consequence)
 
 
-# ---- the view of one release: why it runs, its file, the last change, its history and status ----
+# ---- the view of one release ----
 
 MOST_CHANGES = 20
 
 
 @dataclass(frozen=True, slots=True)
 class DiffLine:
-    """A line of a diff; ``sign`` is ``+``, ``-``, ``@`` (the head of a section) or empty."""
-
-    sign: str
+    sign: str  # `+`, `-`, `@` at the head of a section, or empty
     text: str
 
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """A release that runs, that an override denies, or that ran before.
-
-    ``release`` is None if the release does not run; then ``claims`` is empty. ``difference`` is the
-    diff of the newest change of the release's file. The page proposes an override that stops the
-    release. ``stop_with_it`` names the other releases that such an override would stop.
-    """
+    """A release that runs, that an override denies, or that ran before."""
 
     name: str
     path: str
-    release: Release | None
+    release: Release | None  # None if it does not run
     denied_by: Override | None
     status: ReleaseStatus
     claims: tuple[Claim, ...]
@@ -117,7 +103,8 @@ class Explained:
     text: str
     history: PathHistory
     last_change: LogEntry | None
-    difference: tuple[DiffLine, ...]
+    difference: tuple[DiffLine, ...]  # the newest change of the release's file
+    # The other releases that the override stops which the page proposes for this one.
     stop_with_it: tuple[str, ...]
 
     @property
@@ -138,10 +125,6 @@ class Explained:
 
 
 def explained_release(now: Situation, reader: Reader, name: str) -> Explained:
-    """Return why a release runs, and the release's history.
-
-    A StateRepoError says that the situation's commit has no such release, and no earlier one had.
-    """
     commit_state = now.commit_state
     release = commit_state.releases.get(name)
     denied = None if release else explanations.denied_release_named(commit_state.state, name)
@@ -183,7 +166,6 @@ def explained_release(now: Situation, reader: Reader, name: str) -> Explained:
 
 
 def _others_stopped(commit_state: CommitState, release: Release) -> Iterable[str]:
-    """Yield the names of the other releases that an override on ``release`` would stop."""
     for name, other in commit_state.releases.items():
         if name == release.name:
             continue

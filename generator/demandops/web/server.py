@@ -7,7 +7,7 @@ import shlex
 from collections import Counter
 from collections.abc import AsyncIterator, Callable, Mapping
 from dataclasses import replace
-from datetime import datetime, timezone
+from datetime import timezone
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,8 +40,7 @@ from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Link, Row, rows_of
 from demandops.web.situation import Situation
 
-# ---- the views: for each address, the function that returns a template and its data ----
-
+# ---- the views, by address ----
 
 # The parameters that a link to another view keeps: the chosen commit or time, and the filter.
 _KEPT = ("at", "q")
@@ -63,8 +62,6 @@ View = Callable[["ViewRequest"], tuple[str, Data]]
 
 
 class ViewRequest:
-    """A request for a view: its parameters, the chosen situation and the chosen filter."""
-
     def __init__(self, follower: Follower, request: Request) -> None:
         self.follower = follower
         self.path = request.url.path.strip("/")
@@ -73,11 +70,10 @@ class ViewRequest:
         self.filter = Filter(self.get("q"))
 
     def get(self, name: str) -> str:
-        """Return the value of a parameter, at most 500 characters; empty if it is not given."""
+        # an address may have any length
         return self.params.get(name, "").strip()[:500]
 
     def page(self) -> int:
-        """Return the number of the requested page; 1 if the request gives no number."""
         # `isdigit` accepts "²", of which `int` makes no number
         text = self.get("page")
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
@@ -85,8 +81,7 @@ class ViewRequest:
     def to(self, path: str | None = None, **changes: str | int) -> str:
         """Return the address of a view, with the chosen commit or time and the filter.
 
-        Without ``path``, return the address of this view with all its parameters. ``changes`` are
-        new values of parameters; an empty value removes the parameter.
+        Without ``path``, it is this view with all its parameters. An empty value removes one.
         """
         kept = {name: value for name, value in self.params.items() if path is None or name in _KEPT}
         params = {name: value for name, value in {**kept, **changes}.items() if value != ""}
@@ -94,7 +89,7 @@ class ViewRequest:
         return f"/{self.path if path is None else path}{query}"
 
     def link(self, link: Link) -> str:
-        """Return the address of a link, with its own filter instead of the current one."""
+        # with its own filter instead of the current one
         return self.to(link.path, **{"q": "", **link.params})
 
 
@@ -108,11 +103,6 @@ def _not_ready(asked: ViewRequest) -> tuple[str, Data]:
     return "not_ready.html.j2", data
 
 
-def _map(asked: ViewRequest) -> tuple[str, Data]:
-    picture = fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))
-    return "map.html.j2", {"map": picture}
-
-
 def _list(asked: ViewRequest) -> tuple[str, Data]:
     kind = LISTS[asked.path]
     rows = rows_of(asked.situation, kind.name)
@@ -121,10 +111,8 @@ def _list(asked: ViewRequest) -> tuple[str, Data]:
 
 
 def _demand(asked: ViewRequest) -> tuple[str, Data]:
-    demand = release_view.explained_demand(
-        asked.situation, asked.follower.reader(), asked.get("id")
-    )
-    return "demand.html.j2", {"demand": demand}
+    now, reader = asked.situation, asked.follower.reader()
+    return "demand.html.j2", {"demand": release_view.explained_demand(now, reader, asked.get("id"))}
 
 
 def _release(asked: ViewRequest) -> tuple[str, Data]:
@@ -182,13 +170,16 @@ def _rates(asked: ViewRequest) -> tuple[str, Data]:
         if asked.filter.matches(time_line.of_commit(commit).row())
     ]
     plots = time_line.plots(commits, health, asked.situation.now, span)
-    data = {"plots": plots, "span": span, "spans": time_line.SPANS}
-    return "rates.html.j2", data | {"width": time_line.WIDTH, "height": time_line.HEIGHT}
+    size = {"width": time_line.WIDTH, "height": time_line.HEIGHT}
+    return "rates.html.j2", {"plots": plots, "span": span, "spans": time_line.SPANS, **size}
 
 
 VIEWS: Mapping[str, View] = {
     "/": _not_ready,
-    "/map": _map,
+    "/map": lambda asked: (
+        "map.html.j2",
+        {"map": fleet_map.picture(asked.situation, asked.filter, asked.get("layout"))},
+    ),
     **{f"/{name}": _list for name in LISTS},
     "/demand": _demand,
     "/release": _release,
@@ -198,9 +189,7 @@ VIEWS: Mapping[str, View] = {
 }
 
 
-# ---- server ----
-#
-# The site: it renders views as pages, sends events, and sets headers that keep other sites out.
+# ---- the site ----
 #
 # No request changes anything, and no page loads anything from another host. Templates escape the
 # HTML in every value that they print. They also escape invisible characters, except in the fields
@@ -246,15 +235,6 @@ class Site:
     def __init__(
         self, follower: Follower, hosts: tuple[str, ...] = ("*",), documentation: Path | None = None
     ) -> None:
-        """Make the site.
-
-        Args:
-            follower: follows the state repo that the page shows.
-            hosts: the names that the Host header of a request may have; ``*`` allows any name. A
-                list of names keeps another site from reading the page through the browsers of that
-                site's visitors (DNS rebinding).
-            documentation: the folder of the built documentation; None if it is not built.
-        """
         self._follower, self._has_docs = follower, documentation is not None
         self._quick = anyio.CapacityLimiter(_AT_ONCE)
         self._slow = anyio.CapacityLimiter(_SLOW_AT_ONCE)
@@ -270,7 +250,12 @@ class Site:
         )
         self._templates.filters |= {
             "when": lambda at: escaped(f"{at.astimezone(timezone.utc):%Y-%m-%d %H:%M:%S UTC}"),
-            "clock": _clock,
+            # the date only if it is not today's
+            "clock": lambda at, now: at.astimezone(timezone.utc).strftime(
+                "%H:%M:%S UTC"
+                if at.astimezone(timezone.utc).date() == now.astimezone(timezone.utc).date()
+                else "%Y-%m-%d %H:%M UTC"
+            ),
             "ago": relative,
             "iso": lambda at: f"{at.astimezone(timezone.utc):%Y-%m-%dT%H:%M:%SZ}",
             "sh": shlex.quote,
@@ -397,7 +382,6 @@ _REFUSAL = PlainTextResponse("another site asked for this; open the page itself\
 
 
 def _is_foreign(headers: Headers) -> bool:
-    """Return whether another site made the browser send a request."""
     site = headers.get("sec-fetch-site")
     if site is None:  # an old browser, a program, or another machine's page without TLS
         origin = headers.get("origin")
@@ -412,29 +396,17 @@ def _is_foreign(headers: Headers) -> bool:
     return site not in ("same-origin", "none") and not is_link
 
 
-def _clock(at: datetime, now: datetime) -> str:
-    """Return a time in UTC: with seconds on the day of ``now``, else with the date."""
-    at, today = at.astimezone(timezone.utc), now.astimezone(timezone.utc).date()
-    return at.strftime("%H:%M:%S UTC" if at.date() == today else "%Y-%m-%d %H:%M UTC")
-
-
-# ---- the web server of the page, which has its own thread and its own address ----
-
+# ---- the web server ----
 
 # How many connections may be open; at most half of them are streams of events (`Site`).
-_AT_ONCE = 200
+_MOST_CONNECTIONS = 200
 _LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 
 class WebServer:
     def __init__(self, address: str, option: str, follower: Follower) -> None:
-        """Start the server.
-
-        Args:
-            address: ``host:port``; port 0 picks a free port.
-            option: the option that gave the address, for messages.
-            follower: closed by :meth:`close`, or if the server cannot listen.
-        """
+        # The follower is closed by `close`, or if the server cannot listen. `option` is the option
+        # that gave the address, for messages.
         self._follower = follower
         try:
             listening = http_server.bound(address, option)
@@ -449,11 +421,12 @@ class WebServer:
                 "(docs/page.md)",
                 self.url,
             )
-        # Other names would allow DNS rebinding, see `Site`. A server that others reach may have any
-        # name, for example that of a reverse proxy.
+        # With any other name in the Host header, another site could read the page through the
+        # browsers of its visitors (DNS rebinding). A server that others reach may have any name,
+        # for example that of a reverse proxy.
         hosts = _LOCAL_HOSTS if is_local else ("*",)
         site = Site(follower, hosts, settings.documentation())
-        self._server = HttpServer(listening, site.application, "web", _AT_ONCE)
+        self._server = HttpServer(listening, site.application, "web", _MOST_CONNECTIONS)
 
     def close(self) -> None:
         self._follower.closed.set()  # ends the open streams of events

@@ -34,8 +34,7 @@ from demandops.repo.write.proposal_branch import PendingProposal
 from demandops.views import explanations
 from demandops.views.explanations import Entry, override_report
 
-# ---- the health of a release in one word, and the color of this word on the page ----
-
+# ---- the health of a release in one word ----
 
 # The words for a health, each with its color on the page, from the worst to the best health.
 WORDS = {
@@ -59,7 +58,7 @@ def word_of(status: ReleaseStatus) -> str:
 
 
 def since_of(status: ReleaseStatus) -> datetime | None:
-    """Return when a release's state last changed; None if the cluster reports no valid time."""
+    # a cluster may report no valid time
     try:  # Python 3.10 reads no "Z"
         since = datetime.fromisoformat(status.since.replace("Z", "+00:00"))
     except ValueError:
@@ -68,51 +67,32 @@ def since_of(status: ReleaseStatus) -> datetime | None:
 
 
 def worst_word(statuses: Iterable[ReleaseStatus]) -> str:
-    """Return the word for the worst health of releases; ``unknown`` if there are no releases."""
     return min(map(word_of, statuses), key=RANKS.__getitem__, default="unknown")
 
 
-# ---- situation ----
-#
-# What the page shows: the state at a commit, the health of releases and the open proposals.
-#
-# A commit state is the state at one commit, with everything that the page derives from it. The
-# newest situation is a commit state with the reports of the clusters and the open proposals. The
-# situation at an earlier commit has only the commit state.
+# ---- the state at one commit, and with it what the clusters report ----
 
 _UNKNOWN = ReleaseStatus(Health("waiting"))
 
 
 @dataclass(frozen=True, slots=True)
 class Planned:
-    """A planned release, and the claims that need it.
-
-    ``target`` names the Kubernetes object whose health counts as the release's health.
-    """
-
     release: Release
-    target: Target
-    claims: list[Claim]
+    target: Target  # the Kubernetes object whose health counts as the release's
+    claims: list[Claim]  # that need the release
 
 
 @dataclass(frozen=True, slots=True)
 class ReusableRows:
-    """The rows of a list, kept for the next time that the page shows the list.
+    """The rows of a list, kept for the next time that the page shows the list."""
 
-    ``rows`` maps the id of each entry to a pair: the entry's values, and the row made from the
-    values. ``statuses`` has the status of each release when the rows were made. If the rows are
-    taken over from an earlier commit, ``statuses`` is None.
-    """
-
+    # The status of each release when the rows were made; None if they are of an earlier commit.
     statuses: object
-    rows: Mapping[str, tuple[tuple[Any, ...], Any]]
+    rows: Mapping[str, tuple[tuple[Any, ...], Any]]  # the values and the row of each entry
 
 
 class CommitState:
-    """The state at one commit, with everything that the page derives from it.
-
-    Most attributes are computed at their first use, and then kept.
-    """
+    """The state at one commit, with all that the page derives from it at its first use."""
 
     def __init__(
         self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
@@ -142,7 +122,6 @@ class CommitState:
 
     @cached_property
     def active(self) -> World:
-        """Configuration and ledger without the claims that overrides suspend."""
         return without_suspended(self.state)
 
     def take_over(self, before: CommitState) -> None:
@@ -184,11 +163,10 @@ class CommitState:
     def _with_other_claims(
         self, before: CommitState, subjects: Iterable[Subject]
     ) -> Iterator[tuple[ReleaseKey, Planned]]:
-        """Yield the releases of ``before`` whose claims on ``subjects`` have changed."""
         gone: set[int] = set()
         fresh: dict[SubjectKind, dict[str, list[Claim]]] = {kind: {} for kind in SubjectKind}
         for subject in subjects:
-            was, now = (each.active.ledger.claims_on(subject) for each in (before, self))
+            was, now = (state.active.ledger.claims_on(subject) for state in (before, self))
             gone |= {id(claim) for claim in was} - {id(claim) for claim in now}
             before_ids = {id(claim) for claim in was}
             fresh[subject.kind][subject.id] = [
@@ -221,8 +199,8 @@ class CommitState:
     def planned(self) -> dict[ReleaseKey, Planned | None]:
         """The planned releases by key.
 
-        The value is None if an override denies the release, if overrides suspend all claims that
-        need it, or if the client of a connection carries no topic.
+        The value is None if the release is denied, if all claims that need it are suspended, or if
+        the client of a connection carries no topic.
         """
         if self._planned is None:
             self._planned = {key: self._plan(key) for key in all_keys(self.state)}
@@ -239,7 +217,6 @@ class CommitState:
 
     @cached_property
     def denied(self) -> list[tuple[Release, Override]]:
-        """The releases that claims need but an override denies, each with this override."""
         keys = (key for key, planned in self.planned.items() if planned is None)
         return [denied for key in keys if (denied := denied_release(self.state, key))]
 
@@ -248,7 +225,6 @@ class CommitState:
         return {release.name: release for release, _ in self.targets}
 
     def override_entries(self, now: datetime) -> list[Entry]:
-        """Return each override with its state and the releases and claims that it affects."""
         # only the first call computes the report, so its `now` decides which overrides have expired
         if self._entries is None:
             self._entries = override_report(self.state, now)
@@ -260,7 +236,6 @@ class CommitState:
 
     @cached_property
     def releases_of_demands(self) -> dict[str, list[str]]:
-        """The names of the releases that each demand needs, for demands that need any."""
         releases: dict[str, list[str]] = {}
         for name, claims in self.claims_of_releases.items():
             for demand in dict.fromkeys(claim.demand for claim in claims):
@@ -269,7 +244,6 @@ class CommitState:
 
     @cached_property
     def claims_of_demands(self) -> dict[str, list[Claim]]:
-        """The claims of each demand, sorted by subject."""
         claims_of: dict[str, list[Claim]] = {}
         for claim in self.state.ledger:
             claims_of.setdefault(claim.demand, []).append(claim)
@@ -283,25 +257,20 @@ class CommitState:
 class Situation:
     """The state at a commit, with the health of releases and the open proposals.
 
-    ``statuses`` maps names of releases to their status. ``watched`` names the clusters that the
-    page watches. ``old_bootstraps`` lists the watched clusters without the current bootstrap file.
-    ``orphans`` lists the objects that watched clusters still have, although they belong to no
-    release. ``unread`` is the reason why a newer state cannot be read or shown, or empty. For an
-    earlier commit, all these are empty.
+    For an earlier commit, all that the clusters report is empty.
     """
 
     commit_state: CommitState
     now: datetime
     is_newest: bool = True
     statuses: Mapping[str, ReleaseStatus] = field(default_factory=dict)
-    watched: frozenset[str] = frozenset()
+    watched: frozenset[str] = frozenset()  # clusters
     proposals: tuple[PendingProposal, ...] = ()
-    unread: str = ""
+    unread: str = ""  # why a newer state cannot be read or shown
     old_bootstraps: tuple[OldBootstrap, ...] = ()
     orphans: tuple[Orphan, ...] = ()
 
     def status(self, release: str) -> ReleaseStatus:
-        """Return the status of a release; its state is ``unknown`` if no cluster reports it."""
         return self.statuses.get(release, _UNKNOWN)
 
     @property
@@ -312,24 +281,16 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class HealthChange:
-    """A change of a release's health.
-
-    ``before`` and ``after`` are words of ``views.health_word``. ``lasted_s`` says for how many
-    seconds a release that became healthy was not healthy, counted from when the page first saw it
-    so. It is None if the release did not become healthy, or if the page never saw it so.
-    """
-
     time: datetime
     release: str
-    before: str
+    before: str  # a word of `WORDS`, as `after` is
     after: str
     reason: str = ""
+    # For a release that became healthy: how long the page saw that it was not.
     lasted_s: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class Commit:
-    """A commit of the history, and the top-level files and folders that it changed."""
-
     entry: LogEntry
-    roots: tuple[str, ...]
+    roots: tuple[str, ...]  # the top-level files and folders that it changed

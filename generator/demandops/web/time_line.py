@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone
+from functools import partial
 from statistics import median
 
 from demandops.model.config.base_model import span
@@ -14,8 +15,7 @@ from demandops.repo.history.commit_log import PROPOSAL
 from demandops.web.lists import Filter, Row, cell
 from demandops.web.situation import WORDS, Commit, HealthChange
 
-# ---- the time line, with the events of demands, overrides, people's commits and health ----
-
+# ---- the time line of events ----
 
 # The title of each lane of the time line, from top to bottom, by the lane's name.
 LANES = {
@@ -36,7 +36,7 @@ SPANS = {
     "all": 0,
 }
 
-WIDTH = 1000
+_STRIP_WIDTH = 1000
 _BINS = 60
 _FEW = 20
 # The distances between ticks that people can read off easily, from a second to 30 days.
@@ -66,17 +66,14 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """Events of one lane that are close together.
-
-    ``commit`` is the commit of the newest event; empty for a change of health.
-    """
+    """Events of one lane that are close together."""
 
     lane: str
     x: float
     radius: float
     count: int
     label: str
-    commit: str
+    commit: str  # of the newest event; empty for a change of health
     tone: str
     is_chosen: bool
 
@@ -89,15 +86,10 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Strip:
-    """The picture of the time line.
-
-    ``chosen`` is the x coordinate of the chosen commit; None if the picture does not show it.
-    """
-
     span: str
     dots: tuple[Dot, ...]
     ticks: tuple[Tick, ...]
-    chosen: float | None
+    chosen: float | None  # where the chosen commit is; None if the picture does not show it
 
 
 def events(commits: Iterable[Commit], health: Iterable[HealthChange]) -> list[Event]:
@@ -125,7 +117,6 @@ def of_commit(commit: Commit) -> Event:
 
 
 def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
-    """Return the events of ``lane`` (if empty, of all lanes) that match the filter."""
     return [
         event
         for event in events
@@ -139,7 +130,7 @@ def strip(
     """Return the picture of the time line that ends at ``now``, for events that are newest first.
 
     If ``span`` is no key of ``SPANS``, it is the shortest that has enough events. ``chosen`` is the
-    time and the id of the chosen commit; None if no earlier commit is chosen.
+    time and the id of the chosen commit.
     """
     if span not in SPANS:
         # enough events are 20, or three quarters of all events, whichever is less
@@ -154,13 +145,14 @@ def strip(
     length = max((now - start).total_seconds(), 1.0)
 
     def x_of(at: datetime) -> float:
-        return WIDTH * (at - start).total_seconds() / length
+        return _STRIP_WIDTH * (at - start).total_seconds() / length
 
     bins: dict[tuple[str, int], list[Event]] = {}
     for event in events:
         if event.time >= start:
-            x = min(x_of(event.time), WIDTH - 1e-6)  # an event of this moment is in the last bin
-            bins.setdefault((event.lane, int(x * _BINS / WIDTH)), []).append(event)
+            # an event of this moment is in the last bin
+            x = min(x_of(event.time), _STRIP_WIDTH - 1e-6)
+            bins.setdefault((event.lane, int(x * _BINS / _STRIP_WIDTH)), []).append(event)
     dots = []
     for (lane, place), group in sorted(bins.items()):
         newest, count = group[0], len(group)
@@ -169,9 +161,9 @@ def strip(
         label = f"{newest.time:%Y-%m-%d %H:%M:%S} UTC, {newest.word}: {what}{more}"
         tone = "bad" if any(event.tone == "bad" for event in group) else newest.tone
         is_chosen = chosen is not None and any(event.commit == chosen[1] for event in group)
-        x, radius = (place + 0.5) * WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
+        x, radius = (place + 0.5) * _STRIP_WIDTH / _BINS, min(4.0 + math.log2(count), 8.0)
         dots.append(Dot(lane, x, radius, count, label, newest.commit, tone, is_chosen))
-    step = next((each for each in _STEPS_S if length / each <= _TICKS), length / _TICKS)
+    step = next((step for step in _STEPS_S if length / step <= _TICKS), length / _TICKS)
     form = "%H:%M:%S" if step < 60 else "%H:%M" if step < 86400 else "%m-%d"
     ticks, at = list[Tick](), math.ceil(start.timestamp() / step) * step
     while at <= now.timestamp():
@@ -179,15 +171,11 @@ def strip(
         ticks.append(Tick(x_of(moment), moment.strftime(form)))
         at += step
     mark = x_of(chosen[0]) if chosen else None
-    shown = mark if mark is not None and 0 <= mark <= WIDTH else None
+    shown = mark if mark is not None and 0 <= mark <= _STRIP_WIDTH else None
     return Strip(span, tuple(dots), tuple(ticks), shown)
 
 
 # ---- plots of rates and latencies ----
-#
-# The rates are those of demands that are booked or released, and of people's commits. The latencies
-# are the time from the receipt of a demand to its commit, and the time until a release is healthy
-# again.
 
 WIDTH, HEIGHT = 560, 150
 _RATE_BINS = 48
@@ -204,20 +192,15 @@ class Bar:
 
 @dataclass(frozen=True, slots=True)
 class Plot:
-    """A plot: its bars, the highest value of the axis as text, and the values as a table.
-
-    Bins of time whose value is 0 have neither a bar nor a line in the table.
-    """
-
     title: str
     unit: str
     about: str
     bars: tuple[Bar, ...]
-    top: str
+    top: str  # the highest value of the axis
     first: datetime
     last: datetime
     summary: str
-    table: tuple[tuple[datetime, str], ...]
+    table: tuple[tuple[datetime, str], ...]  # without the bins of time whose value is 0
 
 
 # When a value was measured, and the value.
@@ -232,8 +215,7 @@ def plots(
 ) -> list[Plot]:
     """Return the plots of a span of time that ends at ``now``.
 
-    ``span`` is a key of ``SPANS``. ``all``, and any text that is no key, means the time since the
-    oldest of ``commits``; without commits, the last hour.
+    A ``span`` that is no key of ``SPANS`` means the time since the oldest of ``commits``.
     """
     seconds = SPANS.get(span, 0)
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
@@ -247,84 +229,65 @@ def plots(
         if entry.authored and entry.first("Operation") in _BOOKED | _RELEASED
     ]
     ready = [(change.time, change.lasted_s) for change in health if change.lasted_s is not None]
-    make = _PlotMaker(start, span_s)
+    by_people = [(commit.entry.time, 1.0) for commit in commits if not commit.entry.by_generator]
+    rate = partial(_plot, start, span_s, True)
+    latency = partial(_plot, start, span_s, False)
     return [
-        make.counts("Demands booked", _times(commits, _BOOKED), "commits that book a demand"),
-        make.counts(
+        rate("Demands booked", "commits that book a demand", _counted(commits, _BOOKED)),
+        rate(
             "Demands released",
-            _times(commits, _RELEASED),
             "commits that release demands, or end demands whose lease expired",
+            _counted(commits, _RELEASED),
         ),
-        make.counts(
-            "People's commits",
-            [commit.entry.time for commit in commits if not commit.entry.by_generator],
-            "commits that no generator made",
-        ),
-        make.medians("From received to committed", waits, "median (Git records whole seconds)"),
-        make.medians(
+        rate("People's commits", "commits that no generator made", by_people),
+        latency("From received to committed", "median (Git records whole seconds)", waits),
+        latency(
             "Until healthy again",
-            ready,
             "median time that releases were not healthy, since this page was started",
+            ready,
         ),
     ]
 
 
-def _times(commits: Iterable[Commit], operations: set[str]) -> list[datetime]:
+def _counted(commits: Iterable[Commit], operations: set[str]) -> list[Sample]:
     entries = (commit.entry for commit in commits)
-    return [entry.time for entry in entries if entry.first("Operation") in operations]
+    return [(entry.time, 1.0) for entry in entries if entry.first("Operation") in operations]
 
 
-class _PlotMaker:
-    def __init__(self, start: datetime, span_s: float) -> None:
-        self._start, self._bin_s = start, span_s / _RATE_BINS
-        self._span = span_s
-
-    def counts(self, title: str, times: Iterable[datetime], about: str) -> Plot:
-        bins = self._bins((at, 1.0) for at in times)
-        total = sum(map(len, bins))
-        per_hour = total * 3600 / self._span
-        summary = f"{total} in all, {per_hour:.3g} an hour"
-        values = [float(len(each)) for each in bins]
-        return self._plot(title, f"per {span(self._bin_s)}", about, values, summary, "")
-
-    def medians(self, title: str, samples: Iterable[Sample], about: str) -> Plot:
-        bins = self._bins(samples)
-        every = sorted(value for each in bins for value in each)
-        summary = "no values in this span of time"
+def _plot(
+    start: datetime, span_s: float, is_rate: bool, title: str, about: str, samples: list[Sample]
+) -> Plot:
+    bin_s, bins = span_s / _RATE_BINS, [list[float]() for _ in range(_RATE_BINS)]
+    for time, value in samples:
+        place = int((time - start).total_seconds() / bin_s)
+        if time >= start:
+            bins[min(place, _RATE_BINS - 1)].append(value)
+    every = sorted(value for measured in bins for value in measured)
+    if is_rate:
+        unit, suffix = f"per {span(bin_s)}", ""
+        values = [float(len(measured)) for measured in bins]
+        summary = f"{len(every)} in all, {len(every) * 3600 / span_s:.3g} an hour"
+    else:
+        unit, suffix, summary = "in seconds", " s", "no values in this span of time"
+        values = [median(measured) if measured else 0.0 for measured in bins]
         if every:
             late = every[math.ceil(0.95 * len(every)) - 1]
             summary = f"median {median(every):.3g} s, 95 % within {late:.3g} s, {len(every)} values"
-        values = [median(each) if each else 0.0 for each in bins]
-        return self._plot(title, "in seconds", about, values, summary, " s")
-
-    def _bins(self, samples: Iterable[Sample]) -> list[list[float]]:
-        bins: list[list[float]] = [[] for _ in range(_RATE_BINS)]
-        for time, value in samples:
-            place = int((time - self._start).total_seconds() / self._bin_s)
-            if time >= self._start:
-                bins[min(place, _RATE_BINS - 1)].append(value)
-        return bins
-
-    def _plot(
-        self, title: str, unit: str, about: str, values: list[float], summary: str, suffix: str
-    ) -> Plot:
-        top = max(*values, 1.0)  # at least 1, so that bins without a value divide by no zero
-        width = WIDTH / _RATE_BINS
-        starts = [self._start + timedelta(seconds=self._bin_s * n) for n in range(_RATE_BINS)]
-        texts = [f"{value:.3g}{suffix}" for value in values]
-        bars = tuple(
-            Bar(
-                round(n * width + 1, 2),
-                round(HEIGHT * (1 - value / top), 2),
-                round(width - 2, 2),
-                round(HEIGHT * value / top, 2),
-                f"{starts[n]:%Y-%m-%d %H:%M:%S} UTC: {texts[n]}",
-            )
-            for n, value in enumerate(values)
-            if value
+    top = max(*values, 1.0)  # at least 1, so that bins without a value divide by no zero
+    width = WIDTH / _RATE_BINS
+    starts = [start + timedelta(seconds=bin_s * n) for n in range(_RATE_BINS)]
+    texts = [f"{value:.3g}{suffix}" for value in values]
+    bars = tuple(
+        Bar(
+            round(n * width + 1, 2),
+            round(HEIGHT * (1 - value / top), 2),
+            round(width - 2, 2),
+            round(HEIGHT * value / top, 2),
+            f"{starts[n]:%Y-%m-%d %H:%M:%S} UTC: {texts[n]}",
         )
-        table = tuple((starts[n], texts[n]) for n, value in enumerate(values) if value)
-        end = self._start + timedelta(seconds=self._span)
-        return Plot(
-            title, unit, about, bars, f"{top:.3g}{suffix}", self._start, end, summary, table
-        )
+        for n, value in enumerate(values)
+        if value
+    )
+    table = tuple((starts[n], texts[n]) for n, value in enumerate(values) if value)
+    end = start + timedelta(seconds=span_s)
+    return Plot(title, unit, about, bars, f"{top:.3g}{suffix}", start, end, summary, table)

@@ -85,7 +85,7 @@ def test_clients_that_neither_ask_nor_read_are_cut_off(
     follower: Follower, monkeypatch: pytest.MonkeyPatch, sent: str
 ) -> None:
     monkeypatch.setattr(http_server, "_STUCK_S", 0.2)
-    monkeypatch.setattr(server, "_AT_ONCE", 4)
+    monkeypatch.setattr(server, "_MOST_CONNECTIONS", 4)
     page = WebServer("127.0.0.1:0", "--listen", follower)
     with ExitStack() as stack:
         for _ in range(4):

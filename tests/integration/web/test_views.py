@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -12,7 +13,7 @@ from demandops.cluster.health import Health
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
-from demandops.web import fleet_map
+from demandops.web import fleet_map, time_line
 from demandops.web.follower import Follower
 from demandops.web.lists import Filter, rows_of
 from demandops.web.not_ready import remedy_of
@@ -244,3 +245,19 @@ def test_a_demand_that_waits_for_room_is_listed(follower: Follower) -> None:
     assert [row.cells["health"].parts[0].text for row in rows] == ["waits for room"]
     with pytest.raises(StateRepoError, match="'later' holds nothing, because it waits for room"):
         explained_demand(now, follower.reader(), "later")
+
+
+def test_the_time_line_fills_the_drawing(shown: Shown) -> None:
+    follower = shown.follower
+    events = time_line.events(follower.history, follower.health_changes)
+    strip = time_line.strip(events, events[0].time, "all", None)
+    template = (Path(time_line.__file__).parent / "pages" / "timeline.html.j2").read_text()
+    width = int(re.findall(r'x2="(\d+)"', template)[0])
+    assert max(dot.x for dot in strip.dots) > 0.9 * width
+
+
+def test_no_name_of_a_page_module_is_bound_twice() -> None:
+    """Merged sections had the same name for two limits, and the later one replaced the other."""
+    for file in Path(time_line.__file__).parent.glob("*.py"):
+        names = re.findall(r"^(_?[A-Z][A-Z_]+)(?:, _?[A-Z_]+)* = ", file.read_text(), re.MULTILINE)
+        assert len(names) == len({*names}), file

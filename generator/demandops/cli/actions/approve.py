@@ -32,7 +32,6 @@ from demandops.repo.write.proposal_branch import (
 
 # ---- ``demandops approve``: merge a proposal in the caller's own name ----
 
-
 commit_option = click.option(
     "--commit",
     metavar="ID",
@@ -42,11 +41,7 @@ commit_option = click.option(
 )
 
 
-def proposal_named(repo: Reader, name: str) -> PendingProposal:
-    """Return the proposal with this branch, or with a demand of this id.
-
-    If there is none, ``name`` may be a part of a branch's name.
-    """
+def _proposal(repo: Reader, name: str, commit: str, output: str) -> PendingProposal:
     pending = list(pending_proposals(repo.repository))
     # requesters choose ids of demands, so such an id may be the branch of another proposal
     fitting = (
@@ -54,18 +49,16 @@ def proposal_named(repo: Reader, name: str) -> PendingProposal:
         or [proposal for proposal in pending if name in proposal.demands]
         or [proposal for proposal in pending if name in proposal.branch]
     )
-    if len(fitting) == 1:
-        return fitting[0]
-    if fitting:
-        branches = ", ".join(proposal.branch for proposal in fitting)
-        message = f"several proposals fit '{name}': {branches}"
-    else:
+    if len(fitting) != 1:
         close = suggestion(name, [proposal.branch for proposal in pending])
         message = f"no proposal fits '{name}'{close or '; nothing is proposed'}"
-    raise InvalidInput.at("", message)
-
-
-def print_proposal(proposal: PendingProposal, output: str) -> None:
+        if fitting:
+            branches = ", ".join(proposal.branch for proposal in fitting)
+            message = f"several proposals fit '{name}': {branches}"
+        raise InvalidInput.at("", message)
+    (proposal,) = fitting
+    if commit:
+        proposal.require(commit)
     if output == "text":
         for line in (
             f"{proposal.branch} at commit {proposal.commit}",
@@ -75,6 +68,7 @@ def print_proposal(proposal: PendingProposal, output: str) -> None:
             *(f"  changed: it replaces {old}" for old in proposal.replaces),
         ):
             errors.print(one_line(line))
+    return proposal
 
 
 @click.command()
@@ -113,10 +107,7 @@ def approve(
             "name the commit that you looked at: --commit ID; `demandops get proposals` lists it"
         )
     with writable(state_repo, signing_key) as repo:
-        proposal = proposal_named(repo, name)
-        if commit:
-            proposal.require(commit)
-        print_proposal(proposal, output)
+        proposal = _proposal(repo, name, commit, output)
         if output == "text":
             base = repo.base_of(proposal.commit)
             entries, preview = differences(repo, base, proposal.commit)
@@ -158,10 +149,7 @@ def reject(name: str, commit: str, yes: bool, state_repo: str, output: str) -> N
       demandops reject visit --yes
     """
     with writable(state_repo, None) as repo:
-        proposal = proposal_named(repo, name)
-        if commit:
-            proposal.require(commit)
-        print_proposal(proposal, output)
+        proposal = _proposal(repo, name, commit, output)
         confirm("Turn it down?", yes, output)
         ProposalBranches(repo.repository).remove(proposal.branch, proposal.commit)
     data = {"outcome": "rejected", "branch": proposal.branch, "commit": proposal.commit}

@@ -32,7 +32,6 @@ from demandops.model.demand.demand_request import Decommission
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo import reader
 from demandops.repo.history import commit_message
-from demandops.repo.history.commit_message import Person
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.serve import evaluation
@@ -41,20 +40,17 @@ from demandops.serve.queue import Receipt
 
 # ---- booking, and printing the changes ----
 
-
 _LOOK_UP_S = 0.5
 
 
 def await_answer(future: Future[Any]) -> None:
-    """Wait until a demand has an answer; Ctrl-C and SIGTERM interrupt the wait."""
-    # Polled, because a wait without a timeout could miss a signal that arrives just before the wait
-    # begins, or a signal that another library handles.
+    # Polled, so that Ctrl-C and SIGTERM interrupt it: a wait without a timeout could miss a signal
+    # that arrives just before the wait begins, or a signal that another library handles.
     while not future.done():
         wait([future], timeout=_LOOK_UP_S)
 
 
 def booked(generator: Generator, goal: Json) -> Receipt:
-    """Submit a goal, and return its receipt when it is published."""
     ticket = generator.submit(goal)
     with busy("booking"):
         await_answer(ticket.future)
@@ -100,15 +96,15 @@ def print_consequences(decision: Decision) -> None:
 
 def print_refusal(title: str, faults: Iterable[Json]) -> None:
     errors.print(title)
-    for each in faults:
-        errors.print(f"  {Fault(**each)}")
+    for fault in faults:
+        errors.print(f"  {Fault(**fault)}")
 
 
 def claim_text(claim: Json) -> str:
     return f"{claim['subject']['kind']} '{claim['subject']['id']}'"
 
 
-# ---- ``demandops decommission``: release all claims of a node or a requester, in one commit ----
+# ---- ``demandops decommission``: release all claims of a node or a requester ----
 
 
 @click.command()
@@ -167,21 +163,17 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
         if dry_run or row["outcome"] == "unchanged":
             return
         confirm("Continue?", yes, output)
-    row = _book(goal, by, state_repo, signing_key)
-    show(output, row, _decommission_lines(row, False))
-
-
-def _book(goal: Json, by: Person, state_repo: str, signing_key: Path | None) -> Json:
     # through the journal, like a demand, so it may run beside other generators
     with started_generator(state_repo, signing_key) as generator:
         warned_if_unnamed(by)
         try:
             receipt = booked(generator, goal)
+            row = _row(goal, receipt.outcome, receipt.commit, receipt.changes)
         except Refused as error:
             if not _is_unclaimed_node(error, goal, generator.snapshot):
                 raise
-            return _row(goal, "unchanged", None, ())
-    return _row(goal, receipt.outcome, receipt.commit, receipt.changes)
+            row = _row(goal, "unchanged", None, ())
+    show(output, row, _decommission_lines(row, False))
 
 
 def _dry_run_decommission(goal: Json, state_repo: str, output: str) -> Json:
@@ -200,7 +192,7 @@ def _dry_run_decommission(goal: Json, state_repo: str, output: str) -> Json:
 
 def _is_unclaimed_node(error: Refused, goal: Json, snapshot: Snapshot) -> bool:
     # a node that holds nothing is no error; any other name that holds nothing may be misspelled
-    codes = {each.code for each in error.faults}
+    codes = {fault.code for fault in error.faults}
     return codes == {"not-held"} and goal["name"] in snapshot.state.config.nodes
 
 
@@ -229,7 +221,7 @@ def _decommission_lines(row: Json, dry_run: bool) -> Iterator[str]:
         yield f"'{row['name']}' is decommissioned in {row['commit']}"
 
 
-# ---- ``demandops rollback``: restore the ledger of an earlier commit, by a new commit ----
+# ---- ``demandops rollback``: restore the ledger of an earlier commit ----
 
 _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 
@@ -298,7 +290,6 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
 
 
 def _dry_run_rollback(repo: Reader, goal: Json, base: str) -> Json:
-    """Return the outcome and consequences of a rollback on top of ``base``; book nothing."""
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(base, report).state
     request = repo.restoration(goal["to"], drop_newer=goal["dropNewer"])
@@ -314,15 +305,11 @@ def _consequences(decision: Decision | None) -> Json:
         assert claim is not None  # noqa: S101 - a change has at least one side
         claims[word if change.after else "dropped"].append(claim_data(claim))
     releases = decision.releases if decision else ()
-    return {**claims, "releases": [asdict(each) for each in releases]}
+    return {**claims, "releases": [asdict(release) for release in releases]}
 
 
 def _roll_back(state_repo: str, goal: Json, signing_key: Path | None, base: str) -> Json:
-    """Roll back with a generator; return the outcome as JSON data.
-
-    The caller knows the consequences on top of the commit ``base``. The data has others if the
-    rollback was decided on another commit, was refused or had no effect.
-    """
+    """Roll back with a generator; return what differs from the consequences on ``base``."""
     try:
         with started_generator(state_repo, signing_key) as generator:
             receipt = booked(generator, goal)
@@ -349,7 +336,7 @@ def _rollback_lines(result: Json, dry_run: bool) -> Iterator[str]:
         for claim in result[word]:
             what = f"claim of {', '.join(claim['requesters'])} on {claim_text(claim)}"
             yield f"  {sign} {what} ({word.replace('_', ' ')})"
-    releases = (ReleaseChange(**each) for each in result["releases"])
+    releases = (ReleaseChange(**release) for release in result["releases"])
     yield from (f"  {line}" for line in release_lines(releases, "release "))
     if result["configuration_since"]:
         yield (

@@ -19,12 +19,10 @@ from demandops.cli.actions.person_change import (
     carry_out,
     confirm,
     consequence,
-    consequence_lines,
     editing,
     print_edit,
     selecting,
     selector,
-    warn_of_idle,
     writable,
 )
 from demandops.cli.output import errors
@@ -36,7 +34,7 @@ from demandops.model.config.override import OVERRIDES_ROOT, Override, format_tim
 from demandops.repo.reader import Reader
 from demandops.views.explanations import Entry
 
-# ---- ``demandops override``: create or end an override, by a commit in the caller's own name ----
+# ---- ``demandops override``: create or end an override ----
 
 
 @click.group()
@@ -134,9 +132,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
         "keep": keep or None,
     }
     more = {"owner": owner, "priority": priority, "expires": ends_at(expires)}
-    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
-        text = new_override(repo, name, options, selected, {**more, **effects})
-        create_override(repo, Edit(name, text, f"Create override {name}", options.reason), options)
+    create_override(name, f"Create override {name}", selected, {**more, **effects}, options)
 
 
 @override.command()
@@ -156,49 +152,40 @@ def end(name: str, options: EditOptions) -> None:
         end_override(repo, Edit(name, None, f"End override {name}", options.reason), options)
 
 
-def new_override(
-    repo: Reader,
+def create_override(
     name: str,
-    options: EditOptions,
+    summary: str,
     selected: dict[str, tuple[str, ...]],
     more: dict[str, Any],
-) -> str:
-    """Return the text of a new override's file.
-
-    ``selected`` has the values of the options that select releases and claims. ``more`` has the
-    effects and the other fields; None leaves a field out. Without an owner, the person's name in
-    git is the owner.
-    """
-    if not options.reason:
-        raise click.UsageError("give the reason: -m TEXT")
-    chosen = selector(selected)
-    if not chosen:
-        raise click.UsageError("select what the override applies to, for example --node edge")
-    owner = more.get("owner")
-    if not owner:
-        # a name in git may have characters that an owner may not have
-        person = repo.operator()
-        owner = person.email if id_problem(person.name) else person.name
-    fields = {"reason": options.reason, **more, "owner": owner, "select": [chosen]}
-    given = {key: value for key, value in fields.items() if value is not None}
-    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
-
-
-def create_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Show the effect of a new override, ask for confirmation, and commit the override.
-
-    With ``options.propose``, commit it to a branch. With ``options.dry_run``, only show the effect.
-    """
-    if repo.file_reader()(edit.path) is not None:
-        message = "exists already; end it first, or choose another name"
-        raise InvalidInput.at("", message, file=edit.path)
-    entry = consequence(repo, edit)
-    warn_of_idle(entry)
-    _carry_out(repo, edit, entry, options)
+    options: EditOptions,
+) -> None:
+    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
+        if not options.reason:
+            raise click.UsageError("give the reason: -m TEXT")
+        chosen = selector(selected)
+        if not chosen:
+            raise click.UsageError("select what the override applies to, for example --node edge")
+        owner = more.get("owner")
+        if not owner:
+            # a name in git may have characters that an owner may not have
+            person = repo.operator()
+            owner = person.email if id_problem(person.name) else person.name
+        fields = {"reason": options.reason, **more, "owner": owner, "select": [chosen]}
+        given = {key: value for key, value in fields.items() if value is not None}
+        text = document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
+        edit = Edit(name, text, summary, options.reason)
+        if repo.file_reader()(edit.path) is not None:
+            message = "exists already; end it first, or choose another name"
+            raise InvalidInput.at("", message, file=edit.path)
+        entry = consequence(repo, edit)
+        if entry.state == "matches nothing":
+            errors.print(f"warning: {edit.path} has no effect on anything that is demanded now")
+        elif entry.state in ("held back", "expired"):
+            errors.print(f"warning: {edit.path} is {entry.state}, so it changes nothing now")
+        _carry_out(repo, edit, entry, options)
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
-    """Like :func:`create_override`, but remove an override."""
     overrides = repo.last_valid_snapshot(repo.commit()).state.config.overrides
     if edit.name not in overrides and repo.file_reader()(edit.path) is not None:
         message = "is not valid, so nothing is overridden; correct or remove the file with git"
@@ -212,7 +199,10 @@ def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
 def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> None:
     if options.output == "text":
         errors.print(f"{edit.summary} ({edit.path})")
-        for line in consequence_lines(edit, entry):
+        verb = "affects" if edit.text is not None else "no longer affects"
+        lines = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
+        lines += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
+        for line in lines or ["  affects nothing now"]:
             errors.print(line)
     published = None
     if not options.dry_run:
@@ -222,10 +212,6 @@ def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> 
 
 
 def ends_at(text: str | None) -> str | None:
-    """Return the end of an override as the file has it.
-
-    ``text`` is a time, or a duration from now; for any other text, raise BadParameter.
-    """
     if text is None:
         return None
     try:
@@ -241,20 +227,20 @@ def ends_at(text: str | None) -> str | None:
         ) from None
 
 
-# ---- ``demandops suspend``: stop applications and connections by an override that denies them ----
+# ---- ``demandops suspend``: an override that denies applications and connections ----
 
 
 def name_of(selected: dict[str, tuple[str, ...]]) -> str:
-    """Return the name of the override for a selection; equal selections get the same name."""
+    # equal selections get the same name, so that `resume` finds the override
     chosen = sorted((kind, sorted(values)) for kind, values in selector(selected).items())
     words = "-".join(value for _, values in chosen for value in values)
     return "suspend-" + naming.slug_with_hash(words, repr(chosen), 6)
 
 
 def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
-    """Return whether an override has this selection, and not another one with the same name."""
-    selectors = [each.model_dump(exclude_none=True) for each in override.select]
-    return [{kind: {*values} for kind, values in each.items()} for each in selectors] == [
+    # another override may have the same name
+    selectors = [select.model_dump(exclude_none=True) for select in override.select]
+    return [{kind: {*values} for kind, values in select.items()} for select in selectors] == [
         {kind: {*values} for kind, values in selector(selected).items()}
     ]
 
@@ -281,15 +267,11 @@ def suspend(expires: str | None, options: EditOptions, **selected: tuple[str, ..
       demandops suspend --connection vehicle00/edge -m "Too much data" --propose
     """
     effect = {"expires": ends_at(expires), "deny": True}
-    with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
-        name = name_of(selected)
-        text = new_override(repo, name, options, selected, effect)
-        edit = Edit(name, text, f"Suspend {described(selected)}", options.reason)
-        create_override(repo, edit, options)
+    summary = f"Suspend {described(selected)}"
+    create_override(name_of(selected), summary, selected, effect, options)
 
 
 def described(selected: dict[str, tuple[str, ...]]) -> str:
-    """Return a selection as text, such as ``node edge, requester vehicle00``."""
     return ", ".join(
         f"{kind.removesuffix('s')} {value}"
         for kind, values in selector(selected).items()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import wraps
@@ -26,9 +26,10 @@ from demandops.cli.json_output import (
 )
 from demandops.cli.output import errors, progress
 from demandops.cli.target import (
+    Command,
     dry_run_option,
     hint_to_pull,
-    names_of,
+    name_options,
     signing_option,
     writable_repo_option,
 )
@@ -43,8 +44,6 @@ from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published
 from demandops.views.explanations import Entry, override_report
-
-Command = Callable[..., Any]
 
 reason_option = click.option(
     "-m",
@@ -62,18 +61,15 @@ propose_option = click.option(
 
 
 def is_asked(yes: bool, output: str) -> bool:
-    """Return whether to ask for confirmation: at a terminal, with text output, without ``yes``."""
     return not yes and output == "text" and sys.stdin.isatty()
 
 
 def confirm(question: str, yes: bool, output: str) -> None:
-    """Ask the question, if :func:`is_asked`; a ClickException says that the answer was no."""
     if is_asked(yes, output) and not click.confirm(question, err=True):
         raise click.ClickException("nothing was changed")
 
 
 def warned_if_unnamed(person: Person) -> Person:
-    """Return ``person``; warn if git's configuration does not name the person."""
     if not person.is_known:
         errors.print(
             f"warning: git does not know who you are, so the commit's author is {person}; to "
@@ -87,7 +83,6 @@ def warned_if_unnamed(person: Person) -> Person:
 def writable(
     state_repo: str, signing_key: Path | None, *, dry_run: bool = False
 ) -> Iterator[Reader]:
-    """Yield an open state repo for a person's commits, which ``signing_key`` signs."""
     # a dry run writes nothing, so the state repo may also be a checkout
     with reader.opened(state_repo, only_read=dry_run) as repo:
         repo.repository.signer = Signer(signing_key) if signing_key else None
@@ -96,8 +91,6 @@ def writable(
 
 @dataclass(frozen=True, slots=True)
 class EditOptions:
-    """The values of the options common to all commands that create or end an override."""
-
     state_repo: str
     signing_key: Path | None
     reason: str
@@ -108,7 +101,7 @@ class EditOptions:
 
 
 def editing(command: Command) -> Command:
-    """Add the options of :class:`EditOptions` to a command, which gets them as ``options``."""
+    # the command gets the values of these options as `options`
 
     @wraps(command)
     def run(**given: Any) -> Any:  # noqa: ANN401
@@ -135,13 +128,10 @@ def editing(command: Command) -> Command:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A person's edit of one override, and the summary and reason of its commit.
-
-    ``text`` is the new text of the override's file; None removes the file.
-    """
+    """A person's edit of one override, and the summary and reason of its commit."""
 
     name: str
-    text: str | None
+    text: str | None  # None removes the file
     summary: str
     reason: str
 
@@ -151,10 +141,7 @@ class Edit:
 
 
 def consequence(repo: Reader, edit: Edit) -> Entry:
-    """Return the edited override, and the releases and claims that it affects.
-
-    A new override is treated as if it were on main already. One to remove must exist.
-    """
+    """Return the edited override as if it were on main, and what it affects."""
     with progress("reading the ledger") as report:
         state = repo.last_valid_snapshot(repo.commit(), report).state
     world = World(state.config, state.ledger)
@@ -167,7 +154,6 @@ def consequence(repo: Reader, edit: Edit) -> Entry:
 
 
 def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
-    """Publish the edit on main, or with ``propose`` on a branch and as a merge request."""
     files = {edit.path: edit.text}
     details = CommitDetails(
         warned_if_unnamed(repo.operator()), REAL.now(), edit.summary, one_line(edit.reason)
@@ -197,7 +183,6 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
 
 
 def print_edit(edit: Edit, entry: Entry, published: Published | None, output: str) -> None:
-    """Print the outcome of the edit; without ``published``, what would change."""
     outcome = "would-change"
     if published:
         outcome = "committed" if published.branch == MAIN_BRANCH else "proposed"
@@ -209,8 +194,8 @@ def print_edit(edit: Edit, entry: Entry, published: Published | None, output: st
         "text": edit.text,
         "override": override_data(entry.override),
         "state": entry.state,
-        "releases": [release_data(each) for each in entry.releases],
-        "claims": [claim_data(each) for each in entry.claims],
+        "releases": [release_data(release) for release in entry.releases],
+        "claims": [claim_data(claim) for claim in entry.claims],
     }
     if outcome == "committed":
         lines = [
@@ -226,36 +211,14 @@ def print_edit(edit: Edit, entry: Entry, published: Published | None, output: st
     show(output, data, lines)
 
 
-def consequence_lines(edit: Edit, entry: Entry) -> list[str]:
-    verb = "affects" if edit.text is not None else "no longer affects"
-    lines = [f"  {verb} {release.name} ({release.description})" for release in entry.releases]
-    lines += [f"  {verb} {claim.subject} of demand {claim.demand}" for claim in entry.claims]
-    return lines or ["  affects nothing now"]
-
-
-def warn_of_idle(entry: Entry) -> None:
-    override = entry.override
-    if entry.state == "matches nothing":
-        errors.print(f"warning: {override.path} has no effect on anything that is demanded now")
-    elif entry.state in ("held back", "expired"):
-        errors.print(f"warning: {override.path} is {entry.state}, so it changes nothing now")
-
-
-SELECTORS = ("application", "appdef", "service", "connection", "node", "requester")
-
-
-def selecting(command: Command) -> Command:
-    """Add the options that select an override's releases and claims; return the command."""
-    for name in reversed(SELECTORS):
-        command = click.option(
-            f"--{name}",
-            f"{name}s",
-            metavar="NAME",
-            multiple=True,
-            shell_complete=names_of(f"{name}s"),
-            help=f"Select this {name}; * matches any text, ? one character. May be repeated.",
-        )(command)
-    return command
+selecting = name_options(
+    {
+        name: f"Select this {name}; * matches any text, ? one character. May be repeated."
+        for name in ("application", "appdef", "service", "connection", "node", "requester")
+    },
+    metavar="NAME",
+    multiple=True,
+)
 
 
 def selector(given: Mapping[str, Iterable[str]]) -> dict[str, list[str]]:

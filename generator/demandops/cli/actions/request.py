@@ -48,14 +48,14 @@ class Document:
 
     @property
     def request_id(self) -> str:
-        """The id of the goal's request or demand; empty if the id is missing or no text."""
         goal = self.goal if isinstance(self.goal, dict) else {}
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
 
 
+# The receipt, or the proposal that awaits approval.
 class _Answer(Future["Receipt | dict[str, str]"]):
-    """A future for the answer to a request: the receipt, or the proposal that awaits approval."""
+    pass
 
 
 @click.command()
@@ -103,7 +103,7 @@ def request(
         goals = enumerate(strict_yaml.load_all(text, name))
         documents += [Document(name, goal, text, at) for at, goal in goals if goal is not None]
     if release:
-        documents = [replace(each, goal=_release_of(each.goal)) for each in documents]
+        documents = [replace(document, goal=_release_of(document.goal)) for document in documents]
     if not documents:
         raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     if any(form_faults(document.goal) for document in documents):
@@ -152,7 +152,6 @@ def _row(index: int, request_id: str, outcome: str, **more: object) -> Json:
 
 
 def _unbooked(documents: list[Document], state_repo: str) -> list[Json]:
-    """Return a refusal for each document, because at least one of them does not parse."""
     with reader.opened(state_repo) as repo, progress("reading the ledger") as report:
         state = repo.snapshot(progress=report).state
     rows = []
@@ -217,18 +216,13 @@ def _answered(index: int, document: Document, answer: _Answer) -> Json:
 
 
 def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
-    """Submit a request; return a future for its answer.
-
-    Without ``wait``, the future has its answer as soon as the request is proposed for approval.
-    """
     answer = _Answer()
-    name = document.request_id
 
     def listen(stage: str, text: str) -> None:
         if stage != "proposed":
             return
         if wait:
-            errors.print(f"{document.file}: request '{name}' {text}")
+            errors.print(f"{document.file}: request '{document.request_id}' {text}")
         elif not answer.done():
             answer.set_result(parse_waiting_text(text))
 
@@ -273,7 +267,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
                 "warnings": decision.warnings,
                 "not_held": decision.changes.not_held,
                 "placed": decision.placed,
-                "releases": [asdict(each) for each in decision.releases],
+                "releases": [asdict(release) for release in decision.releases],
                 "files": sorted(decision.files),
             }
             more |= {"approval": decision.approval} if decision.approval else {}

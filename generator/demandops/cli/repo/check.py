@@ -25,9 +25,7 @@ from demandops.views.bookkeeping import EntryChange
 #
 # Text that people wrote appears only as code, so that this text cannot mention users, make links or
 # break the layout. Each code span or fence uses more backticks than any run of backticks in its
-# text. The length of a comment is limited. So the most important parts come first, and the comment
-# states how many parts are omitted.
-
+# text. The length of a comment is limited, so the most important parts come first.
 
 # The first line of every report. A pipeline finds its earlier comment by this line.
 MARK = "<!-- demandops check -->"
@@ -41,7 +39,7 @@ _ROOM_FOR_NOTE = 200
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
     """Return the result of a check as Markdown, with at most ``longest`` characters."""
-    parts = [f"{MARK}\n", *_head(checked), *_suggestions(checked), *_consequence(checked)]
+    parts = [f"{MARK}\n", *_findings(checked), *_consequence(checked)]
     room = longest - _ROOM_FOR_NOTE
     taken, left_out = list[str](), 0
     for part in parts:
@@ -64,10 +62,7 @@ def report(checked: CheckResult, longest: int = LONGEST) -> str:
 def chart_lines(
     charts: RenderedCharts | None, shown: Callable[[str], str] = one_line
 ) -> Iterator[str]:
-    """Yield lines that say which charts helm rendered, and why it did not render the others.
-
-    A reason may contain text that people wrote, so ``shown`` makes it safe to print.
-    """
+    # a reason may contain text that people wrote, so `shown` makes it safe to print
     if charts is None:
         return
     if MISSING in charts.not_rendered.values():
@@ -83,7 +78,7 @@ def chart_lines(
 
 
 def code(text: str) -> str:
-    """Return text as a code span of one line, cut off if it is very long."""
+    # one line, cut off if it is very long
     text = one_line(text, _LONGEST_SPAN)
     if not text.strip():
         return "(empty)"
@@ -104,7 +99,7 @@ def _longer_than_any(text: str, least: int) -> str:
     return "`" * max(least, longest + 1)
 
 
-def _head(checked: CheckResult) -> Iterator[str]:
+def _findings(checked: CheckResult) -> Iterator[str]:
     count = len(checked.faults)
     if count:
         yield f"## DemandOps: {'1 error' if count == 1 else f'{count} errors'}\n"
@@ -120,9 +115,6 @@ def _head(checked: CheckResult) -> Iterator[str]:
             yield f"\n- {kind}{': '.join([*places, code(fault.message)])}"
         if faults:
             yield "\n"
-
-
-def _suggestions(checked: CheckResult) -> Iterator[str]:
     for suggestion in checked.suggestions:
         body = f"Merge this as {code(suggestion.file)}:\n\n{fence(suggestion.text, 'yaml')}"
         if suggestion.not_covered:
@@ -185,12 +177,12 @@ def _folded(summary: str, body: str) -> str:
 
 
 def _plain(path: str) -> str:
-    """Return a path as HTML for a ``<summary>``, in which Markdown is not rendered."""
+    # for a <summary>, in which Markdown is not rendered
     safe = re.sub(r"[^A-Za-z0-9_./-]", lambda char: f"&#{ord(char[0])};", one_line(path))
     return f"<code>{safe if len(safe) <= _LONGEST_SPAN else '…'}</code>"
 
 
-# ---- ``demandops check``: the effect of edits of a state repo, before they are merged ----
+# ---- the command ----
 
 _MOST_DIFF_LINES = 400
 _LONG_NEW_FILE = 30
@@ -268,21 +260,21 @@ def _data(checked: CheckResult) -> Json:
         {"file": file.path, "change": file.change, "diff": diffs.get(file.path)} for file in files
     ]
     return {
-        "faults": [asdict(each) for each in checked.faults],
-        "warnings": [asdict(each) for each in checked.warnings],
-        "suggestions": [asdict(each) for each in checked.suggestions],
+        "faults": [asdict(fault) for fault in checked.faults],
+        "warnings": [asdict(warning) for warning in checked.warnings],
+        "suggestions": [asdict(override) for override in checked.suggestions],
         "charts": charts,
         "base": checked.base,
         "base_valid": checked.base_valid,
-        "releases": [asdict(each) for each in merge.releases] if merge else None,
+        "releases": [asdict(release) for release in merge.releases] if merge else None,
         "files": changes if merge else None,
         "diff_lines_left_out": left_out,
-        "bookkeeping": None if entries is None else [asdict(each) for each in entries],
+        "bookkeeping": None if entries is None else [asdict(entry) for entry in entries],
     }
 
 
 def _bounded(files: tuple[FileChange, ...], most: int) -> tuple[dict[str, str], int]:
-    """Return the diffs that fit into ``most`` lines, by path, and the number of other lines."""
+    # the diffs that fit into `most` lines, by path, and the number of other lines
     shown: dict[str, str] = {}
     left_out = 0
     for file in files:

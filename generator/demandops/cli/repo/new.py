@@ -11,7 +11,7 @@ import click
 
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import data_folder
-from demandops.cli.json_output import output_option, show
+from demandops.cli.json_output import Command, output_option, show
 from demandops.cli.output import busy
 from demandops.cli.repo import scaffold
 from demandops.cli.repo.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan, document
@@ -30,14 +30,16 @@ _SHORT_TYPE = re.compile(r"(?P<package>\w+)/(?P<name>\w+)")
 _SERVICE = re.compile(r"(?P<name>[^=]+)=(?P<package>[^/]+)/(?P<file>[^/]+)")
 Files = Mapping[str, str]
 
-directory_option = click.option(
-    "--directory",
-    "-C",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    default=Path(),
-    metavar="DIR",
-    help="The checked-out state repo. Default: this folder.",
-)
+
+def _directory(what: str) -> Callable[[Command], Command]:
+    return click.option(
+        "--directory",
+        "-C",
+        type=click.Path(path_type=Path, exists=True, file_okay=False),
+        default=Path(),
+        metavar="DIR",
+        help=f"{what} Default: this folder.",
+    )
 
 
 @click.group()
@@ -81,7 +83,7 @@ def new() -> None:
     metavar="ID",
     help="The node of the example demand. Default: an edge server if there is one.",
 )
-@directory_option
+@_directory("The checked-out state repo.")
 @output_option
 def application(  # noqa: PLR0913 - as many as options
     name: str,
@@ -162,7 +164,7 @@ def application(  # noqa: PLR0913 - as many as options
 @click.option(
     "--replicas", type=click.IntRange(min=0), metavar="N", help="Set the number of replicas."
 )
-@directory_option
+@_directory("The checked-out state repo.")
 @output_option
 def override(  # noqa: PLR0913 - as many as options
     name: str,
@@ -219,14 +221,7 @@ def override(  # noqa: PLR0913 - as many as options
     metavar="URL",
     help="The state repo to which the image is proposed.",
 )
-@click.option(
-    "--directory",
-    "-C",
-    type=click.Path(path_type=Path, exists=True, file_okay=False),
-    default=Path(),
-    metavar="DIR",
-    help="The repository of the ROS package. Default: this folder.",
-)
+@_directory("The repository of the ROS package.")
 @output_option
 def image(name: str, repository: str, url: str, directory: Path, output: str) -> None:
     """Write a container file and pipelines for a ROS package of your own.
@@ -246,11 +241,7 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
-    """Ask the question until the answer is valid; return the words of the answer.
-
-    ``check`` raises a click exception for a word that is not valid. ``most`` is the highest number
-    of words; None for any number.
-    """
+    """Ask until the answer is at most ``most`` valid words; ``check`` raises for another word."""
 
     def valid(answer: str) -> tuple[str, ...]:
         words = tuple(answer.split())
@@ -326,7 +317,6 @@ _QUESTIONS: Mapping[str, tuple[str, Callable[[str], object], int | None]] = {
 
 
 def _read_configuration(directory: Path) -> tuple[Files, Config]:
-    """Return the files that people edit in a checkout, and the configuration in them."""
     with busy("reading the state repo"):
         files, faults = edited_checkout.files_of(directory)
         if faults:
@@ -338,9 +328,9 @@ def _read_configuration(directory: Path) -> tuple[Files, Config]:
 def _lay_down(
     directory: Path, existing: Files, new_files: Files, output: str, then: list[str]
 ) -> None:
-    """Write new files, but only if the whole configuration is valid with them."""
     if strange := [path for path in new_files if ".." in path.split("/") or "//" in path]:
         raise StateRepoError(f"{strange[0]} is not a valid file name; choose another name")
+    # nothing is written unless the whole configuration is valid with it
     with busy("rendering an example of each application"):
         try_configuration(State(load({**existing, **new_files}), Ledger(), EVALUATE))
     hints = [f"to check the files: demandops check {directory}", *then]

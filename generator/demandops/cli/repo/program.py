@@ -19,7 +19,7 @@ from demandops.cli.table import Column, Table
 from demandops.cli.target import context_names
 from demandops.model.config.base_model import parse
 
-# ---- ``demandops version``: the versions of the program and of the formats that it writes ----
+# ---- ``demandops version`` ----
 
 
 @click.command()
@@ -55,9 +55,7 @@ def version(output: str) -> None:
     show(output, data, lines)
 
 
-# ---- completion ----
-#
-# ``demandops completion``: a script with which a shell completes commands, options and names.
+# ---- ``demandops completion`` ----
 
 VARIABLE = "_DEMANDOPS_COMPLETE"
 
@@ -116,7 +114,7 @@ def list_contexts(output: str) -> None:
     Examples:
       demandops config list
     """
-    content = target.read()
+    content = target.read_contexts()
     rows = [
         (
             "*" if name == content.current else "",
@@ -160,7 +158,7 @@ def set_context(
       demandops config set fleet --state-repo ssh://git@git.example/fleet.git
       demandops config set fleet --clusters clusters.yaml
     """
-    content = target.read()
+    content = target.read_contexts()
     options = {
         "stateRepo": _absolute(state_repo),
         "clusters": _absolute(clusters),
@@ -172,12 +170,12 @@ def set_context(
     if "stateRepo" not in data["contexts"][name]:
         raise click.UsageError(f"the context '{name}' is new, so give --state-repo")
     data.setdefault("current", name)
-    target.write(parse(target.ContextsFile, data, str(target.path())))
-    show("text", None, [f"context '{name}' set in {target.path()}"])
+    target.write_contexts(parse(target.ContextsFile, data, str(target.contexts_file())))
+    show("text", None, [f"context '{name}' set in {target.contexts_file()}"])
 
 
 def _absolute(place: str | None) -> str | None:
-    """Return the absolute form of a path that exists; return other text, such as a URL, as is."""
+    # other text, such as a URL, stays as it is
     if place is None or not Path(place).expanduser().exists():
         return place
     return str(Path(place).expanduser().resolve())
@@ -192,8 +190,8 @@ def use_context(name: str) -> None:
     Examples:
       demandops config use fleet
     """
-    target.named(name)
-    target.write(target.read().model_copy(update={"current": name}))
+    target.context_named(name)
+    target.write_contexts(target.read_contexts().model_copy(update={"current": name}))
     show("text", None, [f"the current context is '{name}'"])
 
 
@@ -208,9 +206,9 @@ def delete_context(name: str) -> None:
     Examples:
       demandops config delete old-fleet
     """
-    target.named(name)
-    content = target.read()
+    target.context_named(name)
+    content = target.read_contexts()
     others = {key: context for key, context in content.contexts.items() if key != name}
     current = None if content.current == name else content.current
-    target.write(content.model_copy(update={"contexts": others, "current": current}))
+    target.write_contexts(content.model_copy(update={"contexts": others, "current": current}))
     show("text", None, [f"context '{name}' deleted"])

@@ -24,20 +24,12 @@ from demandops.templating import charts
 
 
 def document(path: str, schema: str, kind: str, fields: Mapping[str, Any], note: str = "") -> str:
-    """Return the text of a file for people to edit.
-
-    ``schema`` names the JSON Schema with which editors check the file; ``note`` becomes a comment
-    at its start.
-    """
     text = strict_yaml.dump({"apiVersion": API_VERSION, "kind": kind, **fields})
     comment = "".join(f"# {line}\n" for line in note.splitlines())
     return modeline(path, schema) + comment + text
 
 
-# ---- a new container file and new pipelines for the repository of a ROS package ----
-#
-# The pipelines test the package, build its image, and propose the image to the state repo, pinned
-# by its digest. Pure.
+# ---- a container file and pipelines for a ROS package ----
 
 _PATHS = {
     "Containerfile": "Containerfile",
@@ -57,7 +49,6 @@ def image_files(
 ) -> dict[str, str]:
     """Return the container file and the pipelines, as a map from path to text.
 
-    ``name`` is the image's name in the registry of the state repo, ``repository`` has a host, and
     ``texts`` has the files in ``templates/scaffold/image`` by name.
     """
     url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
@@ -83,13 +74,11 @@ def image_files(
     }
 
 
-# ---- new application ----
-#
-# A new application: its definition, values, chart, registry entries, README and example demand.
+# ---- a new application ----
 #
 # The application's services form a chain: the first service reads the application's inputs, and
 # each further service reads the outputs of the service before it. One image contains the launch
-# files of all services. Pure.
+# files of all services.
 
 LIBRARY_FOLDER = f"appdefs/charts/{charts.LIBRARY}"
 _NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
@@ -107,18 +96,15 @@ class ServicePlan:
 
 @dataclass(frozen=True, slots=True)
 class ApplicationPlan:
-    """The application to write; ``node`` is the node of the example demand."""
-
     name: str
     description: str
     inputs: Mapping[str, str]  # the message type of each input
     services: tuple[ServicePlan, ...]
     image: Image
-    node: str
+    node: str  # of the example demand
 
 
 def refuse_name(name: str, config: Config) -> None:
-    """Refuse a name that is not valid, or that an application, a chart or an image has already."""
     if not _NAME.fullmatch(name):
         raise InvalidInput.at(
             "NAME", f"{quoted(name)} cannot be used here; write {PATTERN_WORDS[_NAME.pattern]}"
@@ -132,8 +118,7 @@ def application_files(
 ) -> dict[str, str]:
     """Return the files of a new application, as a map from path to text.
 
-    ``library`` has the files of the library chart. They are part of the result if the state repo
-    lacks the library chart.
+    They include those of the library chart, ``library``, if the state repo lacks it.
     """
     refuse_name(plan.name, config)
     has_library = f"{LIBRARY_FOLDER}/Chart.yaml" in config.files
@@ -154,8 +139,7 @@ def application_files(
 
 
 def _chain(plan: ApplicationPlan) -> Iterable[tuple[ServicePlan, dict[str, str]]]:
-    """Yield each service with its inputs, as a map from the input's name to its source."""
-    inputs = {role: role for role in plan.inputs}
+    inputs = {role: role for role in plan.inputs}  # the source of each input
     for service in plan.services:
         yield service, inputs
         inputs = {_role(service.name): f"{service.name}.{_RESULT}"}
@@ -168,13 +152,13 @@ def _role(name: str) -> str:
 def _appdef(plan: ApplicationPlan, config: Config) -> str:
     # Names of releases begin with the prefix of their service, so each service needs its own.
     taken = {kind.word for kind in CONNECTION_TYPES}
-    taken |= {service.prefix for each in config.services.values() for service in each.values()}
+    taken |= {service.prefix for own in config.services.values() for service in own.values()}
     taken |= {definition.prefix for definition in config.definitions.values()}
     services: dict[str, Any] = {}
     for service, inputs in _chain(plan):
         letters = re.sub("[^a-z0-9]", "", service.name)[:8]
         prefixes = (letters, *(f"{letters}{number}" for number in range(2, 100)))
-        prefix = next(each for each in prefixes if each not in taken)
+        prefix = next(word for word in prefixes if word not in taken)
         taken.add(prefix)
         services[service.name] = {
             "prefix": prefix,

@@ -27,7 +27,6 @@ from demandops.model.demand.deployment_request_goal import WireGoal
 
 # ---- a description and an example of each property, for editors and the docs ----
 
-
 _INHERITS = "inherits"
 _COMMON = {
     "apiVersion": ["Version of the format", API_VERSION],
@@ -36,9 +35,8 @@ _COMMON = {
 
 
 def describe(schema: dict[str, Any], root: str) -> None:
-    """Add descriptions and examples to the properties of a schema and its definitions.
+    """Add descriptions and examples from ``templates/schemas/properties.yaml`` to a schema.
 
-    They come from ``templates/schemas/properties.yaml``. Other properties stay as they are.
     ``root`` is the name of the model whose JSON Schema is changed.
     """
     properties = _properties()
@@ -51,19 +49,12 @@ def describe(schema: dict[str, Any], root: str) -> None:
             if entry:
                 description, *example = entry
                 field["description"] = description
-                field["examples"] = example or _fixed(field)
-
-
-def _fixed(field: dict[str, Any]) -> list[Any]:
-    """Return a list with one example if only certain values are valid; otherwise an empty list."""
-    for part in (field, *field.get("anyOf", ())):
-        if "const" in part:
-            return [part["const"]]
-        if "enum" in part:
-            return [part["enum"][-1]]
-        if part.get("type") == "boolean":
-            return [True]
-    return []
+                only = (
+                    [part["const"]] if "const" in part else part.get("enum", [True])[-1:]
+                    for part in (field, *field.get("anyOf", ()))
+                    if "const" in part or "enum" in part or part.get("type") == "boolean"
+                )
+                field["examples"] = example or next(only, [])
 
 
 @lru_cache(maxsize=1)
@@ -122,12 +113,12 @@ def schema(name: str | None, folder: Path | None) -> None:
     """
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
-        for each in SCHEMAS:
-            folder.joinpath(f"{each}.json").write_text(text(each))
+        for kind in SCHEMAS:
+            folder.joinpath(f"{kind}.json").write_text(text(kind))
         console().print(f"{len(SCHEMAS)} schemas in {folder}")
     elif name is None:
-        for each, (_, file) in SCHEMAS.items():
-            console().print(f"{each:20} {file}")
+        for kind, (_, file) in SCHEMAS.items():
+            console().print(f"{kind:20} {file}")
     else:
         click.echo(text(name), nl=False)
 

@@ -27,7 +27,6 @@ from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
 from demandops.repo.git.signing import Signer
 from demandops.repo.upgrade import Upgrade, UpgradeRequest
-from demandops.repo.verification import Verdict
 from demandops.repo.write.journal import find_journals
 from demandops.templating.evaluator import processor_time
 
@@ -137,7 +136,7 @@ def init(
     show(output, data, lines)
 
 
-# ---- ``demandops upgrade``: render with this version, or for the other GitOps controller ----
+# ---- ``demandops upgrade``: render everything again ----
 
 _MOST_PATHS = 50
 _SWITCH = (
@@ -272,7 +271,7 @@ def _upgrade_lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
         yield from (f"      {command}" for command in step["commands"])
 
 
-# ---- ``demandops verify``: a proof that commits match their ledger and configuration ----
+# ---- ``demandops verify``: render commits again and compare ----
 
 
 @click.command()
@@ -307,43 +306,38 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     ):
         verdicts = repo.verify(repo.revisions(revisions), whole=whole, progress=report)
     rows: list[Json] = []
+    lines: list[str] = []
     for verdict in verdicts:
         row = {name: None if value == "" else value for name, value in asdict(verdict).items()}
         message = row.pop("fault")
         rows.append(row | {"faults": [asdict(fault("", message))] if message else []})
-    show(output, rows, _verify_lines(verdicts))
-    if not all(verdict.holds for verdict in verdicts):
-        raise click.exceptions.Exit(1)
-
-
-def _verify_lines(verdicts: list[Verdict]) -> Iterator[str]:
-    for verdict in verdicts:
         word = "skipped" if verdict.skipped else "verified"
         if not verdict.holds:
             differs = verdict.fault or verdict.differing or verdict.touched
             word = "DIFFERS" if differs else "UNSIGNED"
         note = f" ({verdict.skipped})" if verdict.skipped else ""
-        yield f"{verdict.commit[:10]} {word}{note}  {verdict.summary}"
-        if verdict.fault:
-            yield f"    the ledger of this commit can no longer be rendered: {verdict.fault}"
-        yield from (f"    {path}" for path in verdict.differing)
-        yield from (f"    {path} (this commit must not change it)" for path in verdict.touched)
+        lines.append(f"{verdict.commit[:10]} {word}{note}  {verdict.summary}")
+        if message:
+            lines.append(f"    the ledger of this commit can no longer be rendered: {message}")
+        lines += (f"    {path}" for path in verdict.differing)
+        lines += (f"    {path} (this commit must not change it)" for path in verdict.touched)
         if verdict.signature:
-            yield f"    it {verdict.signature}"
+            lines.append(f"    it {verdict.signature}")
     skipped = sum(bool(verdict.skipped and verdict.holds) for verdict in verdicts)
     verified = sum(verdict.holds for verdict in verdicts) - skipped
     note = f", {skipped} skipped" if skipped else ""
-    yield f"{verified} of {len(verdicts)} commits are verified{note}"
+    lines.append(f"{verified} of {len(verdicts)} commits are verified{note}")
     signed = sum(verdict.signed for verdict in verdicts)
     if signed:
         good = sum(bool(verdict.signer) for verdict in verdicts)
         listed = f", {good} by keys that policy/allowed-signers lists" if good else ""
-        yield f"{signed} of {len(verdicts)} are signed{listed}"
+        lines.append(f"{signed} of {len(verdicts)} are signed{listed}")
+    show(output, rows, lines)
+    if not all(verdict.holds for verdict in verdicts):
+        raise click.exceptions.Exit(1)
 
 
-# ---- journal ----
-#
-# ``demandops journal``: accepted demands that generators on this machine have yet to publish.
+# ---- ``demandops journal``: accepted demands that are yet to be published ----
 
 
 @click.command()

@@ -129,6 +129,6 @@ _CAPACITY = (Column("Node"), Column("Resource"), Column("Requested"), Column("Ca
 
 
 def _lines(topics: Mapping[str, list[str]], entry: ServiceEntry | ConnectionEntry) -> Iterator[str]:
-    """Yield each topic, followed by its requesters if the entry has other requesters too."""
+    # a topic is followed by its requesters if the entry has others too
     for topic, who in topics.items():
         yield topic if who == entry.requesters else f"{topic} ({', '.join(who)})"

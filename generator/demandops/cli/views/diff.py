@@ -38,8 +38,8 @@ def diff(before: str, after: str, state_repo: str, output: str) -> None:
     with reader.opened(state_repo) as repo:
         entries, changes = differences(repo, before, after)
     data = {
-        "bookkeeping": [asdict(each) for each in entries],
-        "releases": [asdict(each) for each in changes.releases],
+        "bookkeeping": [asdict(entry) for entry in entries],
+        "releases": [asdict(release) for release in changes.releases],
         "other_files": list(changes.other_files),
     }
     bookkeeping_lines = list(entry_lines(entries)) or ["no difference in bookkeeping"]
@@ -66,10 +66,7 @@ def differences(
 
 
 def loaded(repo: Reader, revision: str | None) -> Snapshot:
-    """Return the state at a revision, by default the newest; warn about files not valid there.
-
-    An invalid file counts with its last valid version.
-    """
+    # an invalid file counts with its last valid version
     with progress("reading the ledger") as report:
         snapshot = repo.last_valid_snapshot(repo.commit(revision), report)
     warn_of(repo.problems_of(snapshot))
@@ -77,7 +74,6 @@ def loaded(repo: Reader, revision: str | None) -> Snapshot:
 
 
 def release_lines(releases: Iterable[ReleaseChange], word: str = "") -> Iterator[str]:
-    """Yield the lines for releases that differ, with ``word`` before the name of each."""
     for release in releases:
         yield f"{SIGNS[release.change]} {word}{release.name} ({release.what})"
         yield from (f"    {detail}" for detail in release.details)

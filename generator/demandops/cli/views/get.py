@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
-from typing import Any
+from typing import ClassVar
 
 import click
 
@@ -38,7 +39,7 @@ from demandops.cli.output import (
     warn_of_not_rendered,
 )
 from demandops.cli.table import Cell, Column, Table
-from demandops.cli.target import names_of, state_repo_option
+from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.model.config.base_model import duration_text, relative
 from demandops.model.config.override import parse_time
 from demandops.model.config.policy import matches
@@ -55,41 +56,7 @@ from demandops.views import demand_lists, explanations
 from demandops.views.bookkeeping import bookkeeping
 from demandops.views.explanations import override_report, override_state
 
-# ---- the proposals that await a person's approval, with links to their pull requests ----
-
-
-def proposals(repo: Reader) -> list[Json]:
-    """Return the proposals as JSON data.
-
-    The links to the pull requests come from the GitHub or Gitea that demandops.yaml names, with the
-    token in the file that DEMANDOPS_FORGE_TOKEN_FILE names. If one of these is missing, or there is
-    no answer or no pull request, a link is None.
-    """
-    pending = list(pending_proposals(repo.repository))
-    token_file, forge = settings.forge_token_file(), None
-    if pending and token_file is not None:
-        try:
-            configured = repo.config().repo_settings.proposals
-        except InvalidInput:
-            configured = Proposals()  # if a file is invalid, list the proposals without links
-        try:
-            forge = forge_for(configured, token_file)
-        except ForgeError as error:
-            errors.print(f"warning: {error}")
-    rows = []
-    for proposal in pending:
-        link = None
-        try:
-            request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
-            link = request.link if request else None
-        except ForgeError as error:
-            errors.print(f"warning: {error}")
-        since = time_data(proposal.since)
-        rows.append({"name": proposal.branch, **asdict(proposal), "since": since, "link": link})
-    return rows
-
-
-# ---- the kinds of things that ``demandops get`` lists: their data, columns and filters ----
+# ---- the kinds of things: their data, columns and filters ----
 
 Values = Callable[[Json], Iterable[str]]
 CellOf = Callable[[Json, datetime], Cell]
@@ -103,18 +70,16 @@ class Source:
     not_rendered: Collection[str] = ()  # files that a generator has yet to write or remove
 
 
-@dataclass(frozen=True, slots=True)
-class Kind:
-    """A kind of thing: its items, each with a ``name``, and how they are shown.
+class Kind(ABC):
+    """A kind of thing: its items, each with a ``name``, and how they are shown."""
 
-    Only ``-o wide`` shows the columns in ``wide``. ``filters`` maps an option to a function from an
-    item to values. An item is listed if the option matches one of the values.
-    """
-
-    items: Callable[[Source], list[Json]]
     columns: Sequence[tuple[Column, CellOf]]
-    wide: Sequence[tuple[Column, CellOf]]
-    filters: Mapping[str, Values] = field(default_factory=dict)
+    wide: Sequence[tuple[Column, CellOf]]  # further columns for `-o wide`
+    # An item is listed if the option matches one of the values that its filter returns.
+    filters: ClassVar[Mapping[str, Values]]
+
+    @abstractmethod
+    def items(self, source: Source) -> list[Json]: ...
 
     def table(self, items: Iterable[Json], now: datetime, *, wide: bool = False) -> Table:
         shown = [*self.columns, *(self.wide if wide else ())]
@@ -125,90 +90,12 @@ class Kind:
 def _column(
     title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False
 ) -> tuple[Column, CellOf]:
-    """Return a column whose cells are a field of the items, or what a function returns."""
     cell_of = cell if callable(cell) else lambda item, now: item[cell] or ""
     return Column(title, rank, wraps), cell_of
 
 
-def _demands(source: Source) -> list[Json]:
-    return [
-        {
-            **asdict(demand),
-            "state": _state_now(demand.state, demand.lease, source.now),
-            "since": time_data(demand.since),
-            "lease": lease_data(demand.lease),
-        }
-        for demand in demand_lists.demands(source.snapshot.state)
-    ]
-
-
 def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
     return "overdue" if state == "held" and lease and lease.has_ended(now) else state
-
-
-def _leases(source: Source) -> list[Json]:
-    leased = [demand for demand in _demands(source) if demand["lease"]]
-    # "~" sorts a lease that has not started behind every time
-    return sorted(leased, key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]))
-
-
-def _nodes(source: Source) -> list[Json]:
-    world = source.snapshot.state
-    return [
-        {**asdict(node), "position": node.position.model_dump() if node.position else None}
-        for node in demand_lists.nodes(world, explanations.releases(world))
-    ]
-
-
-def _services(source: Source) -> list[Json]:
-    world = source.snapshot.state
-    return [
-        {
-            "name": name,
-            "domains": demand_lists.domains_of([service.node], world.config),
-            **asdict(service),
-        }
-        for name, service in bookkeeping(world).services.items()
-    ]
-
-
-def _connections(source: Source) -> list[Json]:
-    world = source.snapshot.state
-    return [
-        {
-            "name": name,
-            "domains": demand_lists.domains_of([each.source, each.target], world.config),
-            **asdict(each),
-        }
-        for name, each in bookkeeping(world).connections.items()
-    ]
-
-
-def _claims(source: Source) -> list[Json]:
-    world = source.snapshot.state
-    claims = sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand))
-    return [
-        {
-            "name": (data := claim_data(claim))["file"],
-            "state": _state_now(demand_lists.state_of(claim, world), claim.lease, source.now),
-            "nodes": (nodes := demand_lists.nodes_of(claim)),
-            "domains": demand_lists.domains_of(nodes, world.config),
-            **data,
-        }
-        for claim in claims
-    ]
-
-
-def _overrides(source: Source) -> list[Json]:
-    return [
-        {
-            **override_data(entry.override),
-            "state": override_state(entry, source.snapshot.state, source.not_rendered),
-            "releases": [release_data(release) for release in entry.releases],
-            "claims": [claim_data(claim) for claim in entry.claims],
-        }
-        for entry in override_report(source.snapshot.state, source.now)
-    ]
 
 
 def _lease_text(item: Json, now: datetime) -> str:
@@ -236,12 +123,6 @@ def effect_words(override: Json) -> list[str]:
         else name
         for name, value in override["effects"].items()
     ]
-
-
-def _override_targets(item: Json, now: datetime) -> list[str]:
-    releases = (release["name"] for release in item["releases"])
-    subjects = ("{kind} {id}".format(**claim["subject"]) for claim in item["claims"])
-    return [*dict.fromkeys((*releases, *subjects))]
 
 
 def _node_state(item: Json, now: datetime) -> str:
@@ -276,170 +157,275 @@ def _key(name: str) -> Values:
 
 _COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _key("domains")}
 
-KINDS: dict[str, Kind] = {
-    "claims": Kind(
-        _claims,
-        (
-            _column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
-            _column("Requesters", _joined("requesters"), 1, wraps=True),
-            _column("State", "state", 2),
-            _column("Since", _ago("since"), 3),
-            _column("Lease", _lease_text, 4, wraps=True),
-            _column("Demand", "demand", 5),
+
+class _Claims(Kind):
+    columns = (
+        _column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
+        _column("Requesters", _joined("requesters"), 1, wraps=True),
+        _column("State", "state", 2),
+        _column("Since", _ago("since"), 3),
+        _column("Lease", _lease_text, 4, wraps=True),
+        _column("Demand", "demand", 5),
+    )
+    wide = (
+        _column("Request", "request"),
+        _column("Since (UTC)", _utc("since")),
+        _column("File", "file"),
+    )
+    filters = _COMMON | {
+        "application": lambda item: (
+            [item["subject"]["id"]] if item["subject"]["kind"] == "application" else []
+        )
+    }
+
+    def items(self, source: Source) -> list[Json]:
+        world = source.snapshot.state
+        claims = sorted(world.ledger, key=lambda claim: (str(claim.subject), claim.demand))
+        return [
+            {
+                "name": (data := claim_data(claim))["file"],
+                "state": _state_now(demand_lists.state_of(claim, world), claim.lease, source.now),
+                "nodes": (nodes := demand_lists.nodes_of(claim)),
+                "domains": demand_lists.domains_of(nodes, world.config),
+                **data,
+            }
+            for claim in claims
+        ]
+
+
+class _Connections(Kind):
+    columns = (
+        _column("Connection", "name"),
+        _column("Type", "type", 2),
+        _column("From", "source", 1),
+        _column("To", "target", 1),
+        _column("Requesters", _joined("requesters"), 3, wraps=True),
+    )
+    wide = (_column("Topics", lambda item, now: list(item["topics"])),)
+    filters = _COMMON | {"node": lambda item: [item["source"], item["target"]]}
+
+    def items(self, source: Source) -> list[Json]:
+        world = source.snapshot.state
+        return [
+            {
+                "name": name,
+                "domains": demand_lists.domains_of([entry.source, entry.target], world.config),
+                **asdict(entry),
+            }
+            for name, entry in bookkeeping(world).connections.items()
+        ]
+
+
+class _Demands(Kind):
+    columns = (
+        _column("Demand", "name"),
+        _column("State", "state", 3),
+        _column("Requesters", _joined("requesters"), 1, wraps=True),
+        _column("Holds", _holds, 2),
+        _column("Since", _ago("since"), 5),
+        _column("Lease", _lease_text, 4, wraps=True),
+    )
+    wide = (
+        _column("Requests", "requests"),
+        _column("Nodes", "nodes"),
+        _column("Since (UTC)", _utc("since")),
+        _column("Suspended by", "suspended_by"),
+    )
+    filters = _COMMON | {"application": _key("applications")}
+
+    def items(self, source: Source) -> list[Json]:
+        return [
+            {
+                **asdict(demand),
+                "state": _state_now(demand.state, demand.lease, source.now),
+                "since": time_data(demand.since),
+                "lease": lease_data(demand.lease),
+            }
+            for demand in demand_lists.demands(source.snapshot.state)
+        ]
+
+
+class _Leases(Kind):
+    columns = (
+        _column("Demand", "name"),
+        _column("Requesters", _joined("requesters"), 2, wraps=True),
+        _column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
+        _column(
+            "Ends",
+            lambda item, now: _lease_text(item, now).removeprefix("ends "),
+            1,
+            wraps=True,
         ),
-        (
-            _column("Request", "request"),
-            _column("Since (UTC)", _utc("since")),
-            _column("File", "file"),
-        ),
-        _COMMON
-        | {
-            "application": lambda item: (
-                [item["subject"]["id"]] if item["subject"]["kind"] == "application" else []
-            )
-        },
-    ),
-    "connections": Kind(
-        _connections,
-        (
-            _column("Connection", "name"),
-            _column("Type", "type", 2),
-            _column("From", "source", 1),
-            _column("To", "target", 1),
-            _column("Requesters", _joined("requesters"), 3, wraps=True),
-        ),
-        (_column("Topics", lambda item, now: list(item["topics"])),),
-        _COMMON | {"node": lambda item: [item["source"], item["target"]]},
-    ),
-    "demands": Kind(
-        _demands,
-        (
-            _column("Demand", "name"),
-            _column("State", "state", 3),
-            _column("Requesters", _joined("requesters"), 1, wraps=True),
-            _column("Holds", _holds, 2),
-            _column("Since", _ago("since"), 5),
-            _column("Lease", _lease_text, 4, wraps=True),
-        ),
-        (
-            _column("Requests", "requests"),
-            _column("Nodes", "nodes"),
-            _column("Since (UTC)", _utc("since")),
-            _column("Suspended by", "suspended_by"),
-        ),
-        _COMMON | {"application": _key("applications")},
-    ),
-    "leases": Kind(
-        _leases,
-        (
-            _column("Demand", "name"),
-            _column("Requesters", _joined("requesters"), 2, wraps=True),
-            _column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
-            _column(
-                "Ends",
-                lambda item, now: _lease_text(item, now).removeprefix("ends "),
-                1,
-                wraps=True,
-            ),
-        ),
-        (
-            _column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
-            _column("Holds", _holds),
-        ),
-        _COMMON | {"application": _key("applications")},
-    ),
-    "nodes": Kind(
-        _nodes,
-        (
-            _column("Node", "name"),
-            _column("Type", "type", 2),
-            _column("Domain", "domain", 3),
-            _column("Cluster", "cluster", 5),
-            _column("State", _node_state, 1),
-            _column("Releases", lambda item, now: str(len(item["releases"])), 4),
-            _column("Requesters", _joined("requesters"), 6, wraps=True),
-        ),
-        (
-            _column("Capabilities", "capabilities"),
-            _column(
-                "Properties",
-                lambda item, now: [
-                    f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
-                ],
-            ),
-            _column("Names of releases", "releases"),
-        ),
-        {
-            "node": _key("name"),
-            "requester": _key("requesters"),
-            "application": _key("applications"),
-            "domain": _key("domain"),
-        },
-    ),
-    "overrides": Kind(
-        _overrides,
-        (
-            _column("Override", "name"),
-            _column("State", "state", 1),
-            _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
-            _column("Until", _ago("until"), 3),
-            _column("Owner", "owner", 4),
-            _column("To", _override_targets, 5),
-            _column("Reason", "reason", 6, wraps=True),
-        ),
-        (
-            _column("Priority", lambda item, now: str(item["priority"])),
-            _column("Until (UTC)", _utc("until")),
-        ),
-        {
-            "node": lambda item: [release["node"] for release in item["releases"]],
-            "domain": lambda item: [release["domain"] for release in item["releases"]],
-            "requester": lambda item: [
-                who for claim in item["claims"] for who in claim["requesters"]
+    )
+    wide = (
+        _column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
+        _column("Holds", _holds),
+    )
+    filters = _COMMON | {"application": _key("applications")}
+
+    def items(self, source: Source) -> list[Json]:
+        leased = [demand for demand in KINDS["demands"].items(source) if demand["lease"]]
+        # "~" sorts a lease that has not started behind every time
+        return sorted(leased, key=lambda demand: (demand["lease"]["until"] or "~", demand["name"]))
+
+
+class _Nodes(Kind):
+    columns = (
+        _column("Node", "name"),
+        _column("Type", "type", 2),
+        _column("Domain", "domain", 3),
+        _column("Cluster", "cluster", 5),
+        _column("State", _node_state, 1),
+        _column("Releases", lambda item, now: str(len(item["releases"])), 4),
+        _column("Requesters", _joined("requesters"), 6, wraps=True),
+    )
+    wide = (
+        _column("Capabilities", "capabilities"),
+        _column(
+            "Properties",
+            lambda item, now: [
+                f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
             ],
-        },
-    ),
-    "proposals": Kind(
-        lambda source: proposals(source.repo),
-        (
-            _column("Branch", "branch"),
-            _column("Commit", lambda item, now: item["commit"][:10]),
-            _column("Requesters", _joined("requesters"), 1, wraps=True),
-            _column("Since", _ago("since"), 2),
-            _column("What", "summary", 3, wraps=True),
-            _column("Link", "link", 5),
         ),
-        (_column("Demands", "demands"), _column("Since (UTC)", _utc("since"))),
-        {"requester": _key("requesters")},
-    ),
-    "services": Kind(
-        _services,
-        (
-            _column("Service", "name"),
-            _column("Kind", "service", 4),
-            _column("Version", lambda item, now: version_lines(item), 5),
-            _column("Node", "node", 1),
-            _column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
-            _column("Requesters", _joined("requesters"), 2, wraps=True),
+        _column("Names of releases", "releases"),
+    )
+    filters = _COMMON | {
+        "node": _key("name"),
+        "application": _key("applications"),
+        "domain": _key("domain"),
+    }
+
+    def items(self, source: Source) -> list[Json]:
+        world = source.snapshot.state
+        return [
+            {**asdict(node), "position": node.position.model_dump() if node.position else None}
+            for node in demand_lists.nodes(world, explanations.releases(world))
+        ]
+
+
+class _Overrides(Kind):
+    columns = (
+        _column("Override", "name"),
+        _column("State", "state", 1),
+        _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
+        _column("Until", _ago("until"), 3),
+        _column("Owner", "owner", 4),
+        _column(
+            "To",
+            lambda item, now: [
+                *dict.fromkeys(release["name"] for release in item["releases"]),
+                *dict.fromkeys("{kind} {id}".format(**c["subject"]) for c in item["claims"]),
+            ],
+            5,
         ),
-        (
-            _column(
-                "Takes in",
-                lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
-            ),
-            _column(
-                "Parameters",
-                lambda item, now: [
-                    f"{name} = {value}" for name, value in item["parameters"].items()
-                ],
-            ),
+        _column("Reason", "reason", 6, wraps=True),
+    )
+    wide = (
+        _column("Priority", lambda item, now: str(item["priority"])),
+        _column("Until (UTC)", _utc("until")),
+    )
+    filters = _COMMON | {
+        "node": lambda item: [release["node"] for release in item["releases"]],
+        "domain": lambda item: [release["domain"] for release in item["releases"]],
+        "requester": lambda item: [who for claim in item["claims"] for who in claim["requesters"]],
+    }
+
+    def items(self, source: Source) -> list[Json]:
+        return [
+            {
+                **override_data(entry.override),
+                "state": override_state(entry, source.snapshot.state, source.not_rendered),
+                "releases": [release_data(release) for release in entry.releases],
+                "claims": [claim_data(claim) for claim in entry.claims],
+            }
+            for entry in override_report(source.snapshot.state, source.now)
+        ]
+
+
+class _Proposals(Kind):
+    columns = (
+        _column("Branch", "branch"),
+        _column("Commit", lambda item, now: item["commit"][:10]),
+        _column("Requesters", _joined("requesters"), 1, wraps=True),
+        _column("Since", _ago("since"), 2),
+        _column("What", "summary", 3, wraps=True),
+        _column("Link", "link", 5),
+    )
+    wide = (_column("Demands", "demands"), _column("Since (UTC)", _utc("since")))
+    filters: ClassVar[Mapping[str, Values]] = {"requester": _key("requesters")}
+
+    def items(self, source: Source) -> list[Json]:
+        repo, pending = source.repo, list(pending_proposals(source.repo.repository))
+        # without a forge, a token or an answer, the proposals are listed without links
+        token_file, forge = settings.forge_token_file(), None
+        if pending and token_file is not None:
+            try:
+                configured = repo.config().repo_settings.proposals
+            except InvalidInput:
+                configured = Proposals()
+            try:
+                forge = forge_for(configured, token_file)
+            except ForgeError as error:
+                errors.print(f"warning: {error}")
+        rows = []
+        for proposal in pending:
+            link = None
+            try:
+                request = forge.find(proposal.branch, MAIN_BRANCH) if forge else None
+                link = request.link if request else None
+            except ForgeError as error:
+                errors.print(f"warning: {error}")
+            since = time_data(proposal.since)
+            rows.append({"name": proposal.branch, **asdict(proposal), "since": since, "link": link})
+        return rows
+
+
+class _Services(Kind):
+    columns = (
+        _column("Service", "name"),
+        _column("Kind", "service", 4),
+        _column("Version", lambda item, now: version_lines(item), 5),
+        _column("Node", "node", 1),
+        _column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
+        _column("Requesters", _joined("requesters"), 2, wraps=True),
+    )
+    wide = (
+        _column(
+            "Takes in",
+            lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
         ),
-        _COMMON | {"node": _key("node"), "application": _key("applications")},
-    ),
+        _column(
+            "Parameters",
+            lambda item, now: [f"{name} = {value}" for name, value in item["parameters"].items()],
+        ),
+    )
+    filters = _COMMON | {"node": _key("node"), "application": _key("applications")}
+
+    def items(self, source: Source) -> list[Json]:
+        world = source.snapshot.state
+        return [
+            {
+                "name": name,
+                "domains": demand_lists.domains_of([service.node], world.config),
+                **asdict(service),
+            }
+            for name, service in bookkeeping(world).services.items()
+        ]
+
+
+KINDS: dict[str, Kind] = {
+    "claims": _Claims(),
+    "connections": _Connections(),
+    "demands": _Demands(),
+    "leases": _Leases(),
+    "nodes": _Nodes(),
+    "overrides": _Overrides(),
+    "proposals": _Proposals(),
+    "services": _Services(),
 }
 
 
-# ---- ``demandops get``: lists of demands, of running services and of people's configuration ----
+# ---- the command ----
 
 FILTERS = ("node", "requester", "application", "domain")
 _POLL_S = 1.0
@@ -476,17 +462,6 @@ def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
     return names_of(kinds[kind])(ctx, param, incomplete) if kind in kinds else []
 
 
-def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
-    for name in reversed(FILTERS):
-        command = click.option(
-            f"--{name}",
-            metavar="NAME",
-            shell_complete=names_of(f"{name}s"),
-            help=f"List only items of this {name}; * matches any text, ? one character.",
-        )(command)
-    return command
-
-
 @click.command()
 @click.argument(
     "kind",
@@ -497,7 +472,13 @@ def _filters(command: Callable[..., Any]) -> Callable[..., Any]:
 )
 @click.argument("names", nargs=-1, metavar="[NAME…]", shell_complete=_item_names)
 @state_repo_option
-@_filters
+@name_options(
+    {
+        name: f"List only items of this {name}; * matches any text, ? one character."
+        for name in FILTERS
+    },
+    metavar="NAME",
+)
 @at_option
 @click.option(
     "-w",
@@ -534,16 +515,16 @@ def get(
     """
     if watch and at:
         raise click.UsageError("--watch follows the newest commit, so leave out --at")
-    shown = KINDS[kind]
+    listed = KINDS[kind]
     wanted = {name: value for name, value in filters.items() if value is not None}
-    for name in wanted.keys() - shown.filters.keys():
-        can = ", ".join(f"--{each}" for each in FILTERS if each in shown.filters)
+    for name in wanted.keys() - listed.filters.keys():
+        can = ", ".join(f"--{option}" for option in FILTERS if option in listed.filters)
         raise click.UsageError(f"{kind} have no --{name}; they can be filtered by {can}")
     with reader.opened(state_repo) as repo:
         source = _read_source(repo, at)
-        items = shown.items(source)
-        _refuse_unknown(shown, items, source.snapshot.state, names, wanted)
-        items = _matching(shown, items, names, wanted)
+        items = listed.items(source)
+        _refuse_unknown(listed, items, source.snapshot.state, names, wanted)
+        items = _matching(listed, items, names, wanted)
         _print_list(kind, source, items, output, watch)
         while watch:
             REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
@@ -555,7 +536,7 @@ def get(
             if is_same and kind != "proposals":  # a proposal is a branch, and no commit on main
                 continue
             source = _read_source(repo, None)
-            before, items = items, _matching(shown, shown.items(source), names, wanted)
+            before, items = items, _matching(listed, listed.items(source), names, wanted)
             if items != before:
                 _print_list(kind, source, items, output, watch)
 
@@ -586,7 +567,7 @@ def _matching(
 def _refuse_unknown(
     kind: Kind, items: list[Json], world: World, names: tuple[str, ...], wanted: dict[str, str]
 ) -> None:
-    """Refuse names and filters that match nothing: they are probably misspelled."""
+    # what matches nothing is probably misspelled
     # a filter may match no item if it names something that exists, such as a node without demands
     existing: dict[str, Iterable[str]] = {
         "node": {*world.config.nodes, *world.ledger.indexed_names("node")},
@@ -608,9 +589,8 @@ def _refuse_unknown(
 
 
 def _print_list(kind: str, source: Source, items: list[Json], output: str, watch: bool) -> None:
-    commit, shown = str(source.snapshot.commit), KINDS[kind]
-    data = {"kind": kind, "commit": commit, "items": items}
-    plain = json.loads(json.dumps(data))
+    commit = str(source.snapshot.commit)
+    plain = json.loads(json.dumps({"kind": kind, "commit": commit, "items": items}))
     if output == "json" and watch:
         click.echo(json_escaped(json.dumps(plain, ensure_ascii=False)))
     elif output == "json":
@@ -620,7 +600,7 @@ def _print_list(kind: str, source: Source, items: list[Json], output: str, watch
     elif output == "name":
         show(output, None, [item["name"] for item in items])
     else:
-        table = shown.table(items, source.now, wide=output == "wide")
+        table = KINDS[kind].table(items, source.now, wide=output == "wide")
         table = replace(table, empty=f"no {kind}", styles=_COLORS)
         when = f"{source.now:%H:%M:%S} UTC, " if watch else ""
         note = painted(f"{when}at {commit[:10]}", "dim")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from datetime import datetime
 from itertools import islice
 from typing import Any
@@ -15,7 +14,7 @@ from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
 from demandops.cli.output import busy
 from demandops.cli.table import Column, Table
-from demandops.cli.target import names_of, state_repo_option
+from demandops.cli.target import name_options, state_repo_option
 from demandops.model.config.base_model import relative
 from demandops.model.config.override import parse_time
 from demandops.repo import reader
@@ -63,42 +62,20 @@ def _time(ctx: click.Context, param: click.Parameter, text: str | None) -> datet
 @click.command()
 @click.argument("commit_range", required=False, metavar="[REV|A..B]")
 @state_repo_option
-@click.option(
-    "--requester",
+@name_options(
+    {
+        "requester": "List only commits about claims or waiting demands of this requester.",
+        "application": "List only commits about this application.",
+        "connection": "List only commits about this connection.",
+        "node": "List only commits that change a release on this node or a claim that names this "
+        "node.",
+    },
     metavar="ID",
-    shell_complete=names_of("requesters"),
-    help="List only commits about claims or waiting demands of this requester.",
 )
-@click.option(
-    "--application",
-    metavar="ID",
-    shell_complete=names_of("applications"),
-    help="List only commits about this application.",
+@name_options(
+    {"release": "List only commits that changed the file of this release."}, metavar="NAME"
 )
-@click.option(
-    "--connection",
-    metavar="ID",
-    shell_complete=names_of("connections"),
-    help="List only commits about this connection.",
-)
-@click.option(
-    "--node",
-    metavar="ID",
-    shell_complete=names_of("nodes"),
-    help="List only commits that change a release on this node or a claim that names this node.",
-)
-@click.option(
-    "--release",
-    metavar="NAME",
-    shell_complete=names_of("releases"),
-    help="List only commits that changed the file of this release.",
-)
-@click.option(
-    "--demand",
-    metavar="ID",
-    shell_complete=names_of("demands"),
-    help="List only commits about this demand.",
-)
+@name_options({"demand": "List only commits about this demand."}, metavar="ID")
 @click.option(
     "--operation",
     type=click.Choice(OPERATIONS),
@@ -153,8 +130,20 @@ def log(
                     "`demandops status` lists the current ones"
                 )
         commits = repo.log(commit_range, path) if path else repo.log(commit_range)
+        wanted = [(_TRAILERS[name], given[name]) for name in _TRAILERS if given[name] is not None]
+
+        def matches(entry: LogEntry) -> bool:
+            return (
+                all(value in entry.trailers.get(trailer, ()) for trailer, value in wanted)
+                and given["operation"] in (None, entry.first("Operation") or "by-hand")
+                and (given["since"] is None or entry.time >= given["since"])
+                and (given["until"] is None or entry.time <= given["until"])
+                # last, because it reads the trees of the commit
+                and (given["node"] is None or repo.changes_node(entry.commit, given["node"]))
+            )
+
         with busy("looking through the commits"):
-            entries = list(islice(_matching(repo, commits, **given), max_count))
+            entries = list(islice(filter(matches, commits), max_count))
             if not entries:
                 _refuse_unknown(repo, given)
     rows = [commit_data(entry) for entry in entries]
@@ -163,7 +152,7 @@ def log(
 
 
 def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
-    """Refuse names that no commit is about: they are probably misspelled."""
+    # a name that no commit is about is probably misspelled
     names: dict[str, set[str]] = {name: set() for name in _TRAILERS if given[name] is not None}
     for entry in repo.log() if names else ():
         for name, values in names.items():
@@ -187,32 +176,6 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
             faults.append(fault("--node", message))
     if faults:
         raise InvalidInput(faults)
-
-
-def _matching(
-    repo: Reader,
-    entries: Iterable[LogEntry],
-    *,
-    node: str | None,
-    operation: str | None,
-    since: datetime | None,
-    until: datetime | None,
-    **trailers: str | None,
-) -> Iterable[LogEntry]:
-    """Return the commits that match every filter; ``trailers`` has keys of ``_TRAILERS``."""
-    wanted = [(_TRAILERS[name], value) for name, value in trailers.items() if value is not None]
-
-    def matches(entry: LogEntry) -> bool:
-        return (
-            all(value in entry.trailers.get(key, ()) for key, value in wanted)
-            and operation in (None, entry.first("Operation") or "by-hand")
-            and (since is None or entry.time >= since)
-            and (until is None or entry.time <= until)
-            # last, because it reads the trees of the commit
-            and (node is None or repo.changes_node(entry.commit, node))
-        )
-
-    return filter(matches, entries)
 
 
 _COLUMNS = (

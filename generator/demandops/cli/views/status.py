@@ -14,9 +14,9 @@ from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, output_option, release_data, show, version_data
 from demandops.cli.output import (
     busy,
-    duration,
     errors,
     progress,
+    read_by,
     version_lines,
     warn_of_not_rendered,
 )
@@ -28,7 +28,7 @@ from demandops.cluster.object_cache import ObjectCache
 from demandops.cluster.release_status import OldBootstrap, Orphan, old_bootstraps, orphans, statuses
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.warnings import MissingInput, missing_inputs
-from demandops.model.config.base_model import duration_text
+from demandops.model.config.base_model import duration_text, seconds_of
 from demandops.repo import reader
 from demandops.repo.git.repository import RemoteAway
 from demandops.repo.load.last_valid_config import Problem
@@ -53,7 +53,7 @@ _PATIENCE_S = 10
     metavar="DURATION",
     default="10m",
     show_default=True,
-    callback=duration,
+    callback=read_by(seconds_of),
     help="How long --wait waits: 90s, 10m or 1h30m.",
 )
 @click.option(
@@ -61,7 +61,7 @@ _PATIENCE_S = 10
     metavar="DURATION",
     default=duration_text(_PATIENCE_S),
     show_default=True,
-    callback=duration,
+    callback=read_by(seconds_of),
     help="How long a cluster may take to answer. All clusters are asked at the same time.",
 )
 @output_option
@@ -132,10 +132,8 @@ def status(
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """The state of all releases at one commit; ``rows`` are the releases as JSON data."""
-
     commit: str
-    rows: list[Json]
+    rows: list[Json]  # the releases
     problems: tuple[Problem, ...]
     clusters: frozenset[str]
     not_rendered: frozenset[str]
@@ -151,7 +149,6 @@ class Status:
         clusters: Mapping[str, clusters_file.ClusterAccess],
         patience_s: int = _PATIENCE_S,
     ) -> Status:
-        """Return the current status; give the clusters ``patience_s`` seconds to answer."""
         problems = repo.problems()
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(progress=report)
@@ -163,7 +160,22 @@ class Status:
         for domain in {*domains, *(target.domain for target in targets)}:
             watched = health_reader(domain).objects_to_watch(domain)
             wanted.setdefault(domain.cluster, {}).update(dict.fromkeys(watched))
-        caches = _read_clusters(clusters, wanted, patience_s)
+        caches = {
+            name: ObjectCache(name, cluster, lambda: None)
+            for name, cluster in clusters.items()
+            if cluster.kubeconfig and name in wanted
+        }
+        threads = {
+            name: REAL.start_thread(f"read-{name}", partial(cache.read_once, wanted[name]))
+            for name, cache in caches.items()
+        }
+        # all clusters are read at the same time, so that a slow cluster does not delay the others
+        end = REAL.monotonic() + patience_s
+        with busy("asking the clusters"):
+            for name, thread in threads.items():
+                thread.join(max(0.0, end - REAL.monotonic()))
+                if thread.is_alive():
+                    caches[name].give_up(f"it did not answer within {duration_text(patience_s)}")
         ledger = without_suspended(snapshot.state).ledger
         rows = [
             release_data(release)
@@ -194,10 +206,8 @@ class Status:
         )
 
     def amiss(self, clusters: Mapping[str, clusters_file.ClusterAccess]) -> str:
-        """Return a text that counts everything that is wrong; empty if nothing is wrong.
-
-        Of the releases, only those on clusters with a kubeconfig in ``clusters`` count.
-        """
+        """Return a text that counts everything that is wrong; empty if nothing is wrong."""
+        # of the releases, only those on clusters with a kubeconfig count
         readable = {name for name, cluster in clusters.items() if cluster.kubeconfig}
         watched = [row for row in self.rows if row["cluster"] in readable]
         failing = sum(row["failing"] for row in watched)
@@ -219,9 +229,9 @@ class Status:
             "commit": self.commit,
             "releases": self.rows,
             "not_rendered": sorted(self.not_rendered),
-            "old_bootstraps": [asdict(each) for each in self.old_bootstraps],
-            "orphans": [asdict(each) | {"command": each.command} for each in self.orphans],
-            "missing_inputs": [asdict(each) for each in self.missing_inputs],
+            "old_bootstraps": [asdict(bootstrap) for bootstrap in self.old_bootstraps],
+            "orphans": [asdict(orphan) | {"command": orphan.command} for orphan in self.orphans],
+            "missing_inputs": [asdict(missing) for missing in self.missing_inputs],
             "unreadable": [
                 {"cluster": name, "reason": why} for name, why in self.unreadable.items()
             ],
@@ -236,31 +246,6 @@ class Status:
             text.insert(0, f"{title}; the last valid version of each file, if any, is in effect:")
         further = map(str, (*self.old_bootstraps, *self.orphans))
         return [*text, releases_table(self.rows), *further, f"desired: {self.commit}"]
-
-
-def _read_clusters(
-    clusters: Mapping[str, clusters_file.ClusterAccess],
-    wanted: Mapping[str, Iterable[ObjectSelector]],
-    patience_s: int,
-) -> dict[str, ObjectCache]:
-    """Return a cache of the ``wanted`` objects of each cluster that has a kubeconfig."""
-    caches = {
-        name: ObjectCache(name, cluster, lambda: None)
-        for name, cluster in clusters.items()
-        if cluster.kubeconfig and name in wanted
-    }
-    threads = {
-        name: REAL.start_thread(f"read-{name}", partial(cache.read_once, wanted[name]))
-        for name, cache in caches.items()
-    }
-    # all clusters are read at the same time, so that a slow cluster does not delay the others
-    end = REAL.monotonic() + patience_s
-    with busy("asking the clusters"):
-        for name, thread in threads.items():
-            thread.join(max(0.0, end - REAL.monotonic()))
-            if thread.is_alive():
-                caches[name].give_up(f"it did not answer within {duration_text(patience_s)}")
-    return caches
 
 
 _COLORS = {"failing": "red", "healthy": "green", "unknown": "yellow", "waiting": "yellow"}

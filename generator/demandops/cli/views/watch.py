@@ -99,7 +99,6 @@ def _screen(
 
 
 def _part(title: str, table: Table, width: int, room: int) -> list[str]:
-    """Return a title and as many lines of a table as fit in ``room`` lines."""
     lines = [painted(title, "bold"), *table.lines(width, painted)]
     if len(lines) <= room:
         return lines

@@ -9,7 +9,7 @@ from pathlib import Path
 import click
 
 from demandops.base.runtime import REAL
-from demandops.cli.output import errors, progress
+from demandops.cli.output import errors, progress, read_by
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file
 from demandops.repo.reader import Reader
@@ -18,13 +18,6 @@ from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 
 _INTERVAL = "5s"
-
-
-def _interval(ctx: click.Context, param: click.Parameter, text: str) -> float:
-    try:
-        return parse_interval(text)
-    except ValueError as error:
-        raise click.BadParameter(str(error)) from None
 
 
 @click.command()
@@ -42,7 +35,7 @@ def _interval(ctx: click.Context, param: click.Parameter, text: str) -> float:
     "interval",
     default=_INTERVAL,
     show_default=True,
-    callback=_interval,
+    callback=read_by(parse_interval),
     metavar="DURATION",
     help="How often to fetch a state repo behind a URL. A state repo on this disk is always "
     "current.",

@@ -45,8 +45,7 @@ from demandops.views import explanations
 from demandops.views.demand_lists import nodes_of
 from demandops.views.explanations import affected_releases, override_report
 
-# ---- what is meant: the release, demand, node or other object that has the given name ----
-
+# ---- the object that has the given name ----
 
 KINDS = (
     "release",
@@ -63,12 +62,7 @@ _MOST_LISTED = 8
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """What a name identifies.
-
-    ``kind`` is one of ``KINDS``, ``claim`` or ``file``.
-    """
-
-    kind: str
+    kind: str  # one of `KINDS`, `claim` or `file`
     name: str
     path: str = ""
     release: Release | None = None
@@ -78,23 +72,34 @@ class Match:
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
     """Return the object that a name or path identifies; ``kind`` limits the search to one kind.
 
-    Only the history up to the commit of ``snapshot`` counts. A StateRepoError says that the name
-    identifies nothing, or several things.
+    Only the history up to the commit of ``snapshot`` counts.
     """
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     world = snapshot.state
-    matches = [each for each in _by_name(repo, snapshot, name) if kind in (None, each.kind)]
+    matches = []
+    release = explanations.release_named(world, name)
+    path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
+    if path is None:  # a release that an override denies may never have run
+        denied = explanations.denied_release_named(world, name)
+        path = path_of(denied[0]) if denied else None
+    if path is not None:
+        matches.append(Match("release", name, path, release))
+    for subject in (Subject(subject_kind, name) for subject_kind in SubjectKind):
+        folder = claim_file.folder_of(subject)
+        if world.ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
+            matches.append(Match(subject.kind.value[:-1], name, folder, subject=subject))
+    matches = [match for match in matches if kind in (None, match.kind)]
     matches = matches or list(_by_looser_match(repo, snapshot, name, kind))
     running = [
-        each
-        for each in matches
-        if each.release or (each.subject and world.ledger.claims_on(each.subject))
+        match
+        for match in matches
+        if match.release or (match.subject and world.ledger.claims_on(match.subject))
     ]
     if len(running or matches) == 1:
         return (running or matches)[0]
     if matches:
-        kinds = ", ".join(each.kind for each in matches)
+        kinds = ", ".join(match.kind for match in matches)
         raise StateRepoError(
             f"{quoted(name)} names several things: {kinds}; choose one with --kind"
         )
@@ -102,7 +107,7 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         return _by_path(repo, snapshot, name)
     running_names = {release.name for release in explanations.releases(world)}
     names = {*running_names, *repo.stopped_release_names(str(snapshot.commit))}
-    names |= {id for each in SubjectKind for id in world.ledger.subjects(each)}
+    names |= {id for subject_kind in SubjectKind for id in world.ledger.subjects(subject_kind)}
     names |= {*world.config.nodes, *world.config.appdefs, *world.config.overrides}
     names |= {id for kind in ("demand", "requester") for id in world.ledger.indexed_names(kind)}
     parts = {part for running_name in running_names for part in running_name.split("-")}
@@ -117,34 +122,26 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
     )
 
 
-def _by_name(repo: Reader, snapshot: Snapshot, name: str) -> Iterator[Match]:
-    world = snapshot.state
-    release = explanations.release_named(world, name)
-    path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
-    if path is None:  # a release that an override denies may never have run
-        stopped = explanations.denied_release_named(world, name)
-        path = path_of(stopped[0]) if stopped else None
-    if path is not None:
-        yield Match("release", name, path, release)
-    for kind in SubjectKind:
-        subject = Subject(kind, name)
-        folder = claim_file.folder_of(subject)
-        if world.ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
-            yield Match(kind.value[:-1], name, folder, subject=subject)
-
-
 def _by_looser_match(
     repo: Reader, snapshot: Snapshot, name: str, kind: str | None
 ) -> Iterator[Match]:
-    """Yield what a name may mean that is no whole name of a release or subject."""
+    # for a name that is no whole name of a release or subject
     world, commit = snapshot.state, str(snapshot.commit)
-    named = next((each for each in _named(world, name) if kind in (None, each.kind)), None)
-    if named is not None:
-        yield named
-        return
+    config, index = world.config, world.ledger.index
+    places = {
+        "demand": "" if ("demand", name) in index else None,
+        "node": config.file_of(NODES_FILE, name) if name in config.nodes else None,
+        "appdef": f"appdefs/{name}/appdef.yaml" if name in config.appdefs else None,
+        "override": config.overrides[name].path if name in config.overrides else None,
+        "requester": "" if ("requester", name) in index else None,
+    }
+    for named_kind, path in places.items():
+        if path is not None and kind in (None, named_kind):
+            yield Match(named_kind, name, path)
+            return
     # what runs or is held comes before what has ended
     if kind in (None, "release"):
-        parts = {each.name: each for each in explanations.releases(world) if name in each.name}
+        parts = {r.name: r for r in explanations.releases(world) if name in r.name}
         if parts:
             release = parts[_the_only_name(name, [*parts])]
             yield Match("release", release.name, path_of(release), release)
@@ -158,25 +155,10 @@ def _by_looser_match(
             yield Match("demand", name)
             return
     if kind in (None, "release"):
-        ended = sorted(each for each in repo.stopped_release_names(commit) if name in each)
+        ended = sorted(part for part in repo.stopped_release_names(commit) if name in part)
         if ended:
             only = _the_only_name(name, ended)
             yield Match("release", only, repo.release_path(only, commit) or "")
-
-
-def _named(world: World, name: str) -> Iterator[Match]:
-    """Yield each current object of this name that is no release, application or connection."""
-    config = world.config
-    if ("demand", name) in world.ledger.index:
-        yield Match("demand", name)
-    if name in config.nodes:
-        yield Match("node", name, config.file_of(NODES_FILE, name))
-    if name in config.appdefs:
-        yield Match("appdef", name, f"appdefs/{name}/appdef.yaml")
-    if name in config.overrides:
-        yield Match("override", name, config.overrides[name].path)
-    if ("requester", name) in world.ledger.index:
-        yield Match("requester", name)
 
 
 def _the_only_name(
@@ -192,8 +174,7 @@ def _the_only_name(
 
 
 def demand_commits(repo: Reader, snapshot: Snapshot, id: str) -> list[LogEntry]:
-    """Return the generator's commits about a demand up to the snapshot's, newest first."""
-    entries = repo.log(str(snapshot.commit))
+    entries = repo.log(str(snapshot.commit))  # newest first
     return [entry for entry in entries if id in entry.trailers.get("Demand-Id", ())]
 
 
@@ -245,24 +226,23 @@ def lines_of(answer: Json) -> Iterator[str]:
         yield f"  pending     a generator has yet to write or remove {path}"
     if answer.get("denied_by"):
         yield f"  denied by   {_override_text(answer['denied_by'])}"
-    for each in answer.get("releases", ()) if runs else ():
+    for release in answer.get("releases", ()) if runs else ():
         word = _OF_RELEASES.get(answer["kind"], "needs")
-        yield f"  {word:11} {each['name']} on {each['node']} ({each['file']})"
+        yield f"  {word:11} {release['name']} on {release['node']} ({release['file']})"
     if answer.get("claims"):
         yield from _claim_lines(answer["claims"])
     if answer.get("shaped_by"):
         yield "configured by"
-        for each in answer["shaped_by"]:
-            entry = f" {each['entry']}" if each["entry"] else ""
-            yield f"  {each['file']}{entry}: {each['what']}"
+        for place in answer["shaped_by"]:
+            at = f" {place['entry']}" if place["entry"] else ""
+            yield f"  {place['file']}{at}: {place['what']}"
     if answer.get("overrides"):
         yield "overridden by"
-        yield from (f"  {_override_text(each)}" for each in answer["overrides"])
+        yield from (f"  {_override_text(override)}" for override in answer["overrides"])
     yield from _history_lines(answer)
 
 
 def _state(answer: Json) -> str:
-    """Return the predicate of the first line, such as ``runs`` or ``is suspended``."""
     runs, kind = answer["runs"], answer["kind"]
     if kind in ("file", "claim") and not runs:
         return "no longer exists" if answer["stopped"] else "exists"
@@ -343,7 +323,7 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
         yield f"    carries out commit {each['commit'][:10]} of {each['author']}: {each['summary']}"
 
 
-# ---- ``demandops why``: the requesters, configuration, overrides and commits behind what runs ----
+# ---- the command ----
 
 _MOST_CARRIED_OUT = 5
 
@@ -420,7 +400,6 @@ def why(
 
 
 def _described(world: World, match: Match) -> Json:
-    """Return as JSON data what the object of ``match`` is, and who needs it."""
     name, config = match.name, world.config
     if match.release is not None:
         release = match.release
@@ -475,7 +454,7 @@ def _described(world: World, match: Match) -> Json:
         node, domain = config.nodes[name], config.domain_of.get(name)
         claims = [claim for claim in world.ledger if name in nodes_of(claim)]
         claims.sort(key=lambda claim: (str(claim.subject), claim.demand))
-        running = [each for each in explanations.releases(world) if each.node.id == name]
+        running = [release for release in explanations.releases(world) if release.node.id == name]
         return {
             "runs": bool(running or claims),
             "what": f"{node.type} in cluster {node.cluster}, access domain "
@@ -536,28 +515,23 @@ def _claims(claims: list[Claim], world: World) -> Json:
 
 
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> Json:
-    if match.kind in ("node", "requester"):  # `demandops log` lists their commits
-        return _history(repo, PathHistory(None, (), 0, None))
-    if match.kind != "demand":
-        return _history(repo, repo.history(match.path, str(snapshot.commit), most))
-    about = demand_commits(repo, snapshot, match.name)
-    if not about:  # the history was made anew
-        return _history(repo, PathHistory(None, (), 0, None))
-    *newer, first = about
-    held = ("demand", match.name) in snapshot.state.ledger.index
-    stopped = None if held or not newer else newer.pop(0)
-    more = max(len(newer) - most, 0)
-    return _history(repo, PathHistory(first, tuple(newer[:most]), more, stopped))
-
-
-def _history(repo: Reader, history: PathHistory) -> Json:
-    """Return commits as JSON data, each with the people's commits that it carries out."""
+    history = PathHistory(None, (), 0, None)
+    if match.kind == "demand":
+        about = demand_commits(repo, snapshot, match.name)
+        if about:  # else the history was made anew
+            *newer, first = about
+            held = ("demand", match.name) in snapshot.state.ledger.index
+            stopped = None if held or not newer else newer.pop(0)
+            more = max(len(newer) - most, 0)
+            history = PathHistory(first, tuple(newer[:most]), more, stopped)
+    elif match.kind not in ("node", "requester"):  # `demandops log` lists their commits
+        history = repo.history(match.path, str(snapshot.commit), most)
 
     def row(entry: LogEntry | None) -> Json | None:
         if entry is None:
             return None
         behind = repo.person_commits_behind(entry, _MOST_CARRIED_OUT)
-        return commit_data(entry) | {"carries_out": [commit_data(each) for each in behind]}
+        return commit_data(entry) | {"carries_out": [commit_data(commit) for commit in behind]}
 
     return {
         "started": row(history.started),

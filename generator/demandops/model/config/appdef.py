@@ -38,8 +38,7 @@ from demandops.model.config.inventory import (
 )
 from demandops.model.config.policy import Duration
 
-# ---- the number of replicas of a service, and the fields of a definition that decide it ----
-
+# ---- the number of replicas of a service ----
 
 Count = Annotated[int, Field(ge=0, le=1000)]
 
@@ -61,10 +60,7 @@ class Sizes(CamelModel):
     replicas: Annotated[dict[Word, Count], Field(min_length=1)]
 
     def replicas_for(self, value: object) -> int | None:
-        """Return the number of replicas for a size, or for the largest of a list of sizes.
-
-        Return ``None`` if anything else is among the sizes, or if the list is empty.
-        """
+        """Return the number for a size, or for the largest of a list; ``None`` for all else."""
         names = value if isinstance(value, list) else [value]
         # compared with a list, because a value may have no hash, such as a mapping
         counts = [self.replicas[name] for name in names if name in [*self.replicas]]
@@ -140,22 +136,19 @@ class Scaling(CamelModel):
         if self.down_after and seconds_of(self.down_after) < 1:
             yield "downAfter is zero; leave it out"
 
+    # how long a service keeps replicas that no demand needs
     @property
     def kept_for(self) -> timedelta | None:
-        """How long a service keeps replicas that no demand needs; ``None`` if it keeps none."""
         return timedelta(seconds=seconds_of(self.down_after)) if self.down_after else None
 
     @property
     def most(self) -> int:
-        """The highest number of replicas that the service may have without an override."""
         if self.sizes:
             return max(self.sizes.replicas.values())
         return self.max if self.per or self.autoscaler else self.min
 
 
-# ---- service definition ----
-#
-# Services as people define them: services of one appdef, and services that several appdefs use.
+# ---- services as people define them ----
 
 # The name of an output's topic. `{instance}` stands for the source, the application or the node
 # that the service runs for.
@@ -299,7 +292,6 @@ class ServiceDefinition(Deployed, FileModel):
 
 
 def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iterator[str]:
-    """Yield a message for each fault of the parameter that ``scaling.sizes`` names."""
     sizes = scaling.sizes
     if sizes is None:
         return
@@ -319,7 +311,7 @@ def size_problems(scaling: Scaling, parameters: Mapping[str, Parameter]) -> Iter
         yield f"{place}: '{name}' has the default {default}, which is not a size{hint}"
 
 
-# ---- one type of application, as people define it: `appdefs/<name>/appdef.yaml` ----
+# ---- applications as people define them: ``appdefs/<name>/appdef.yaml`` ----
 
 # What happens if demands that share an application or a service ask for different versions.
 # `refuse`: the later demand is refused. `separate`: a version other than the default runs in an
@@ -383,7 +375,7 @@ class ApplicationDefinition(FileModel):
         return self
 
 
-# ---- the services of an appdef, and where the inputs of each service come from ----
+# ---- the services of an appdef, with the origins of their inputs ----
 
 
 class Service(Deployed):
@@ -410,7 +402,6 @@ class Service(Deployed):
 
     @property
     def at_source(self) -> bool:
-        """Whether the service runs on the nodes that its inputs come from."""
         return self.placement == "source"
 
     @property
@@ -419,7 +410,6 @@ class Service(Deployed):
 
     @property
     def is_placeable(self) -> bool:
-        """Whether the generator may choose the service's node separately from the application's."""
         # What several appdefs share is not placed: a demand could be refused because of a node that
         # somebody else's demand had chosen.
         return self.scope == "application" or not (self.shared or self.at_source)
@@ -439,10 +429,7 @@ Problem: TypeAlias = "tuple[str, str]"
 def resolved_services(
     appdef: ApplicationDefinition, definitions: Mapping[str, ServiceDefinition]
 ) -> tuple[Services, list[Problem]]:
-    """Return all services of an appdef and no problem, or no service and the problems.
-
-    Some problems are found only after a person has mended others.
-    """
+    """Return all services of an appdef and no problem, or no service and the problems."""
     services = {
         name: Service.model_construct(
             # a role in `each` is an input, even if `inputs` lacks it
@@ -460,7 +447,7 @@ def resolved_services(
             used = {**dict(definitions[name]), "inputs": bound}
             services[name] = Service.model_construct(**used, folder=name, shared=True)
     problems = [*_input_problems(appdef, definitions, services)]
-    if problems:
+    if problems:  # the others are found only after a person has mended these
         return {}, problems
     graph = {
         name: [origin.partition(".")[0] for origin in service.inputs.values() if "." in origin]
@@ -520,7 +507,7 @@ def _place(service: Service, role: str) -> str:
 
 
 def _set_roots(name: str, services: dict[str, Service]) -> Iterator[Problem]:
-    """Set ``root`` and ``roots`` of a service, after those of the services that it reads."""
+    # after those of the services that it reads
     service, root = services[name], None
     made_from: dict[str, tuple[str, ...]] = {}
     for role, origin in service.inputs.items():

@@ -24,14 +24,12 @@ from demandops.base.quoting import quoted
 
 # ---- durations and times for people: ``1h30m``, ``in 10m``, ``3m20s ago`` ----
 
-
 _DURATION = re.compile(r"(?:([0-9]{1,9})d)?(?:([0-9]{1,9})h)?(?:([0-9]{1,9})m)?(?:([0-9]{1,9})s)?")
 _UNITS = ((86_400, "d"), (3_600, "h"), (60, "m"), (1, "s"))
 _YEAR_S = 366 * 86_400
 
 
 def seconds_of(text: str) -> int:
-    """Return the seconds of a duration like ``1h30m``; a ValueError says what is wrong with it."""
     match = _DURATION.fullmatch(text)
     if not text or match is None:
         raise ValueError(f"{quoted(text)} is not a duration; write one like 90s, 10m, 1h30m or 2d")
@@ -43,7 +41,6 @@ def seconds_of(text: str) -> int:
 
 
 def duration_text(seconds: float) -> str:
-    """Return a duration, which is not negative, as text like ``1h30m``, rounded to seconds."""
     text, left = "", round(seconds)
     for size, name in _UNITS:
         whole, left = divmod(left, size)
@@ -52,7 +49,7 @@ def duration_text(seconds: float) -> str:
 
 
 def span(seconds: float) -> str:
-    """Return a duration without its sign, rounded down, in one or two units: ``12d``, ``3h20m``."""
+    """Return a duration without its sign, rounded down, in one or two units: ``3h20m``."""
     left = int(abs(seconds))
     for place, (size, unit) in enumerate(_UNITS):
         if left >= size or size == 1:
@@ -66,7 +63,6 @@ def span(seconds: float) -> str:
 
 
 def relative(moment: datetime, now: datetime) -> str:
-    """Return a time relative to ``now``, like ``3m20s ago`` or ``in 10m``."""
     seconds = (moment - now).total_seconds()
     return f"in {span(seconds)}" if seconds >= 1 else f"{span(seconds)} ago"
 
@@ -94,8 +90,6 @@ Word = Annotated[str, StringConstraints(pattern=r"^[a-z][a-z0-9_-]*$", max_lengt
 
 
 def without(problem_of: Callable[[str], str]) -> AfterValidator:
-    """Return a validator that rejects a text for which ``problem_of`` returns a message."""
-
     def check(value: str) -> str:
         problem = problem_of(value)
         if problem:
@@ -106,8 +100,6 @@ def without(problem_of: Callable[[str], str]) -> AfterValidator:
 
 
 def readable_by(parse: Callable[[str], object]) -> AfterValidator:
-    """Return a validator that rejects a value for which ``parse`` raises a ValueError."""
-
     def check(value: str) -> str:
         parse(value)
         return value
@@ -115,14 +107,14 @@ def readable_by(parse: Callable[[str], object]) -> AfterValidator:
     return AfterValidator(check)
 
 
-def _hidden(value: str) -> str:
-    control = control_character(re.sub(r"[\n\t]", " ", value))
-    return control and f"{quoted(value)} has the control character {control}; remove it"
-
-
 # A validator that rejects control characters, and characters that reorder text. Line breaks and
 # tabs are valid.
-Visible = without(_hidden)
+Visible = without(
+    lambda value: (
+        (control := control_character(re.sub(r"[\n\t]", " ", value)))
+        and f"{quoted(value)} has the control character {control}; remove it"
+    )
+)
 
 # Any text that `Visible` accepts
 Text = Annotated[str, Visible]
@@ -155,10 +147,7 @@ def faults_of(
     place: tuple[int | str, ...] = (),
     most: int | None = None,
 ) -> list[Fault]:
-    """Return every fault of a failed validation, or the first ``most``.
-
-    ``place`` is the path to the validated value in the file, ``()`` for the whole file.
-    """
+    """Return the first ``most`` faults of a failed validation; ``place`` is in the file."""
     faults = []
     for item in error.errors(include_url=False)[:most]:
         value = item.get("input")
@@ -211,18 +200,14 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
 
 
 def parse(model: type[Model], data: object, file: str = "") -> Model:
-    """Validate plain data, and return it as an instance of ``model``.
-
-    Rules about several fields are checked only if each field is valid.
-    """
     try:
+        # rules about several fields are checked only if each field is valid
         return model.model_validate(data)
     except ValidationError as error:
         raise InvalidInput(faults_of(error, model, file)) from None
 
 
 def parse_file(model: type[Model], text: str, file: str) -> Model:
-    """Parse the text of a YAML file, and return its content as an instance of ``model``."""
     data = strict_yaml.load(text, file)
     if not isinstance(data, dict):
         message, version = "must be a mapping", model.model_fields.get("apiVersion")

@@ -43,7 +43,6 @@ from demandops.model.config.repo_settings import RepoSettings
 
 # ---- the whole configuration as one frozen, indexed value: :class:`Config` ----
 
-
 CLUSTERS_FILE = "inventory/clusters.yaml"
 NODES_FILE = "inventory/nodes.yaml"
 BROKERS_FILE = "inventory/brokers.yaml"
@@ -72,11 +71,6 @@ CONFIG_ROOTS = ("demandops.yaml", "inventory", "policy", "registry", "appdefs", 
 
 
 def collection_of(path: str) -> str | None:
-    """Return the collection to which the entries of a file belong, if any.
-
-    ``inventory/nodes.yaml`` and ``inventory/nodes/berlin.yaml`` have entries of the collection
-    ``inventory/nodes.yaml``.
-    """
     folder, _, name = path.rpartition("/")
     if name.startswith(".") or not name.endswith(".yaml"):
         return None
@@ -84,7 +78,7 @@ def collection_of(path: str) -> str | None:
 
 
 def place_of_collection(collection: str, files: Iterable[str]) -> str:
-    """Return the text for a collection's files: ``inventory/nodes.yaml or inventory/nodes/``."""
+    # for example `inventory/nodes.yaml or inventory/nodes/`
     used = {*files} or {collection}
     folder = [collection.replace(".yaml", "/")] if used - {collection} else []
     return " or ".join([collection] * (collection in used) + folder)
@@ -92,10 +86,7 @@ def place_of_collection(collection: str, files: Iterable[str]) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Config:
-    """What can run, where, and from which charts and images.
-
-    Most mappings go from the name of an entry to the entry.
-    """
+    """What can run, where, and from which charts and images; most mappings are by name."""
 
     repo_settings: RepoSettings
     clusters: Mapping[str, Cluster]
@@ -200,21 +191,20 @@ class Config:
         return versions | {channel: versions[name] for channel, name in channels.items()}
 
     def host_of(self, node: str) -> str:
-        """Return the inventory's name of a node: ``edge`` for ``edge@city``."""
+        # `edge` for `edge@city`
         return self.hosts.get(node, node)
 
     def nodes_of(self, host: str) -> tuple[str, ...]:
-        """Return a node's name in each of its access domains: ``edge``, then ``edge@city``."""
+        # `edge`, then `edge@city` for each further access domain
         node = self.nodes.get(host)
         domains = node.access_domains if node else ()
         return host, *(id_in_domain(host, domain.name) for domain in domains)
 
     def file_of(self, collection: str, name: str) -> str:
-        """Return the file that has an entry; for an unknown entry, the collection's usual file."""
+        # for an unknown entry, the collection's usual file
         return self.entry_files.get(collection, {}).get(name, collection)
 
     def place_of(self, collection: str) -> str:
-        """Return the text by which messages name a collection's files."""
         return place_of_collection(collection, self.entry_files.get(collection, {}).values())
 
     def node_and_domain(self, id: str) -> tuple[Node, AccessDomain]:
@@ -230,7 +220,6 @@ class Config:
         return node, domain
 
     def appdef_by_wire_type(self, number: int) -> ApplicationDefinition | None:
-        """Return the appdef that ``DeploymentRequest`` names by ``number``, or ``None``."""
         for appdef in self.appdefs.values():
             if appdef.deployment_request and appdef.deployment_request.type == number:
                 return appdef
@@ -240,7 +229,6 @@ class Config:
         return sorted(self.application_versions[appdef].keys() - {""})
 
     def versions_file(self, appdef: str) -> str:
-        """Return the text by which messages name the files that list the versions of an appdef."""
         if appdef in self.versions:
             return self.file_of(VERSIONS_FILE, appdef)
         return self.place_of(CHARTS_FILE)
@@ -259,9 +247,7 @@ class Config:
         return f"appdefs/{service.folder}/{service.values}"
 
 
-# ---- config reader ----
-#
-# The reader of configuration files: it reads item by item, to find the faults of every item.
+# ---- the reader: item by item, to find the faults of every item ----
 
 Model = TypeVar("Model", bound=BaseModel)
 Valid = TypeVar("Valid")
@@ -270,8 +256,6 @@ _NAME = TypeAdapter(DnsLabel)
 
 
 class ConfigReader:
-    """Reads the configuration files of one state repo, and collects their faults."""
-
     def __init__(self, files: Mapping[str, str]) -> None:
         self.files = files
         self.faults: list[Fault] = []
@@ -279,16 +263,17 @@ class ConfigReader:
         self._by_collection = defaultdict[str | None, list[str]](list)
         for path in sorted(files):
             self._by_collection[collection_of(path)].append(path)
-        self._places: dict[str, dict[str, tuple[str, str]]] = {}
+        # The file and the path of each item, by collection and name
+        self.places: dict[str, dict[str, tuple[str, str]]] = {}
         self._incomplete: set[str] = set()
-        self._heads: dict[str, BaseModel] = {}
+        # The valid files with items, but without the items
+        self.heads: dict[str, BaseModel] = {}
 
     def add_fault(self, file: str, field: str, message: str) -> None:
         self._counts[file] += 1
         self.faults.append(fault(field, message).within(file))
 
     def read_file(self, file: str, model: type[Model]) -> Model | None:
-        """Return a file as an instance of ``model``, or ``None`` after adding its faults."""
         text = self.files.get(file)
         if text is None:
             self.add_fault(file, "", "is missing; `demandops init` creates an example")
@@ -300,7 +285,6 @@ class ConfigReader:
             return None
 
     def files_of(self, collection: str) -> list[str]:
-        """Return the files with entries of a collection, its usual file first."""
         return self._by_collection[collection]
 
     def read_items(
@@ -308,11 +292,11 @@ class ConfigReader:
     ) -> dict[str, Model]:
         """Return the valid items of a collection, by name; collect the faults of invalid ones.
 
-        ``whole`` is the model of the collection's files, and ``field`` their field with the items:
-        a list if ``key`` names the field with an item's name, else a mapping.
+        ``field`` of ``whole`` has the items: a list if ``key`` names the field with an item's name,
+        else a mapping.
         """
         items: dict[str, Model] = {}
-        places = self._places[collection] = {}
+        places = self.places[collection] = {}
         kind: type[Any] = list if key else dict
         for file in self.files_of(collection) or [collection]:
             entries: Any = None
@@ -323,7 +307,7 @@ class ConfigReader:
                     entries = raw
                     # without the items, each of which is parsed below, so that an invalid item
                     # hides neither the others nor the faults of the file's other fields
-                    self._heads[file] = parse(whole, {**data, field: kind()}, file)
+                    self.heads[file] = parse(whole, {**data, field: kind()}, file)
                 else:
                     self.read_file(file, whole)
             except InvalidInput as error:
@@ -350,7 +334,6 @@ class ConfigReader:
     def add_duplicate(
         self, name: str, first: tuple[str, str], second: tuple[str, str], key: str = ""
     ) -> None:
-        """Add the faults of an entry that is at two places; a place is (file, field)."""
         dot_key = f".{key}" if key else ""
         if first[0] == second[0]:
             self.add_fault(
@@ -364,36 +347,26 @@ class ConfigReader:
     def entry_files(self) -> dict[str, dict[str, str]]:
         return {
             collection: {name: file for name, (file, _) in places.items()}
-            for collection, places in self._places.items()
+            for collection, places in self.places.items()
         }
 
-    def head(self, file: str, model: type[Model]) -> Model | None:
-        """Return a file that :meth:`read_items` has read, without its items, if it is valid."""
-        head = self._heads.get(file)
-        return head if isinstance(head, model) else None
-
     def place_of(self, collection: str, name: str) -> tuple[str, str]:
-        """Return the file that has an item, and the item's path in this file, like ``nodes[3]``."""
-        return self._places[collection][name]
-
-    def add_alias(self, collection: str, name: str, item: str) -> None:
-        self._places[collection][name] = self._places[collection][item]
+        return self.places[collection][name]
 
     def is_complete(self, collection: str) -> bool:
         return collection not in self._incomplete
 
     def is_missing(self, collection: str, name: str) -> bool:
         # an invalid item may be the missing one, and has faults of its own
-        return self.is_complete(collection) and name not in self._places[collection]
+        return self.is_complete(collection) and name not in self.places[collection]
 
     def check_reference(self, file: str, field: str, name: str, collection: str) -> None:
-        """Add a fault if the item ``name`` is missing in the collection."""
         if self.is_missing(collection, name):
             where = place_of_collection(collection, self.files_of(collection))
             where = where.replace("inventory/", "")
             # thousands of names may be unknown, and only the first faults of a file are listed
             is_listed = self._counts[file] < MOST_FAULTS
-            hint = suggestion(name, self._places[collection]) if is_listed else ""
+            hint = suggestion(name, self.places[collection]) if is_listed else ""
             self.add_fault(file, field, f"'{name}' is not in {where}{hint}")
 
     def _valid(

@@ -35,11 +35,9 @@ from demandops.templating import charts
 # Such a pair needs an order, and only different priorities give one. It is refused even if no
 # release matches both overrides yet, because a later demand could add a release that does.
 
-
 _MERGED = ("values", "images")
 _SINGLE = ("version", "replicas", "node")
 _FROZEN = (*_SINGLE, *_MERGED)
-
 
 # A merge may bring thousands of overrides, each of which contradicts all others
 _MOST_SHOWN = 3
@@ -49,7 +47,18 @@ _INDEXED = ("nodes", "services", "applications", "connections", "appdefs")
 def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
     contests = defaultdict[tuple[int, tuple[str, ...]], list[tuple[Override, str]]](list)
     for override in by_rank(config.overrides.values()):
-        for what, token in _settings(override):
+        # (what, token) for all that the override sets; another token contradicts it
+        settings: list[tuple[tuple[str, ...], str]] = [
+            ((name,), str(value))
+            for name in _SINGLE
+            if (value := getattr(override, name)) is not None
+        ]
+        settings += _leaves(("values",), override.values or {})
+        pins = (override.images or {}).items()
+        settings += ((("images", name), pin.model_dump_json()) for name, pin in pins)
+        if override.hold or any(name in _FROZEN for name in override.effects()):
+            settings.append((("hold",), str(override.hold)))
+        for what, token in settings:
             contests[override.priority, what].append((override, token))
     rivals = defaultdict[str, dict[str, Override]](dict)
     for contenders in contests.values():
@@ -67,18 +76,6 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
             )
 
 
-def _settings(override: Override) -> Iterator[tuple[tuple[str, ...], str]]:
-    """Yield (what, token) for all that an override sets; another token contradicts it."""
-    for name in _SINGLE:
-        if (value := getattr(override, name)) is not None:
-            yield (name,), str(value)
-    yield from _leaves(("values",), override.values or {})
-    for name, pin in (override.images or {}).items():
-        yield ("images", name), pin.model_dump_json()
-    if override.hold or any(name in _FROZEN for name in override.effects()):
-        yield ("hold",), str(override.hold)
-
-
 def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, ...], str]]:
     if not isinstance(patch, Mapping):
         yield path, json.dumps(patch, sort_keys=True)
@@ -91,10 +88,7 @@ def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, .
 def _rivals(
     contenders: list[tuple[Override, str]], config: Config
 ) -> Iterator[tuple[Override, Override]]:
-    """Yield (earlier, later) for overrides with different tokens that may select one release.
-
-    Each later one is yielded with at most three others.
-    """
+    """Yield (earlier, later) for overrides with different tokens that may select one release."""
     # Only selectors are compared whose patterns begin alike in one field, the one in which the
     # selectors differ most. So the cost grows with the number of overrides, not with that of pairs,
     # unless patterns hardly differ.
@@ -119,7 +113,7 @@ def _rivals(
     starts: list[str] = []  # the keys of `earlier`, sorted
 
     def alike(start: str) -> Iterator[str]:
-        """Yield the starts that begin with ``start`` or with which ``start`` begins."""
+        # those that begin with `start`, or with which it begins
         yield from (start[:end] for end in range(len(start)) if start[:end] in earlier)
         for place in range(bisect_left(starts, start), len(starts)):
             if not starts[place].startswith(start):
@@ -154,7 +148,6 @@ def _rivals(
 
 
 def contested_effects(first: Override, second: Override) -> list[str]:
-    """Return the effects for which the order of two overrides matters."""
     contested = [
         name
         for name in _SINGLE
@@ -177,7 +170,6 @@ def contested_effects(first: Override, second: Override) -> list[str]:
 
 
 def patches_commute(first: object, second: object) -> bool:
-    """Return whether two merge patches have the same result in either order."""
     if isinstance(first, Mapping) and isinstance(second, Mapping):
         return all(patches_commute(first[key], second[key]) for key in first if key in second)
     # unlike ==, JSON distinguishes 1 from True
@@ -187,7 +179,7 @@ def patches_commute(first: object, second: object) -> bool:
 def may_match_same_release(
     first: Selector, second: Selector, config: Config, shares_clients: bool
 ) -> bool:
-    """Return whether some release, now or later, may match both selectors."""
+    # a later demand may add the release
     if (first.connections and _selects_services(second)) or (
         second.connections and _selects_services(first)
     ):
@@ -201,7 +193,6 @@ def may_match_same_release(
 
 
 def _any_overlap(left: Iterable[str], right: Iterable[str]) -> bool:
-    """Return whether some text matches a pattern of both sides."""
     plain = [{text for text in side if not {*text} & {*"*?"}} for side in (left, right)]
     if plain[0] & plain[1]:
         return True
@@ -224,7 +215,6 @@ def shares_any_clients(config: Config) -> bool:
 def _separating_fields(
     first: Selector, second: Selector, config: Config, shares_clients: bool
 ) -> Iterator[str]:
-    """Yield the fields in which selectors must overlap to match the same release."""
     # A release has only one service and one node. But a shared service has many applications and
     # requesters, and a Zenoh bridge has many connections.
     yield from ("services", "nodes")
@@ -254,12 +244,10 @@ def patterns_overlap(first: str, second: str) -> bool:
     return row[-1]
 
 
-# ---- cross check ----
+# ---- the checks across files and entries, for example for a prefix used twice ----
 #
-# Checks across files and entries, for example for an unknown cluster or a prefix used twice.
-#
-# The checks run after all files are parsed. Every check runs, and a :class:`ConfigReader` collects
-# all faults.
+# They run after all files are parsed. Every check runs, and a :class:`ConfigReader` collects all
+# faults.
 
 
 def cross_check(config: Config, reader: ConfigReader) -> None:
@@ -361,7 +349,7 @@ def _check_charts(config: Config, reader: ConfigReader) -> None:
         for channel, source in chart.channels.items():
             _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
     tops = (source.folder for chart in config.charts.values() for source in chart.sources())
-    folders = (each for top in tops if top for each in charts.folders(top, config.files))
+    folders = (folder for top in tops if top for folder in charts.folders(top, config.files))
     for folder in dict.fromkeys(folders):  # each library once, in the order in which it is needed
         reader.faults += charts.faults(folder, config.files)
 
@@ -396,7 +384,15 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
     prefixes: dict[str, tuple[str, str]] = {}
     files: dict[str, str] = {}
     words = {connection_type.word for connection_type in connection_types.CONNECTION_TYPES}
-    for file, where, name, service in _defined_services(config):
+    # (file, beginning of the paths of its fields, name, definition)
+    defined: list[tuple[str, str, str, Deployed]] = [
+        (f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, own)
+        for appdef in config.appdefs.values()
+        for name, own in appdef.services.items()
+    ]
+    for name, shared in config.definitions.items():
+        defined.append((f"appdefs/{name}/service.yaml", "", name, shared))
+    for file, where, name, service in defined:
         folder, _, own = file.rpartition("/")
         reader.check_reference(file, f"{where}chart", service.chart, CHARTS_FILE)
         for image in service.images:
@@ -434,15 +430,6 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
                 f"'{service.prefix}' is already the prefix of '{owner[1]}'; choose another prefix"
             )
             reader.add_fault(file, f"{where}prefix", message)
-
-
-def _defined_services(config: Config) -> Iterator[tuple[str, str, str, Deployed]]:
-    """Yield (file, beginning of its fields' paths, name, definition) for each service."""
-    for appdef in config.appdefs.values():
-        for name, service in appdef.services.items():
-            yield f"appdefs/{appdef.name}/appdef.yaml", f"services.{name}.", name, service
-    for name, definition in config.definitions.items():
-        yield f"appdefs/{name}/service.yaml", "", name, definition
 
 
 def _check_uses(config: Config, reader: ConfigReader) -> None:

@@ -34,10 +34,8 @@ from demandops.model.config.base_model import (
 
 # ---- properties of nodes: typed values, and the conditions of ``place`` on them ----
 #
-# The value of a property is a number, text, true or false. A condition is a text: ``ros=jazzy``,
-# ``memoryGiB>=8`` or ``memoryGiB<=64``. A property has values of the same type on all nodes. This
-# type decides how the generator reads the value in a condition.
-
+# A condition is a text: ``ros=jazzy``, ``memoryGiB>=8`` or ``memoryGiB<=64``. A property has values
+# of the same type on all nodes. This type decides how the value in a condition is read.
 
 _NAME = "[a-z][A-Za-z0-9_]*"
 _TEXT = re.compile(r"[A-Za-z0-9]([A-Za-z0-9 ._+:/-]{0,61}[A-Za-z0-9])?")
@@ -58,7 +56,7 @@ class PropertyCondition(NamedTuple):
 
 
 def kind_of(value: object) -> Kind | None:
-    """Return the type of a property's value; ``None`` if no property may have this value."""
+    # None if no property may have this value
     match value:
         case bool():
             return "true or false"
@@ -107,7 +105,6 @@ RequiredValue = Annotated[
 
 
 def condition_texts(properties: Mapping[str, object]) -> Iterator[str]:
-    """Yield the conditions in a definition's ``properties`` as texts, like ``memoryGiB>=8``."""
     for name, value in properties.items():
         if isinstance(value, dict):
             yield from (f"{name}{_BOUNDS[bound]}{limit}" for bound, limit in value.items())
@@ -116,7 +113,6 @@ def condition_texts(properties: Mapping[str, object]) -> Iterator[str]:
 
 
 def comparable_kind(value: object) -> Kind | None:
-    """Return the type that a property needs to be compared with a required value."""
     return "a number" if isinstance(value, dict) else kind_of(value)
 
 
@@ -130,7 +126,6 @@ def read_condition(text: str) -> PropertyCondition | None:
 
 
 def condition_problem(condition: PropertyCondition, kind: Kind) -> str:
-    """Return why a condition does not fit a property of the type ``kind``; empty if it fits."""
     if _value_as(kind, condition) is not None:
         return ""
     return f"{quoted(condition.name)} is {kind}; ask for {_EXAMPLES[kind].format(condition.name)}"
@@ -144,7 +139,6 @@ _EXAMPLES: dict[Kind, str] = {
 
 
 def meets_condition(properties: Mapping[str, object], text: str) -> bool:
-    """Return whether a node with these properties meets the condition in ``text``."""
     condition = read_condition(text)
     value = properties.get(condition.name) if condition else None
     kind = kind_of(value)
@@ -160,7 +154,6 @@ def meets_condition(properties: Mapping[str, object], text: str) -> bool:
 
 
 def _value_as(kind: Kind, condition: PropertyCondition) -> object:
-    """Return a condition's value, read as ``kind``, or ``None`` if the value has another type."""
     if kind == "a number":
         return _number(condition.value)
     if condition.sign != "=":
@@ -180,9 +173,8 @@ def _number(value: str | float) -> float | None:
 
 # ---- the inventory: nodes, clusters and brokers ----
 #
-# A node is a vehicle, a roadside station, an edge or a cloud server, or anything else that runs
-# services. A node belongs to one cluster. It runs services only in access domains: in the one whose
-# patterns match it, and in those that it lists. A node selector identifies the node in its cluster.
+# A node belongs to one cluster. It runs services only in access domains: in the one whose patterns
+# match it, and in those that it lists. A node selector identifies the node in its cluster.
 
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9]([A-Za-z0-9.:-]*[A-Za-z0-9])?$")]
 
@@ -231,7 +223,6 @@ class Zenoh(CamelModel):
         return self
 
     def listening(self) -> tuple[str, ...]:
-        """Return the endpoints that the bridge listens on; empty if no other bridge can connect."""
         if self.listen or not self.endpoint:
             return self.listen
         protocol, _, address = self.endpoint.partition("/")
@@ -265,10 +256,7 @@ _FACTORS = {"m": 1, "": 1000} | {
 
 @lru_cache(maxsize=1024)
 def amount_of(text: str) -> int:
-    """Return a quantity of a resource in thousandths: 500 for ``500m``, 2000 for ``2``.
-
-    Of Kubernetes' notations, exponents and the units above Ti are refused, with a ValueError.
-    """
+    """Return a quantity in thousandths; exponents and the units above Ti are refused."""
     match = _QUANTITY.fullmatch(text)
     if match is None:
         raise ValueError(f"{quoted(text)} is not a quantity; write one like 2, 500m, 1.5 or 16Gi")
@@ -279,8 +267,7 @@ def amount_of(text: str) -> int:
     return amount
 
 
-def amount_text(amount: int, resource: str) -> str:
-    """Return ``amount``, a number of thousandths, as people write it: ``1.5``, ``16Gi``."""
+def amount_text(amount: int, resource: str) -> str:  # of thousandths
     if resource.endswith(("memory", "storage")):
         for unit in ("Ti", "Gi", "Mi", "Ki"):
             if amount and amount % _FACTORS[unit] == 0:
@@ -289,15 +276,13 @@ def amount_text(amount: int, resource: str) -> str:
     return f"{whole}.{decimals:03}".rstrip("0") if decimals else str(whole)
 
 
-def _plain_number(value: object) -> object:
-    is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    return str(value) if is_number else value
-
-
 # A quantity as Kubernetes writes it, like `500m`. A plain number needs no quotes.
 Quantity = Annotated[
     str,
-    BeforeValidator(_plain_number, json_schema_input_type=str | int | float),
+    BeforeValidator(
+        lambda value: str(value) if type(value) in (int, float) else value,
+        json_schema_input_type=str | int | float,
+    ),
     readable_by(amount_of),
 ]
 
@@ -453,8 +438,7 @@ class Node(CamelModel):
             }
         )
 
-    def most(self, resource: str) -> int | None:
-        """Return the node's capacity of a resource in thousandths; ``None`` means no limit."""
+    def most(self, resource: str) -> int | None:  # in thousandths; None means no limit
         if self.capacity is None:
             return None
         if resource in self.capacity:

@@ -73,7 +73,7 @@ _ANY = RepoSettings(
 
 
 def load(files: Mapping[str, str]) -> Config:
-    """Return the configuration of a state repo; files outside of the configuration are ignored."""
+    """Return the configuration of a state repo; other files are ignored."""
     reader = ConfigReader(files)
     repository = reader.read_file(ROOT_FILE, RepoSettings)
     if repository and repository.render_version > RENDER_VERSION:
@@ -100,7 +100,15 @@ def load(files: Mapping[str, str]) -> Config:
         name: _services_of(appdef, definitions, nodes.values(), reader)
         for name, appdef in appdefs.items()
     }
-    clients, client_files = _read_clients(reader)
+    clients, client_files = DEFAULT_SETTINGS, dict[str, str]()
+    for file in reader.files_of(CLIENTS_FILE):
+        part = reader.read_file(file, ClientsFile)
+        words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
+        for word in sorted(words):
+            first = client_files.setdefault(word, file)
+            if first != file:
+                reader.add_duplicate(word, (first, word), (file, word))
+            clients = clients.model_copy(update={word: getattr(part, word)})
     domain_of = _domains_of_nodes(reader, nodes, domains)
     all_nodes, domain_of, hosts = _in_further_domains(reader, nodes, domains, domain_of)
     clusters = reader.read_items(CLUSTERS_FILE, ClustersFile, "clusters", Cluster, "name")
@@ -108,8 +116,8 @@ def load(files: Mapping[str, str]) -> Config:
     charts = reader.read_items(CHARTS_FILE, ChartsFile, "charts", Chart)
     images = reader.read_items(IMAGES_FILE, ImagesFile, "images", Image)
     for name, image in images.items():
-        head = reader.head(reader.place_of(IMAGES_FILE, name)[0], ImagesFile)
-        if head is not None and head.registry is not None:
+        head = reader.heads.get(reader.place_of(IMAGES_FILE, name)[0])
+        if isinstance(head, ImagesFile) and head.registry is not None:
             images[name] = image.pulled_from(head.registry)
     versions: Mapping[str, VersionList] = {}
     if reader.files_of(VERSIONS_FILE):  # unlike the other collections, this one may have no file
@@ -139,20 +147,6 @@ def load(files: Mapping[str, str]) -> Config:
     return config
 
 
-def _read_clients(reader: ConfigReader) -> tuple[ClientsFile, Mapping[str, str]]:
-    """Return the settings of all connection types, and for each type the file with its settings."""
-    clients, files = DEFAULT_SETTINGS, dict[str, str]()
-    for file in reader.files_of(CLIENTS_FILE):
-        part = reader.read_file(file, ClientsFile)
-        words = part.model_fields_set - {"apiVersion", "kind"} if part else set()
-        for word in sorted(words):
-            first = files.setdefault(word, file)
-            if first != file:
-                reader.add_duplicate(word, (first, word), (file, word))
-            clients = clients.model_copy(update={word: getattr(part, word)})
-    return clients, files
-
-
 def _refuse_unread(reader: ConfigReader) -> None:
     # whoever mistypes a file's name must not believe that its entries are in force
     folders = {collection.partition("/")[0] for collection in COLLECTIONS}
@@ -173,7 +167,6 @@ def _refuse_unread(reader: ConfigReader) -> None:
 def _read_definitions(
     reader: ConfigReader, file: str, model: type[Definition]
 ) -> Mapping[str, Definition]:
-    """Return the definitions in all valid files ``appdefs/<folder>/{file}``, by folder."""
     definitions = {}
     for path in sorted(reader.files):
         parts = path.split("/")
@@ -253,7 +246,7 @@ def _in_further_domains(
     domains: Mapping[str, AccessDomain],
     domain_of: Mapping[str, AccessDomain],
 ) -> tuple[Mapping[str, Node], Mapping[str, AccessDomain], Mapping[str, str]]:
-    """Return nodes, domains and hosts, with a node ``<id>@<domain>`` for each further domain."""
+    """Return nodes, domains and hosts, with ``<id>@<domain>`` for each further domain."""
     # Everything follows from the node: namespace, rules, quotas, keys of releases. A domain beside
     # each node would have to be asked for at each place, and a place that forgets it would mix the
     # data of two domains.
@@ -289,7 +282,7 @@ def _in_further_domains(
                     reader.add_fault(file, f"{where}.name", message)
                 # the first domain keeps the plain name, so a further one changes nothing that runs
                 nodes[id], domain_of[id], hosts[id] = node.in_domain(further), domain, node.id
-                reader.add_alias(NODES_FILE, id, node.id)
+                reader.places[NODES_FILE][id] = (file, place)
     return nodes, MappingProxyType(domain_of), MappingProxyType(hosts)
 
 

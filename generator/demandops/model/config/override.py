@@ -1,8 +1,7 @@
 """Overrides: a person's declared deviations, one file each in ``overrides/``.
 
-This module has the model and the rules for one override. The module
-:mod:`.cross_check` finds conflicts between two overrides, and the
-package ``plan/overrides`` applies overrides to releases and claims.
+This module has the model and the rules for one override. :mod:`.cross_check` finds conflicts
+between two of them, and ``decide.planning.overrides`` applies overrides to releases and claims.
 """
 
 from __future__ import annotations
@@ -47,7 +46,7 @@ EFFECTS = (*_SHAPING, "hold", "deny", "keep")
 
 
 def parse_time(text: str) -> datetime:
-    """Parse an RFC 3339 time that has a time zone, and return it in UTC, or raise ValueError."""
+    """Parse an RFC 3339 time that has a time zone, and return it in UTC."""
     match = _MOMENT.fullmatch(text)
     if match is None:
         raise ValueError(
@@ -65,7 +64,6 @@ def parse_time(text: str) -> datetime:
 
 
 def format_time(moment: datetime) -> str:
-    """Return a time as RFC 3339 text in UTC, as messages and the ledger's markers have it."""
     text = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
     return re.sub(r"\.?0*\+00:00$", "Z", text)
 
@@ -134,7 +132,6 @@ class Selector(FrozenModel):
         return self
 
     def takes(self, service: str, appdef: str) -> bool:
-        """Return whether a service of an appdef fits ``services`` and ``appdefs``."""
         return (not self.services or matches(service, self.services)) and (
             not self.appdefs or matches(appdef, self.appdefs)
         )
@@ -163,53 +160,51 @@ class OverrideFile(FileModel):
     @model_validator(mode="after")
     def _consistent(self) -> OverrideFile:
         _filled_in(self)
-        if problems := [*self._problems()]:
-            raise ValueError(sentences(problems))
-        return self
-
-    def _problems(self) -> Iterable[str]:
+        problems: list[str] = []
         effects = self.effects()
         if not effects:
-            yield f"has no effect; give at least one of {', '.join(EFFECTS)}"
+            problems.append(f"has no effect; give at least one of {', '.join(EFFECTS)}")
         if "deny" in effects and len(effects) > 1:
             others = " and ".join(f"'{name}'" for name in effects if name != "deny")
-            yield (
+            problems.append(
                 f"with 'deny', nothing runs, so {others} cannot apply; remove 'deny', or remove "
                 f"{others}"
             )
         frozen = " and ".join(f"'{name}'" for name in effects if name in _SHAPING)
         if "hold" in effects and frozen:
-            yield (
+            problems.append(
                 f"'hold' freezes the release, so {frozen} cannot apply; remove 'hold', or remove "
                 f"{frozen}"
             )
         selects_clients = any(selector.connections for selector in self.select)
         if self.values is not None and selects_clients and not self.patches_clients():
-            yield (
+            problems.append(
                 "select: selects both connections and services, but 'values' fits only connections "
                 "(settings of clients) or only services (Helm values); write two overrides"
             )
         of_services = [name for name in effects if name in _OF_SERVICES]
         for index, selector in enumerate(self.select):
             if selector.connections and of_services:
-                yield (
+                problems.append(
                     f"select[{index}].connections: '{of_services[0]}' is for services, but this "
                     f"selector selects connections; remove 'connections' or '{of_services[0]}'"
                 )
             if selector.requesters and "node" in effects:
-                yield (
+                problems.append(
                     f"select[{index}].requesters: 'node' moves a service for all its "
                     "requesters, so it cannot be limited to some of them; select by applications, "
                     "appdefs, services, nodes or labels"
                 )
             if selector.services and "keep" in effects:
-                yield (
+                problems.append(
                     f"select[{index}].services: 'keep' applies to applications and connections "
                     "only; select those"
                 )
+        if problems:
+            raise ValueError(sentences(problems))
+        return self
 
     def patches_clients(self) -> bool:
-        """Return whether ``values`` patches the settings of clients instead of Helm values."""
         return all(selector.connections for selector in self.select)
 
     def effects(self) -> tuple[str, ...]:
@@ -244,15 +239,12 @@ class Override(OverrideFile):  # noqa: PLW1641 - overrides contain mappings, so 
 
 @dataclass(frozen=True, slots=True)
 class Shaping:
-    """The overrides that shape a release, each with the names of its effects on the release.
+    """The overrides that shape a release, each with the names of its effects on the release."""
 
-    The overrides are in the order in which they apply; the last one wins.
-    """
-
+    # In the order in which they apply; the last one wins
     by: tuple[tuple[Override, tuple[str, ...]], ...] = ()
 
     def image(self, name: str, image: Image) -> Image:
-        """Return ``image``, which the registry calls ``name``, as the overrides pin it."""
         for override, effects in self.by:
             if "images" in effects and override.images and name in override.images:
                 image = override.images[name].over(image)
@@ -260,7 +252,6 @@ class Shaping:
 
     @property
     def patches(self) -> tuple[tuple[str, Mapping[str, Any]], ...]:
-        """The file and the patch of each override that patches values."""
         return tuple(
             (override.path, override.values or {})
             for override, effects in self.by
@@ -269,7 +260,6 @@ class Shaping:
 
     @property
     def held(self) -> bool:
-        """Whether a ``hold`` keeps the release's file unchanged."""
         held = False
         for _, effects in self.by:
             # one that applies later and changes the release cancels the hold
@@ -284,7 +274,6 @@ Settings = TypeVar("Settings", bound=ClientSettings)
 
 
 def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) -> Settings:
-    """Return the settings of clients, patched by the ``values`` of the override in ``file``."""
     data = merge_patch(settings.model_dump(by_alias=True), patch)
     own, of_mqtt = (
         {field.alias for field in model.model_fields.values()}
@@ -298,12 +287,12 @@ def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) ->
 
 
 def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:
-    """Return overrides in the order in which they apply; the last one wins."""
+    # the order in which they apply; the last one wins
     return tuple(sorted(overrides, key=lambda override: override.rank))
 
 
 def still_active(overrides: Mapping[str, Override], ended: Mapping[str, str]) -> list[Override]:
-    """Return the overrides that have not ended; ``ended`` maps names to the expiry that passed."""
+    # `ended` has the expiry of each override when it ended
     return [
         override
         for name, override in overrides.items()

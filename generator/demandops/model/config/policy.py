@@ -35,7 +35,6 @@ Patterns = Annotated[tuple[Text, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
-    """Return whether a name matches any of ``patterns``; only ``*`` and ``?`` are special."""
     return any(name == pattern or _compiled(pattern)(name) for pattern in patterns)
 
 
@@ -204,7 +203,6 @@ class AccessDomain(CamelModel):
 
     @property
     def allowed_kinds(self) -> tuple[Kind, ...]:
-        """The kinds of objects that the domain's charts may have; the cluster enforces them."""
         if self.kinds is not None:
             return self.kinds
         # with a NetworkPolicy, a chart could open the closed namespace
@@ -212,7 +210,6 @@ class AccessDomain(CamelModel):
         return tuple(kind for name, kind in KINDS.items() if name not in without)
 
     def how_to_allow(self, kind: str, file: str) -> str:
-        """Return, in words, how to allow a kind of objects; ``file`` has the access domain."""
         if kind == _NETWORK_POLICY and self.network == "namespace":
             return f"remove 'network: namespace' of the domain in {file}"
         added = kind if kind in KINDS else f"{kind}, with its group and resource,"

@@ -87,8 +87,7 @@ class Chart(ChartSource):
         return (self, *self.channels.values())
 
     def at(self, version: str) -> ChartSource | None:
-        """Return the source of a channel or version, if known; an empty name is the default."""
-        if not version:
+        if not version:  # the default
             return self
         if version in self.channels:
             return self.channels[version]
@@ -112,7 +111,6 @@ class Image(FrozenModel):
         return self
 
     def pulled_from(self, registry: str) -> Image:
-        """Return this image with ``registry`` as the host in its name."""
         host, _, path = self.repository.partition("/")
         # Docker's rule: only such a first part is a host
         has_host = path and ("." in host or ":" in host or host == "localhost")
@@ -120,7 +118,6 @@ class Image(FrozenModel):
         return self.model_copy(update={"repository": repository})
 
     def parts(self) -> dict[str, str]:
-        """Return repository, tag and digest as chart values; an absent value is empty text."""
         return {"repository": self.repository, "tag": self.tag or "", "digest": self.digest or ""}
 
     def reference(self) -> str:
@@ -219,7 +216,7 @@ Precedence = tuple[tuple[int, ...], bool, tuple[tuple[bool, int, str], ...], str
 
 
 def precedence(version: str) -> Precedence:
-    """Return the key that sorts versions by the rules of Semantic Versioning 2.0.0 (item 11)."""
+    # by the rules of Semantic Versioning 2.0.0 (item 11)
     numbers, _, before = version.partition("-")
     words = (
         (not word.isdigit(), int(word) if word.isdigit() else 0, word) for word in before.split(".")
@@ -229,25 +226,21 @@ def precedence(version: str) -> Precedence:
 
 @dataclass(frozen=True)
 class ApplicationVersion:
-    """One version of an application definition, with the version's chart sources and image pins.
-
-    ``name`` is empty if the definition has no entry in ``registry/versions.yaml``.
-    """
+    """One version of an application definition, with its chart sources and image pins."""
 
     appdef: str
-    name: str
+    name: str  # empty if `registry/versions.yaml` does not list the definition
     charts: Mapping[str, ChartSource]
     images: Mapping[str, ImagePin]
 
     @cached_property
     def rank(self) -> tuple[Precedence, ...]:
-        """The key that sorts the versions of a definition; equal keys mean the same version."""
+        # equal keys mean the same version
         # without a list of versions, a version is that of the charts
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 
     def image(self, name: str, image: Image) -> Image:
-        """Return ``image``, which the registry calls ``name``, as this version pins it."""
         return self.images[name].over(image) if name in self.images else image
 
 
@@ -313,7 +306,6 @@ class ClientsFile(FileModel):
     ros: ClientSettings = ClientSettings()
 
     def of(self, connection_type: str) -> ClientSettings:
-        """Return the settings of a connection type, which is a word like ``mqtt``."""
         settings: ClientSettings = getattr(self, connection_type, ClientSettings())
         return settings
 

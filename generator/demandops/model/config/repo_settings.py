@@ -26,7 +26,7 @@ _SCP = re.compile(r"(?P<user>[^\s:@/]+)@(?P<host>[^\s:@/]+):(?!\d+/)(?P<path>[^\
 
 
 def as_git_url(text: str) -> str:
-    """Return an address like ``git@host:path`` as a URL, and any other address unchanged."""
+    # `git@host:path` is Git's short form of a URL
     scp = _SCP.fullmatch(text)
     return f"ssh://{scp['user']}@{scp['host']}/{scp['path']}" if scp else text
 
@@ -119,7 +119,7 @@ class Proposals(FrozenModel):
 
     @property
     def project(self) -> tuple[str, ...]:
-        """The owner and the name of the project: the last two parts of the path in ``url``."""
+        # owner and name: the last two parts of the path in `url`
         path = (self.url or "").partition("://")[2].partition("/")[2]
         return tuple(path.strip("/").removesuffix(".git").split("/")[-2:]) if path else ()
 

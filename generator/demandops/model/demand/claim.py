@@ -15,7 +15,7 @@ from demandops.base import naming
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections.connection import Connection
 
-# ---- applications: demands list them, claims hold them, and services are planned from them ----
+# ---- applications ----
 
 
 class InputTopic(NamedTuple):
@@ -29,20 +29,17 @@ class InputTopic(NamedTuple):
     further: bool = False
 
     def part_in(self, version: str) -> str:
-        """Return the text that stands for this input in topic names; ``version`` may be empty."""
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
 
     def distinguishing_text(self, further: bool, version: str) -> str:
-        """Return the text that makes topic names differ although their source is the same."""
         if not further:
             return version
         return f"{self.topic} {version}" if version else self.topic
 
 
+# An output that is brought to a node, as `topic` if that is set
 class Delivery(NamedTuple):
-    """An output (``<service>.<output>``) that is brought to a node, as ``topic`` if that is set."""
-
-    output: str
+    output: str  # `<service>.<output>`
     node: str
     topic: str = ""
 
@@ -60,8 +57,7 @@ class Requirement:
     def size(self) -> int:
         return len(self.labels) + len(self.capabilities) + len(self.properties)
 
-    def united(self, other: Requirement) -> Requirement:
-        """Return the requirement that a node meets if it meets both; two roles must be the same."""
+    def united(self, other: Requirement) -> Requirement:  # two roles must be the same
         return Requirement(
             self.role or other.role,
             tuple(sorted({*self.labels, *other.labels})),
@@ -109,13 +105,12 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return Subject(SubjectKind.APPLICATION, self.id)
 
     @property
-    def own_version(self) -> str:
-        """The version in the names of services and topics; empty unless ``separate``."""
+    def own_version(self) -> str:  # in the names of services and topics
         return self.version if self.separate else ""
 
     @property
     def home(self) -> str:
-        """The node whose access domain sets leases and quotas."""
+        # its access domain sets leases and quotas
         return self.node
 
     @property
@@ -123,26 +118,22 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return (self.node,)
 
     def all_inputs(self) -> list[tuple[str, InputTopic]]:
-        """Return every input as (role, topic)."""
         return [(role, topic) for role, topics in self.inputs.items() for topic in topics]
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
-        """Return the inputs of a role with this source and topic; they must be sorted as in a
-        claim.
-        """
+        # the inputs must be sorted, as in a claim
         inputs = self.inputs.get(role, ())
         start = bisect_left(inputs, InputTopic(topic, source))
         same = takewhile(
-            lambda each: (each.topic, each.source) == (topic, source), islice(inputs, start, None)
+            lambda t: (t.topic, t.source) == (topic, source), islice(inputs, start, None)
         )
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        """Return the inputs of a role that topic names show as ``part``."""
         if not self._further:  # computed only once, because the plans of many services need it
-            for each, topic in self.all_inputs():
+            for own_role, topic in self.all_inputs():
                 if topic.further or self.separate:
-                    key = each, topic.part_in(self.own_version)
+                    key = own_role, topic.part_in(self.own_version)
                     self._further.setdefault(key, []).append(topic)
         return self._further.get((role, part), [])
 
@@ -151,13 +142,11 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return delivered or node in self.needed_nodes()
 
     def needed_nodes(self) -> set[str]:
-        """Return the nodes at which services may run: the application's nodes and its sources."""
         sources = (topic.source for _, topic in self.all_inputs())
         return {*self.chosen_nodes, *self.moved.values(), *sources}
 
     def chosen_node(self, service: str) -> str:
-        """Return the node that was chosen for a service, which an override may have moved away."""
-        return self.services.get(service, self.node)
+        return self.services.get(service, self.node)  # an override may have moved it away
 
     @property
     def chosen_nodes(self) -> set[str]:
@@ -168,27 +157,31 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         return mine == theirs
 
     def moved_to_nodes_of(self, first: Application) -> Application:
-        """Return the application with the nodes of ``first``: its own and those of its services."""
         if (self.node, self.services, self.moved) == (first.node, first.services, first.moved):
             return self
         return replace(self, node=first.node, services=first.services, moved=first.moved)
 
     def booked(self) -> Application:
-        """Return the application in the form of a claim: sorted, without duplicates."""
         # The order of a goal's lists must not reach the ledger, because the same demand in another
         # order would make a commit.
-        inputs = {role: _merged(topics) for role, topics in sorted(self.inputs.items())}
+        inputs: dict[str, tuple[InputTopic, ...]] = {}
+        for role, topics in sorted(self.inputs.items()):
+            merged: dict[tuple[str, str], InputTopic] = {}
+            for topic in topics:
+                first = merged.setdefault((topic.topic, topic.source), topic)
+                # only some goals give the type of a topic, and the others must not take it away
+                if topic.type and not first.type:
+                    merged[topic.topic, topic.source] = topic
+            inputs[role] = tuple(topic for _, topic in sorted(merged.items()))
         place = self.place and self.place.united(self.place)
         deliver = tuple(sorted({*self.deliver}))
         return replace(self, deliver=deliver, place=place).with_inputs(inputs)
 
     def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
-        """Return the application with other inputs; roles without topics are left out."""
         kept = {role: topics for role, topics in inputs.items() if topics}
         return replace(self, inputs=MappingProxyType(kept))
 
     def extended(self, more: Application) -> Application:
-        """Return ``more`` with this application's inputs, parameters and deliveries added."""
         roles = {*self.inputs, *more.inputs}
         inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
         parameters = MappingProxyType({**self.parameters, **more.parameters})
@@ -198,7 +191,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def matches_listed(self, listed: object) -> bool:
-        """Return whether a shutdown that lists ``listed``, with the same id, means this."""
         return (
             isinstance(listed, Application)
             and listed.node in ("", self.node)
@@ -206,21 +198,17 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
         )
 
     def distinguishing_values(self) -> tuple[str, ...]:
-        """Return the values by which a shutdown distinguishes applications with the same id."""
         return (self.node, self.appdef)
 
     def topic_keys(self) -> Iterator[TopicKey]:
-        """Yield the key of each input, (role, topic, source); without inputs one empty key."""
+        # (role, topic, source) of each input; without inputs one empty key
         for role, topic in self.all_inputs():
             yield role, topic.topic, topic.source
         if not any(self.inputs.values()):
             yield ()
 
     def listed_topics(self, listed: object) -> Iterator[tuple[str, list[TopicKey]]]:
-        """Yield (text, keys) for each input that a shutdown lists in ``listed``.
-
-        ``keys`` are the keys of this application's inputs that match it.
-        """
+        """Yield (text, matching keys of this application) for each input that a shutdown lists."""
         assert isinstance(listed, Application)  # noqa: S101 - see matches_listed
         by_name: dict[TopicKey, list[TopicKey]] = {}
         for key in self.topic_keys():
@@ -232,18 +220,13 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             yield f"{role} {topic.topic} of {topic.source}", keys
 
     def without_topics(self, gone: Container[TopicKey]) -> Application | None:
-        """Return the application without the inputs in ``gone``; ``None`` if no input is left."""
         left = {
-            role: tuple(each for each in topics if (role, each.topic, each.source) not in gone)
+            role: tuple(t for t in topics if (role, t.topic, t.source) not in gone)
             for role, topics in self.inputs.items()
         }
         return self.with_inputs(left) if any(left.values()) else None
 
     def without_node(self, node: str) -> Application | None:
-        """Return the application without its inputs from ``node`` and its deliveries to ``node``.
-
-        Return ``None`` if no input is left, or if the application or a service runs on the node.
-        """
         if node in self.chosen_nodes or node in self.moved.values():
             return None
         deliver = tuple(delivery for delivery in self.deliver if delivery.node != node)
@@ -280,17 +263,6 @@ def _exact(values: Mapping[str, object]) -> str:
     return json.dumps(dict(values), sort_keys=True, default=repr) if values else ""
 
 
-def _merged(topics: Iterable[InputTopic]) -> tuple[InputTopic, ...]:
-    """Return the topics sorted, with one topic for each topic name and source."""
-    merged: dict[tuple[str, str], InputTopic] = {}
-    for topic in topics:
-        first = merged.setdefault((topic.topic, topic.source), topic)
-        # only some goals give the type of a topic, and the others must not take it away
-        if topic.type and not first.type:
-            merged[topic.topic, topic.source] = topic
-    return tuple(topic for _, topic in sorted(merged.items()))
-
-
 # ---- leases: how long a claim stays booked without a renewal ----
 #
 # The recorded end may lag behind the last renewal by ``slack``, so that only some renewals make a
@@ -307,9 +279,7 @@ UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
 
 @dataclass(frozen=True, slots=True)
 class Term:
-    """The requested lease and its slack, both in seconds."""
-
-    seconds: int
+    seconds: int  # the requested lease
     slack: int = 0
     # the lease starts when a person approves the request, not when the request is received
     on_approval: bool = False
@@ -331,14 +301,12 @@ class Lease:
         return self.until < UNSTARTED
 
     def started(self, now: datetime, before: Lease | None = None) -> Lease:
-        """Return the lease of a claim that a person approves at ``now``."""
         term = Term(self.seconds, self.slack)
         # the approval of a changed demand renews its lease, which never ends earlier than before
         return before.renewed(term, now) if before else term.lease_from(now)
 
     @property
     def expires_at(self) -> datetime:
-        """The time after which the claim may be released."""
         return self.until + timedelta(seconds=self.slack)
 
     def has_ended(self, now: datetime) -> bool:
@@ -368,27 +336,21 @@ OVERRIDE_PREFIX = "override:"
 
 @dataclass(frozen=True, slots=True)
 class ClaimKey:
-    """The identity of a claim; the ledger has one file for each claim."""
-
     subject: Subject
     demand: str
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """One demand's hold on an application or a connection.
-
-    ``joined``: a goal of the reference's action booked the claim; a shutdown takes holds only from
-    such claims. ``partial`` maps each topic that only some ``requesters`` hold to these.
-    """
-
     held: Application | Connection
     demand: str
     request: str
     requesters: tuple[str, ...]
     booked: datetime
     lease: Lease | None = None
+    # A goal of the reference's action booked it; a shutdown takes holds only from such claims
     joined: bool = False
+    # The topics that only some requesters hold
     partial: Mapping[TopicKey, tuple[str, ...]] = field(default_factory=dict)
 
     @property
@@ -415,12 +377,11 @@ class Claim:
 
     @property
     def keeping_override(self) -> str | None:
-        """The name of the override that made the claim by its effect ``keep``."""
+        # the override that made the claim by its effect `keep`
         name = self.demand.removeprefix(OVERRIDE_PREFIX)
         return None if name == self.demand else name
 
     def index_entries(self) -> Iterator[tuple[str, ...]]:
-        """Yield the claim's entries in the ledger's index, except the end of its lease."""
         yield ("demand", self.demand)
         for requester in self.requesters:
             yield ("requester", requester)
@@ -436,13 +397,12 @@ class Claim:
     def with_holders(
         self, held: Application | Connection, holders: Mapping[TopicKey, tuple[str, ...]]
     ) -> Claim:
-        """Return the claim with other content; ``holders`` maps each topic to sorted requesters."""
         requesters = tuple(sorted({who for names in holders.values() for who in names}))
         partial = {topic: names for topic, names in holders.items() if names != requesters}
         return replace(self, held=held, requesters=requesters, partial=partial)
 
     def extending(self, current: Claim) -> Claim:
-        """Return the claim with everything added that ``current``, the claim so far, holds."""
+        # with everything added that the claim so far holds
         held = current.held.extended(self.held).booked()  # type: ignore[arg-type]  # of one kind
         # a shutdown may have taken holds: only what is listed again is held by all requesters
         holders = dict.fromkeys(held.topic_keys(), self.requesters)
@@ -453,7 +413,6 @@ class Claim:
     def without_holds(
         self, requester: str, topics: Container[TopicKey] | None = None
     ) -> Claim | None:
-        """Return the claim without a requester's holds on ``topics``, or on all topics."""
         holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
         for topic in self.held.topic_keys():
             names = self.holders(topic)
@@ -466,8 +425,7 @@ class Claim:
         held = self.held.without_topics(gone) if gone else self.held
         return None if held is None else self.with_holders(held, holders)
 
-    def without_node(self, node: str) -> Claim | None:
-        """Return what is left of the claim, which must need the node, without it."""
+    def without_node(self, node: str) -> Claim | None:  # the claim must need the node
         held = self.held.without_node(node)
         if held is None:
             return None
@@ -487,7 +445,6 @@ def requesters_of(claims: Iterable[Claim]) -> tuple[str, ...]:
 
 
 def demand_id(request: str, requesters: Iterable[str]) -> str:
-    """Return the demand id for a request of the reference's action, which names no demand."""
     # a digest, so that every generator gives a repeated request the same demand id
     exact = json.dumps([request, sorted(set(requesters))], ensure_ascii=True)
     return naming.hash_of(exact, 20)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Sequence
 from functools import partial
 from types import MappingProxyType
 from typing import Annotated, Any, Literal, TypeVar
@@ -28,7 +28,6 @@ from demandops.model.demand.demand_request import Demanded, DemandRequest, Put, 
 # Fields of the wrong form are left out, and the other fields are kept. So the caller can report
 # faults of form and of content together.
 
-
 # how deeply a goal may be nested: as deeply as a YAML file of the state repo
 _DEEPEST_GOAL = 100
 
@@ -40,10 +39,7 @@ def parse_valid_part(
 ) -> tuple[Goal, list[Fault]]:
     """Return the part of ``data`` that has the form of ``model``, and a fault for each wrong part.
 
-    The model has a default for every field; ``lists_of_text`` are those that are lists of text.
-
-    Raises:
-        Refused: with the first faults, if there are too many to look for others.
+    Raises Refused with the first faults, if there are too many to look for others.
     """
     faults: list[Fault] = []
     pruned = _with_keys_of_text(data, (), faults)
@@ -63,7 +59,7 @@ def _with_keys_of_text(
     location: tuple[int | str, ...],
     faults: list[Fault],
 ) -> Any:  # noqa: ANN401
-    """Return ``data`` without keys that are not Unicode text and without what is too deep."""
+    # without keys that are not Unicode text, and without what is too deep
     if len(location) > _DEEPEST_GOAL and isinstance(data, dict | list):
         message = f"is nested deeper than {_DEEPEST_GOAL} levels; make it flatter"
         faults.append(fault(field_path(location[:2]), message))
@@ -91,7 +87,7 @@ def is_unicode(text: str) -> bool:
 def _blank(
     data: dict[str, Any], location: Sequence[int | str], lists_of_text: Container[str]
 ) -> dict[str, Any]:
-    """Remove the value at ``location`` from ``data`` in place, and return ``data``."""
+    # removes the value at `location` in place
     *parents, last = location
     node: Any = data
     within = ""
@@ -109,13 +105,7 @@ def _blank(
     return data
 
 
-# ---- demand goal ----
-#
-# The goal of our own ``Demand`` action as plain data, parsed into a :class:`DemandRequest`.
-#
-# :func:`parse` takes goals of ``demandops_interfaces/action/Demand`` and YAML of the kind
-# ``Demand``. The goal names its demand. A put may list any type of application, and replaces the
-# demand's claims.
+# ---- goals of ``demandops_interfaces/action/Demand``, and YAML of the kind ``Demand`` ----
 
 
 class GoalTopic(FrozenModel):
@@ -234,18 +224,12 @@ _LISTS_OF_TEXT = ("requesters", "labels", "capabilities", "properties")
 
 
 def is_demand_goal(data: dict[str, Any]) -> bool:
-    """Return whether plain data is to be read as a goal of our own action."""
     # the reference's goals have neither of these fields
     return "kind" in data or "apiVersion" in data
 
 
 def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
-    """Parse a goal of our own action.
-
-    Returns:
-        The request and the faults of its form. Fields of the wrong form are left out of the
-        request, so that the caller can check the others. A request with faults must not be booked.
-    """
+    """Return the request and the faults of its form; one with faults must not be booked."""
     goal, faults = parse_valid_part(data, DemandGoal, _LISTS_OF_TEXT)
     requesters = tuple(goal.requesters)
     id = goal.request or goal.demand
@@ -258,7 +242,22 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
     else:
         lease_s = goal.lease
     if goal.operation != "put":
-        faults += _fields_of_a_put(goal, lease_s)
+        verb = goal.operation
+        if lease_s is not None:
+            message = "is set by a put; leave it out, or put the demand again"
+            faults.append(fault("lease", message))
+        if goal.applications or goal.connections:
+            remedy = "leave the field out; to change the demand, send a put"
+            if verb == "release":
+                remedy = "to release a part of the demand, put the demand without that part"
+            field = "applications" if goal.applications else "connections"
+            faults.append(fault(field, f"a {verb} names only its demand; {remedy}"))
+        if goal.priority:
+            message = f"a {verb} does not wait for room; leave priority out"
+            faults.append(fault("priority", message))
+        if goal.positions:
+            message = f"a {verb} chooses no node; leave the positions out"
+            faults.append(fault("positions", message))
         operation = Release if goal.operation == "release" else Renew
         return operation(id, demand=goal.demand, own_requesters=requesters), faults
     applications = (
@@ -271,7 +270,21 @@ def parse(data: dict[str, Any]) -> tuple[DemandRequest, list[Fault]]:
         for index, app in enumerate(goal.applications)
     )
     connections = (
-        Demanded(_connection(connection), requesters, partial(_field, f"connections[{index}]"))
+        Demanded(
+            Connection(
+                id=connection.id,
+                type=None if connection.type == "auto" else type_named(connection.type),
+                source=connection.source,
+                target=connection.target,
+                topics=tuple(
+                    r.route(absolute_topic(r.source), absolute_topic(r.target or r.source))
+                    for r in connection.topics
+                ),
+                broker=connection.broker,
+            ),
+            requesters,
+            partial(_field, f"connections[{index}]"),
+        )
         for index, connection in enumerate(goal.connections)
     )
     positions: dict[str, Position] = {}
@@ -299,31 +312,11 @@ def _field(item: str, path: str) -> str:
     return f"{item}.{'type' if path == 'appdef' else path}"
 
 
-def _fields_of_a_put(goal: DemandGoal, lease_s: int | None) -> Iterator[Fault]:
-    """Yield a fault for each field of a release or a renewal that only a put may have."""
-    if lease_s is not None:
-        yield fault("lease", "is set by a put; leave it out, or put the demand again")
-    if goal.applications or goal.connections:
-        remedy = (
-            "to release a part of the demand, put the demand without that part"
-            if goal.operation == "release"
-            else "leave the field out; to change the demand, send a put"
-        )
-        yield fault(
-            "applications" if goal.applications else "connections",
-            f"a {goal.operation} names only its demand; {remedy}",
-        )
-    if goal.priority:
-        yield fault("priority", f"a {goal.operation} does not wait for room; leave priority out")
-    if goal.positions:
-        yield fault("positions", f"a {goal.operation} chooses no node; leave the positions out")
-
-
 def _requirement(where: str, place: GoalPlace, faults: list[Fault]) -> Requirement | None:
     if place == GoalPlace():
         return None
     # a text of the wrong type was reported and is empty now, which would be a second fault
-    told = {each.field for each in faults}
+    told = {fault.field for fault in faults}
     labels = [tuple(label.split("=", 1)) for label in place.labels]
     for index, label in enumerate(labels):
         field = f"{where}.labels[{index}]"
@@ -375,8 +368,8 @@ def _application(where: str, app: GoalApplication, faults: list[Fault]) -> Appli
         parameters=MappingProxyType(parameters),
         version=app.version,
         deliver=tuple(
-            Delivery(each.output, each.node, absolute_topic(each.topic) if each.topic else "")
-            for each in app.deliver
+            Delivery(item.output, item.node, absolute_topic(item.topic) if item.topic else "")
+            for item in app.deliver
         ),
         place=_requirement(f"{where}.place", app.place, faults),
         services=MappingProxyType(dict(app.services)),
@@ -405,17 +398,3 @@ def _value_problem(value: object, depth: int) -> str:
     parts = [*value, *value.values()] if isinstance(value, dict) else value
     nested = parts if isinstance(parts, list) else ()
     return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")
-
-
-def _connection(connection: GoalConnection) -> Connection:
-    return Connection(
-        id=connection.id,
-        type=None if connection.type == "auto" else type_named(connection.type),
-        source=connection.source,
-        target=connection.target,
-        topics=tuple(
-            route.route(absolute_topic(route.source), absolute_topic(route.target or route.source))
-            for route in connection.topics
-        ),
-        broker=connection.broker,
-    )

@@ -1,8 +1,7 @@
 """Demand requests: one class for each operation on the ledger.
 
-Goals of ROS actions and YAML files are parsed into these values, and
-:mod:`.admission` checks them. :mod:`.apply` carries them out. The
-stage of the ledger has further classes: ``Wait``, ``Drain`` and ``Restoration``.
+Goals of ROS actions and YAML files are parsed into these values. The admission checks them, and the
+booking carries them out. Further classes are ``Wait``, ``Drain`` and ``Restoration``.
 """
 
 from __future__ import annotations
@@ -38,22 +37,18 @@ class Demanded:
     placed: tuple[str, ...] = ()
 
     def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
-        """Return a fault for the field at ``path`` in this item, named by its path in the goal."""
         return fault(self.place(path), message, code=code)
 
 
 @dataclass(frozen=True, slots=True)
 class DemandRequest:
-    """A request; it is booked or refused as a whole.
-
-    The reference's requests have no demand id; :func:`.claim.demand_id` makes one
-    for each item. ``own_requesters`` are those of the request as a whole: a release lists nothing,
-    but has requesters.
-    """
+    """A request; it is booked or refused as a whole."""
 
     id: str
     demanded: tuple[Demanded, ...] = ()
+    # Empty in the reference's requests; `claim.demand_id` makes one for each item
     demand: str = ""
+    # Those of the request as a whole: a release lists nothing, but has requesters
     own_requesters: tuple[str, ...] = ()
 
     operation: ClassVar[str]  # as in commits and files
@@ -62,7 +57,6 @@ class DemandRequest:
     is_reference: ClassVar[bool] = False
 
     def requesters(self) -> tuple[str, ...]:
-        """Return all requesters, each once, in the order of the request."""
         listed = (who for item in self.demanded for who in item.requesters)
         return tuple(dict.fromkeys((*self.own_requesters, *listed)))
 
@@ -92,15 +86,11 @@ class Shutdown(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Put(DemandRequest):
-    """A goal of our own action, after which the demand holds exactly what the goal lists.
-
-    ``lease_s`` is the wanted lease in seconds. ``positions`` has the positions of nodes that have
-    none in the inventory. ``priority`` ranks the demand among those that wait for room.
-    """
+    """A goal of our own action, after which the demand holds exactly what the goal lists."""
 
     lease_s: int | None = None
-    positions: Mapping[str, Position] = field(default_factory=dict)
-    priority: int = 0
+    positions: Mapping[str, Position] = field(default_factory=dict)  # of nodes that have none
+    priority: int = 0  # among the demands that wait for room
 
     operation = "put"
     adds_claims = True
@@ -108,15 +98,11 @@ class Put(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Release(DemandRequest):
-    """Releases everything that its demand holds."""
-
     operation = "release"
 
 
 @dataclass(frozen=True, slots=True)
 class Renew(DemandRequest):
-    """Renews the leases of its demand."""
-
     operation = "renew"
 
 
@@ -129,16 +115,12 @@ class Expire(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Decommission(DemandRequest):
-    """An operator's request to release what needs a node or names a requester.
+    """An operator's request to release what needs a node or names a requester: its ``id``."""
 
-    ``id`` is the name of the node or requester. ``kinds`` are ``node``, ``requester`` or both.
-    ``nodes`` lists the names that the node has in its access domains; the admission fills it in.
-    ``by`` is the operator as ``name <email>``.
-    """
-
-    kinds: frozenset[str] = frozenset()
-    by: str = ""
+    kinds: frozenset[str] = frozenset()  # `node`, `requester` or both
+    by: str = ""  # the operator as `name <email>`
     reason: str = ""
+    # The names that the node has in its access domains; the admission fills them in
     nodes: tuple[str, ...] = ()
 
     operation = "decommission"
@@ -149,7 +131,7 @@ class Decommission(DemandRequest):
         return isinstance(data, dict) and data.get("kind") == "Decommission"
 
     def goal(self) -> dict[str, Any]:
-        """Return the request as plain data for :meth:`parse`, without ``nodes``."""
+        # `parse` reads it; without `nodes`
         data = {"kind": "Decommission", "name": self.id, "as": sorted(self.kinds), "by": self.by}
         return data | ({"reason": self.reason} if self.reason else {})
 

@@ -16,7 +16,7 @@ from pydantic import Field
 
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import absolute_topic
-from demandops.connections.connection import Connection, ConnectionType, Route
+from demandops.connections.connection import Connection, Route
 from demandops.connections.connection_types import by_number, type_numbered
 from demandops.model.config.appdef import ApplicationDefinition
 from demandops.model.config.base_model import FrozenModel
@@ -86,7 +86,7 @@ _LISTS_OF_TEXT = ("requester_ids", "source_topics", "target_topics")
 
 
 def _application_field(item: str, lists: Mapping[str, str], path: str) -> str:
-    """Return the path of an application's field in the goal; ``lists`` maps roles to its lists."""
+    # `lists` maps roles to the lists of the goal
     name, _, within = path.partition(".")
     if name in ("id", "node"):
         return f"{item}.header.{'id' if name == 'id' else 'node_id'}"
@@ -114,34 +114,63 @@ def _connection_field(item: str, path: str) -> str:
 
 
 def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | None, list[Fault]]:
-    """Parse a goal given as plain data, as ``ros2 action send_goal`` takes it.
-
-    Returns:
-        The request and the faults of its form. Fields of the wrong form are left out of the
-        request, so that the caller can check the others. A request with faults must not be booked.
-    """
+    """Return the request and the faults of its form; one with faults must not be booked."""
     if not isinstance(data, dict):
         return None, [_not_a_mapping()]
     goal, faults = parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)
-    faulty = {each.field for each in faults}
-    demanded = [
-        _application(f"apps[{index}]", app, appdef_by_type(app.type))
-        for index, app in enumerate(goal.apps)
-    ]
+    faulty = {fault.field for fault in faults}
+    demanded: list[Demanded] = []
+    for index, app in enumerate(goal.apps):
+        appdef, body = appdef_by_type(app.type), app.object_detection_fusion_app
+        wire = appdef.deployment_request if appdef else None
+        roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
+        inputs: dict[str, tuple[InputTopic, ...]] = {}
+        for name in ("ego_data_topics", "pointcloud_topics"):
+            topics: list[WireTopic] = getattr(body, name)
+            role = roles.get(name) or name
+            if topics:
+                # the appdef may give both lists to one role
+                inputs[role] = inputs.get(role, ()) + tuple(
+                    InputTopic(absolute_topic(topic.topic_name), topic.source_node_id, topic.type)
+                    for topic in topics
+                )
+        application = Application(
+            id=app.header.id,
+            appdef=appdef.name if appdef else f"#{app.type}",
+            node=app.header.node_id,
+            inputs=MappingProxyType(inputs),
+        )
+        lists = {role: name for name, role in roles.items()}
+        place = partial(_application_field, f"apps[{index}]", lists)
+        demanded.append(Demanded(application, tuple(dict.fromkeys(body.requester_ids)), place))
     for index, connection in enumerate(goal.connections):
         where = f"connections[{index}]"
         # an invalid type becomes None, so that nothing is checked that depends on the type
         kind = type_numbered(connection.type) if f"{where}.type" not in faulty else None
-        demanded.append(_connection(where, connection, kind))
+        sources, targets = connection.source_topics, connection.target_topics
+        # If the lists are not equally long, the longer one fills up the shorter one, so that faults
+        # of all topics are found too.
+        pairs = zip(
+            [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
+        )
+        held = Connection(
+            id=connection.id,
+            type=kind,
+            source=connection.source_node_id,
+            target=connection.target_node_id,
+            topics=tuple(Route(absolute_topic(here), absolute_topic(to)) for here, to in pairs),
+            broker=connection.broker_node_id,
+        )
+        requesters = tuple(dict.fromkeys(connection.requester_ids))
+        demanded.append(Demanded(held, requesters, partial(_connection_field, where)))
         if kind is None and f"{where}.type" not in faulty:
-            types = ", ".join(f"{each.number} ({each.name})" for each in by_number())
+            types = ", ".join(f"{kind.number} ({kind.name})" for kind in by_number())
             message = f"{connection.type} is not a connection type; known: {types}"
             faults.append(fault(f"{where}.type", message, code="unknown-connection-type"))
-        sources, targets = len(connection.source_topics), len(connection.target_topics)
-        if sources != targets:
+        if len(sources) != len(targets):
             message = (
-                f"has {targets} names, but source_topics has {sources}; source topic i goes to "
-                "target topic i, so both lists must have the same length"
+                f"has {len(targets)} names, but source_topics has {len(sources)}; source topic i "
+                "goes to target topic i, so both lists must have the same length"
             )
             faults.append(fault(f"{where}.target_topics", message))
     # if "shutdown" is invalid, treat the goal as a shutdown, because a join must obey all its rules
@@ -149,8 +178,8 @@ def parse(data: object, appdef_by_type: AppdefByType) -> tuple[DemandRequest | N
     return operation(id=goal.id, demanded=tuple(demanded)), faults
 
 
+# those that need no configuration
 def form_faults(data: object) -> list[Fault]:
-    """Return the faults in a goal's form that need no configuration."""
     if not isinstance(data, dict):
         return [_not_a_mapping()]
     return parse_valid_part(data, WireGoal, _LISTS_OF_TEXT)[1]
@@ -162,53 +191,3 @@ def _not_a_mapping() -> Fault:
         "or with id, apps, connections and shutdown"
     )
     return fault("", message)
-
-
-def _application(
-    where: str, app: WireApplication, appdef: ApplicationDefinition | None
-) -> Demanded:
-    body = app.object_detection_fusion_app
-    wire = appdef.deployment_request if appdef else None
-    roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
-    inputs: dict[str, tuple[InputTopic, ...]] = {}
-    for name in ("ego_data_topics", "pointcloud_topics"):
-        topics: list[WireTopic] = getattr(body, name)
-        role = roles.get(name) or name
-        if topics:
-            # the appdef may give both lists to one role
-            inputs[role] = inputs.get(role, ()) + tuple(
-                InputTopic(absolute_topic(topic.topic_name), topic.source_node_id, topic.type)
-                for topic in topics
-            )
-    return Demanded(
-        Application(
-            id=app.header.id,
-            appdef=appdef.name if appdef else f"#{app.type}",
-            node=app.header.node_id,
-            inputs=MappingProxyType(inputs),
-        ),
-        tuple(dict.fromkeys(body.requester_ids)),
-        partial(_application_field, where, {role: name for name, role in roles.items()}),
-    )
-
-
-def _connection(where: str, connection: WireConnection, kind: ConnectionType | None) -> Demanded:
-    sources, targets = connection.source_topics, connection.target_topics
-    # The caller reports lists of unequal length. Here the longer list fills up the shorter one, so
-    # that faults of all topics are found too.
-    pairs = zip(
-        [*sources, *targets[len(sources) :]], [*targets, *sources[len(targets) :]], strict=True
-    )
-    held = Connection(
-        id=connection.id,
-        type=kind,
-        source=connection.source_node_id,
-        target=connection.target_node_id,
-        topics=tuple(Route(absolute_topic(here), absolute_topic(there)) for here, there in pairs),
-        broker=connection.broker_node_id,
-    )
-    return Demanded(
-        held,
-        tuple(dict.fromkeys(connection.requester_ids)),
-        partial(_connection_field, where),
-    )

@@ -37,15 +37,13 @@ from demandops.model.demand.claim import (
 
 LEDGER_ROOT = "ledger"
 
-_JOINED = re.compile(
-    r"[0-9a-f]{20}"
-)  # the form of what demandops.model.demand.claim.demand_id returns
+_JOINED = re.compile(r"[0-9a-f]{20}")  # the form of what `claim.demand_id` returns
 # nine digits, because Python refuses to convert thousands of them
 _VERSION = re.compile(r"^demandops\.ledger/v([0-9]{1,9})$")
 
 
 def segment(exact: str) -> str:
-    """Return a path segment for an id: readable, and safe on every file system."""
+    # readable, and safe on every file system
     return naming.slug_with_hash(exact, exact, 16)
 
 
@@ -54,14 +52,12 @@ def path_of(key: ClaimKey) -> str:
 
 
 def folder_of(subject: Subject) -> str:
-    """Return the folder of all claims on an application or a connection."""
     # many folders, because a Git tree with 100,000 entries adds 100 ms to each commit
     fan = naming.hash_of(subject.id, 2)
     return f"{LEDGER_ROOT}/{subject.kind.value}/{fan}/{segment(subject.id)}"
 
 
 def parse_timestamp(text: str) -> datetime:
-    """Return the time that a text states, in UTC; raise ValueError without a time zone."""
     try:
         moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
         in_utc = moment.astimezone(timezone.utc)
@@ -74,7 +70,7 @@ def parse_timestamp(text: str) -> datetime:
 
 
 def minute_of(moment: datetime) -> str:
-    """Return the minute of a time, in UTC, as a text that sorts like the time."""
+    # in UTC, and sorts like the time
     return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
 
 
@@ -154,11 +150,10 @@ class _Claim(FrozenModel):
         raise NotImplementedError
 
     def partial(self) -> Iterator[tuple[str, TopicKey, tuple[str, ...]]]:
-        """Yield (field of the file, topic, requesters) for each topic that lists requesters."""
+        # (field of the file, topic, requesters) for each topic that lists requesters
         raise NotImplementedError
 
     def faults(self) -> Iterator[Fault]:
-        """Yield a fault for each topic that lists a requester who is not among the claim's."""
         for place, _, names in self.partial():
             if unknown := set(names) - set(self.requesters):
                 message = (
@@ -222,7 +217,7 @@ class _ApplicationFile(_Claim):
             MappingProxyType(inputs),
             MappingProxyType(self.parameters),
             self.version,
-            tuple(sorted(Delivery(each.output, each.node, each.topic) for each in self.deliver)),
+            tuple(sorted(Delivery(item.output, item.node, item.topic) for item in self.deliver)),
             self.place.requirement() if self.place else None,
             self.separate,
             MappingProxyType(self.services),
@@ -255,10 +250,41 @@ class _ConnectionFile(_Claim):
 
 def text_of(claim: Claim) -> str:
     held = claim.held
+
+    def requesters(*topic: str) -> dict[str, list[str]]:
+        names = claim.partial.get(topic)
+        return {"requesters": list(names)} if names else {}
+
+    data: dict[str, Any]
     if isinstance(held, Application):
-        kind, data = "Application", _application_data(claim, held)
+        inputs: dict[str, list[dict[str, Any]]] = {role: [] for role in held.inputs}
+        for role, topic in held.all_inputs():
+            entry: dict[str, Any] = {"topic": topic.topic, "source": topic.source}
+            entry |= {"type": topic.type} if topic.type else {}
+            entry |= {"further": True} if topic.further else {}
+            inputs[role].append(entry | requesters(role, topic.topic, topic.source))
+        deliver = [{k: v for k, v in item._asdict().items() if v} for item in held.deliver]
+        # Empty fields are left out, so that a new field leaves other claims' files as they are
+        further = {
+            "parameters": dict(sorted(held.parameters.items())),
+            "version": held.version,
+            "separate": held.separate,
+            "deliver": deliver,
+            "services": dict(sorted(held.services.items())),
+            "named": list(held.named),
+            "moved": dict(sorted(held.moved.items())),
+        }
+        kind, data = "Application", {"definition": held.appdef, "node": held.node, "inputs": inputs}
+        data |= {name: value for name, value in further.items() if value}
+        data |= {"place": place_data(held.place)} if held.place else {}
     else:
-        kind, data = "Connection", _connection_data(claim, held)
+        topics: dict[str, str | dict[str, Any]] = {}
+        for route in held.topics:
+            options = route.options() | requesters(route.source)
+            topics[route.source] = {"target": route.target, **options} if options else route.target
+        kind, data = "Connection", {"type": held.known_type.word, "source": held.source}
+        data |= {"target": held.target} | ({"broker": held.broker} if held.broker else {})
+        data["topics"] = topics
     lease: dict[str, object] = {}
     if claim.lease is not None:
         lease = {"seconds": claim.lease.seconds, "slack": claim.lease.slack}
@@ -280,35 +306,7 @@ def text_of(claim: Claim) -> str:
     )
 
 
-def _application_data(claim: Claim, app: Application) -> dict[str, Any]:
-    def topic_data(role: str, topic: InputTopic) -> dict[str, Any]:
-        entry: dict[str, Any] = {"topic": topic.topic, "source": topic.source}
-        entry |= {"type": topic.type} if topic.type else {}
-        entry |= {"further": True} if topic.further else {}
-        return entry | _partial(claim, (role, topic.topic, topic.source))
-
-    data: dict[str, Any] = {
-        "definition": app.appdef,
-        "node": app.node,
-        "inputs": {
-            role: [topic_data(role, topic) for topic in topics]
-            for role, topics in app.inputs.items()
-        },
-    }
-    # Empty fields are left out, so that a new field leaves the files of other claims as they are
-    data |= {"parameters": dict(sorted(app.parameters.items()))} if app.parameters else {}
-    data |= {"version": app.version} if app.version else {}
-    data |= {"separate": True} if app.separate else {}
-    deliver = [{k: v for k, v in each._asdict().items() if v} for each in app.deliver]
-    data |= {"deliver": deliver} if deliver else {}
-    data |= {"services": dict(sorted(app.services.items()))} if app.services else {}
-    data |= {"named": list(app.named)} if app.named else {}
-    data |= {"moved": dict(sorted(app.moved.items()))} if app.moved else {}
-    return data | {"place": place_data(app.place)} if app.place else data
-
-
 def place_data(place: Requirement) -> dict[str, Any]:
-    """Return the requirement on a node in the form of a claim's file."""
     listed = {
         "role": place.role,
         "labels": dict(place.labels),
@@ -318,33 +316,12 @@ def place_data(place: Requirement) -> dict[str, Any]:
     return {name: value for name, value in listed.items() if value}
 
 
-def _connection_data(claim: Claim, connection: Connection) -> dict[str, Any]:
-    topics: dict[str, str | dict[str, Any]] = {}
-    for route in connection.topics:
-        options = route.options() | _partial(claim, (route.source,))
-        topics[route.source] = {"target": route.target, **options} if options else route.target
-    return {
-        "type": connection.known_type.word,
-        "source": connection.source,
-        "target": connection.target,
-        **({"broker": connection.broker} if connection.broker else {}),
-        "topics": topics,
-    }
-
-
 def format_timestamp(moment: datetime) -> str:
-    """Return a time as ledger files have it: in UTC, with microseconds."""
     in_utc = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
     return f"{in_utc.removesuffix('+00:00')}Z"
 
 
-def _partial(claim: Claim, topic: TopicKey) -> dict[str, list[str]]:
-    names = claim.partial.get(topic)
-    return {"requesters": list(names)} if names else {}
-
-
 def read(text: str, path: str) -> Claim:
-    """Return the claim in a file; raise InvalidInput if it is not valid or at another path."""
     data = strict_yaml.load(text, path)
     kind = data.get("kind") if isinstance(data, dict) else None
     version = _VERSION.match(str(data.get("apiVersion", ""))) if isinstance(data, dict) else None
@@ -363,7 +340,7 @@ def read(text: str, path: str) -> Claim:
     else:
         message = f"is {kind!r}, but must be ApplicationClaim or ConnectionClaim"
         raise InvalidInput.at("kind", message, file=path)
-    if faults := [each.within(path) for each in file.faults()]:
+    if faults := [fault.within(path) for fault in file.faults()]:
         raise InvalidInput(faults)
     claim = file.claim()
     # a file that was moved would be a second claim with the same key
@@ -377,7 +354,7 @@ def read(text: str, path: str) -> Claim:
 
 
 def kind_of(path: str) -> SubjectKind | None:
-    """Return the kind of subject of the claim file at ``path``; ``None`` if it is no such path."""
+    # None if no claim file can have this path
     parts = path.split("/")
     if len(parts) != 5 or parts[0] != LEDGER_ROOT or not path.endswith(".yaml"):
         return None

@@ -30,7 +30,6 @@ from demandops.model.ledger.records import (
 #
 # A :class:`Ledger` never changes, because each request makes a new one.
 
-
 _ENDS = "ends"
 _DEMAND = attrgetter("demand")
 
@@ -64,13 +63,12 @@ class Ledger:
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         return self.claims.get(subject) or ()
 
+    # the one with the lowest demand id
     def first_claim(self, subject: Subject) -> Claim | None:
-        """Return the claim on ``subject`` with the lowest demand id, or ``None``."""
         held = self.claims.get(subject)
         return held[0] if held else None
 
     def held(self, subject: Subject) -> Application | Connection | None:
-        """Return the application or connection in the first claim on ``subject``."""
         first = self.first_claim(subject)
         return first.held if first else None
 
@@ -81,20 +79,15 @@ class Ledger:
         return self.claims_on(Subject(SubjectKind.CONNECTION, connection))
 
     def application(self, id: str) -> Application | None:
-        """Return an application as its first claim has it."""
         first = self.first_claim(Subject(SubjectKind.APPLICATION, id))
         return first.application if first else None
 
     def connection(self, id: str) -> Connection | None:
-        """Return a connection as its first claim has it."""
         first = self.first_claim(Subject(SubjectKind.CONNECTION, id))
         return first.connection if first else None
 
     def versions_asked(self, application: str, known: Iterable[str]) -> set[str]:
-        """Return the ``known`` versions and channels that claims on an application ask for.
-
-        An empty text stands for claims that ask for no version, or for an unknown one.
-        """
+        # an empty text stands for claims that ask for no version, or for an unknown one
         by_version = {word: self.index.get(("version", application, word)) for word in known}
         counts = {word: len(keys) for word, keys in by_version.items() if keys}
         others = len(self.application_claims(application)) > sum(counts.values())
@@ -104,42 +97,36 @@ class Ledger:
         return sorted(subject.id for subject in self.claims if subject.kind is kind)
 
     def claims_reading(self, source: str, topic: str) -> tuple[Claim, ...]:
-        """Return the claims with ``topic`` of ``source`` as an input, by application and demand."""
         return self._claims("takes", source, topic)
 
     def each_reading(self, source: str, topic: str) -> Iterator[Claim]:
-        """Yield the claims of :meth:`claims_reading` in no order, without the cost of sorting."""
+        # in no order, without the cost of sorting
         for key in self.index.get(("takes", source, topic)) or ():
             claim = self.get(key)
             if claim is not None:
                 yield claim
 
     def booked_input(self, role: str, source: str, topic: str) -> InputTopic | None:
-        """Return the booked input with this topic and source in ``role``."""
         for claim in self.each_reading(source, topic):
             if inputs := claim.application.inputs_from(role, source, topic):
                 return inputs[0]
         return None
 
     def has_usual_topic(self, role: str, source: str, *, except_demand: str | None = None) -> bool:
-        """Return whether a claim has the usual topic of ``source`` as an input in ``role``."""
         keys = self.index.get(("usual", source, role)) or ()
         return any(key.demand != except_demand for key in keys)
 
     def usual_topics(self, role: str, source: str, *, excluded: str) -> Iterator[str]:
-        """Yield each usual topic of ``source`` that is booked in ``role``, except ``excluded``."""
         keys = self.index.get(("usual", source, role)) or ()
         if len(keys) == len(self.index.get(("usual", source, role, excluded)) or ()):
             return  # all these claims have the topic ``excluded``
         claims = (claim for key in keys if (claim := self.get(key)))
-        inputs = (each for claim in claims for each in claim.application.inputs.get(role, ()))
-        usual = {each.topic for each in inputs if each.source == source and not each.further}
+        inputs = (topic for claim in claims for topic in claim.application.inputs.get(role, ()))
+        usual = {topic.topic for topic in inputs if topic.source == source and not topic.further}
         yield from sorted(usual - {excluded})
 
     def further_topics(self, role: str, part: str) -> Iterator[tuple[InputTopic, str]]:
-        """Yield (input, version of a separate instance) for each input that topic names show as
-        ``part``.
-        """
+        # (input, version of a separate instance), for inputs that topic names show as `part`
         for claim in self._claims("further", part):
             app = claim.application
             yield from ((topic, app.own_version) for topic in app.further_inputs(role, part))
@@ -154,7 +141,6 @@ class Ledger:
         return self._claims("demand", demand)
 
     def kept_claims(self, subject: Subject | None = None) -> tuple[Claim, ...]:
-        """Return the claims that overrides keep on ``subject``; without it, on all subjects."""
         return self._claims("kept", *([subject.kind.value, subject.id] if subject else []))
 
     def moved_applications(self) -> tuple[str, ...]:
@@ -175,41 +161,34 @@ class Ledger:
     def claims_of_definition(self, appdef: str) -> tuple[Claim, ...]:
         return self._claims("definition", appdef)
 
+    # on applications that run on, read from or deliver to the node
     def claims_at(self, node: str) -> tuple[Claim, ...]:
-        """Return the claims on applications that run on, read from or deliver to a node."""
         return self._claims("node", node)
 
     def applications_at(self, node: str) -> tuple[str, ...]:
-        """Return the ids of applications that run on, read from or deliver to a node."""
         return self._ids("node", node)
 
+    # those for which `part` replaces `{instance}`
     def applications_in_topics(self, part: str) -> tuple[str, ...]:
-        """Return the ids of the applications for which ``part`` replaces ``{instance}``."""
         return self._ids("topics", part)
 
     def next_lease_end(self) -> datetime | None:
-        """Return when the first lease and its slack end, which is :data:`UNSTARTED` if none
-        started.
-        """
+        # of the lease with its slack; `UNSTARTED` if none started
         claims = (claim for key in self.first_to_end() or () if (claim := self.get(key)))
         return min((claim.lease.expires_at for claim in claims if claim.lease), default=None)
 
     def first_to_end(self) -> HashTrieSet[ClaimKey] | None:
-        """Return the keys of the claims whose leases, with their slack, end in the earliest minute.
-
-        Each call returns the same object until a claim enters the set, leaves it or gets another
-        lease.
-        """
+        # those that end in the earliest minute: the same object until a claim enters the set,
+        # leaves it or gets another lease
         return self.index.get((_ENDS, min(self.minutes))) if self.minutes else None
 
     def unstarted_claims(self) -> tuple[Claim, ...]:
-        """Return the approved claims whose lease the generator has not started yet."""
         later = (minute for minute in self.minutes if minute >= minute_of(UNSTARTED))
         claims = (claim for minute in sorted(later) for claim in self._claims(_ENDS, minute))
         return tuple(claim for claim in claims if claim.lease and not claim.lease.has_started)
 
     def ended_claims(self, now: datetime) -> tuple[Claim, ...]:
-        """Return the claims whose lease and slack ended before ``now``, the earliest end first."""
+        # the earliest end first
         over = (minute for minute in self.minutes if minute <= minute_of(now))
         ended = [
             (claim.lease.expires_at, claim)
@@ -230,18 +209,17 @@ class Ledger:
         return tuple(claim for key in keys if (claim := self.get(key)))
 
     def connections_at(self, kind: ConnectionType, node: str) -> tuple[str, ...]:
-        """Return the ids of the connections of a type from or to ``node``."""
         return self._ids("link", kind.name, node)
 
     def connections_needing(self, node: str) -> tuple[str, ...]:
-        """Return the ids of the connections from or to a node, or that name its broker."""
+        # those from or to a node, or that name its broker
         ids = set(self._ids("broker", node))
         for kind in connection_types.CONNECTION_TYPES:
             ids |= {*self.connections_at(kind, node)}
         return tuple(sorted(ids))
 
     def indexed_names(self, entry: str) -> set[str]:
-        """Return the last text of each index entry that begins with ``entry``; scans the index."""
+        # the last text of each entry; this scans the index
         return {key[-1] for key in self.index if key[0] == entry}
 
     def get(self, key: ClaimKey) -> Claim | None:
@@ -250,7 +228,6 @@ class Ledger:
         return held[place] if place < len(held) and held[place].demand == key.demand else None
 
     def replace(self, key: ClaimKey, claim: Claim | None) -> Ledger:
-        """Return the ledger with ``claim`` at ``key``; ``None`` removes the claim at ``key``."""
         held, old = self.claims_on(key.subject), self.get(key)
         if old == claim:
             return self
@@ -274,7 +251,13 @@ class Ledger:
                 minutes = minutes.insert(entry[1])
         counts = self.applications_on
         if key.subject.kind is SubjectKind.APPLICATION:
-            counts = _counted(counts, self.first_claim(key.subject), held[0] if held else None)
+            # of all claims on the application, the first decides where it runs
+            firsts = (self.first_claim(key.subject), held[0] if held else None)
+            nodes = [first.application.chosen_nodes if first else set[str]() for first in firsts]
+            for ids, change in ((nodes[0] - nodes[1], -1), (nodes[1] - nodes[0], 1)):
+                for id in ids:
+                    count = (counts.get(id) or 0) + change
+                    counts = counts.insert(id, count) if count else counts.remove(id)
         return replace(self, claims=claims, index=index, minutes=minutes, applications_on=counts)
 
     def without(self, claims: Iterable[Claim]) -> Ledger:
@@ -297,19 +280,6 @@ class Ledger:
         return sum(len(claims) for claims in self.claims.values())
 
 
-def _counted(
-    counts: HashTrieMap[str, int], before: Claim | None, after: Claim | None
-) -> HashTrieMap[str, int]:
-    # Of all claims on the application, the first decides where it runs. These are the first before
-    # and after a change.
-    old, new = (claim.application.chosen_nodes if claim else set() for claim in (before, after))
-    for nodes, change in ((old - new, -1), (new - old, 1)):
-        for node in nodes:
-            count = (counts.get(node) or 0) + change
-            counts = counts.insert(node, count) if count else counts.remove(node)
-    return counts
-
-
 def index_entries(claim: Claim | None) -> set[Entry]:
     entries = set(claim.index_entries()) if claim else set()
     if claim and claim.lease:
@@ -317,19 +287,13 @@ def index_entries(claim: Claim | None) -> set[Entry]:
     return entries
 
 
-# ---- claim changes ----
-#
-# What a request changes in the ledger: claims, before and after the change, and other records.
+# ---- what a request changes in the ledger: claims, and other records ----
 
 
 @dataclass(frozen=True, slots=True)
 class ClaimChange:
-    """One claim before and after a change: it is new without ``before``, released without
-    ``after``.
-    """
-
-    before: Claim | None
-    after: Claim | None
+    before: Claim | None  # None: the claim is new
+    after: Claim | None  # None: it is released
 
     @property
     def key(self) -> ClaimKey:
@@ -339,15 +303,13 @@ class ClaimChange:
 
     @property
     def only_renews(self) -> bool:
-        """Whether the claim existed before and at most its lease changed."""
+        # at most the lease changed
         before, after = self.before, self.after
         return bool(before and after and replace(after, lease=before.lease) == before)
 
 
 @dataclass(frozen=True, slots=True)
 class Changes:
-    """What a request changed in the ledger."""
-
     claims: tuple[ClaimChange, ...] = ()
     # in words, what a shutdown lists, but its requesters do not hold
     not_held: tuple[str, ...] = ()
@@ -379,18 +341,15 @@ def changes_on(
 def claim_changes(
     before: Ledger, after: Ledger, keys: Iterable[ClaimKey]
 ) -> tuple[ClaimChange, ...]:
-    """Return the claims at ``keys`` that differ between two ledgers."""
     changes = (ClaimChange(before.get(key), after.get(key)) for key in dict.fromkeys(keys))
     return tuple(change for change in changes if change.before != change.after)
 
 
-# ---- the world: the configuration and the ledger in effect at one time, as one value ----
+# ---- the world: the configuration and the ledger in effect ----
 
 
 @dataclass(frozen=True, slots=True)
 class World:
-    """The configuration and the ledger."""
-
     config: Config
     ledger: Ledger
     # the overrides that have not ended, in the order in which they apply

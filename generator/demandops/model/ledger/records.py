@@ -29,7 +29,7 @@ from demandops.model.ledger.claim_file import (
     segment,
 )
 
-# ---- kept replicas: those that a service keeps for a while although its demands need fewer ----
+# ---- kept replicas ----
 #
 # A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service
 # has the highest number of replicas that its demands needed within this time. Its record, the file
@@ -37,7 +37,6 @@ from demandops.model.ledger.claim_file import (
 # until which it is kept. When that time passes, the generator removes the number by a commit. The
 # replicas depend on the record, never on the clock, so ``demandops verify`` computes the same bytes
 # again.
-
 
 REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
 
@@ -47,9 +46,8 @@ Instance: TypeAlias = "tuple[str, ...]"
 _FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
 
 
+# One step of scaling down
 class Kept(NamedTuple):
-    """One step of scaling down: a service keeps ``replicas`` replicas until ``until``."""
-
     replicas: int
     until: datetime
 
@@ -58,11 +56,8 @@ class Kept(NamedTuple):
 Steps: TypeAlias = "tuple[Kept, ...]"
 
 
+# `until` is the end of a new step
 def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
-    """Return the steps of a service whose demands now need more or fewer replicas.
-
-    ``until`` is the end of a new step.
-    """
     if was_needed > needed:
         # the new step ends last, so it covers each step with as many replicas or fewer
         steps = (*(step for step in steps if step.replicas > was_needed), Kept(was_needed, until))
@@ -76,14 +71,11 @@ def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: d
 
 @dataclass(frozen=True, slots=True)
 class KeptReplicas:
-    """The records of all services that keep replicas."""
-
     steps: HashTrieMap[Instance, Steps] = field(default_factory=HashTrieMap)
     # by the minute in which the first step ends, so that the next end is found without a scan
     by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
 
     def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
-        """Return the records with ``steps`` for ``instance``; empty steps remove its record."""
         old = self.steps.get(instance) or ()
         if old == steps:
             return self
@@ -101,7 +93,6 @@ class KeptReplicas:
         return KeptReplicas(all_steps, by_minute)
 
     def due(self, now: datetime) -> list[Instance]:
-        """Return the instances whose first step of scaling down has ended, sorted."""
         return sorted(
             instance
             for minute in self.by_minute
@@ -155,7 +146,6 @@ class _KeptReplicasFile(FrozenModel):
 
 
 def read_replicas(text: str, path: str) -> tuple[Instance, Steps] | None:
-    """Return the record in a file; ``None`` if the file is not valid or belongs at another path."""
     # a person may have written the file; a mistake in it must not stop demands
     try:
         file = parse_file(_KeptReplicasFile, text, path)
@@ -168,7 +158,6 @@ def read_replicas(text: str, path: str) -> tuple[Instance, Steps] | None:
 
 
 def read_all_replicas(files: Mapping[str, str]) -> KeptReplicas:
-    """Return the records in ``files``, a map from path to text; invalid files are skipped."""
     kept = KeptReplicas()
     for path, text in files.items():
         if record := read_replicas(text, path):
@@ -176,7 +165,7 @@ def read_all_replicas(files: Mapping[str, str]) -> KeptReplicas:
     return kept
 
 
-# ---- recent shutdowns, so that a shutdown that is sent again within 15 minutes is recognized ----
+# ---- recent shutdowns ----
 #
 # A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
 # record of the first shutdown, the repeat could release another demand of the same requesters. If a
@@ -203,12 +192,12 @@ _Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
 
 @dataclass(frozen=True, slots=True)
 class RecentShutdown:
-    """The record of a shutdown that released something; ``at`` is when it was received."""
+    """The record of a shutdown that released something."""
 
     digest: str
     request: str
     requesters: tuple[str, ...]
-    at: datetime
+    at: datetime  # when it was received
 
     @classmethod
     def of(cls, request: Shutdown, at: datetime) -> RecentShutdown:
@@ -230,21 +219,17 @@ class RecentShutdown:
 
 @dataclass(frozen=True, slots=True)
 class RecentShutdowns:
-    """The recent shutdowns by digest, and their digests by requester and by minute."""
-
     by_digest: HashTrieMap[str, RecentShutdown] = field(default_factory=HashTrieMap)
     by_requester: _Index = field(default_factory=HashTrieMap)
     by_minute: _Index = field(default_factory=HashTrieMap)
 
     def earlier(self, shutdown: RecentShutdown) -> RecentShutdown | None:
-        """Return the record of the shutdown that ``shutdown`` repeats, or ``None``."""
         record = self.by_digest.get(shutdown.digest)
         # a person may have written a record that has this digest and other requesters
         same = record is not None and replace(record, at=shutdown.at) == shutdown
         return record if record and same and abs(shutdown.at - record.at) <= REMEMBERED else None
 
     def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
-        """Return all records, with the one at ``digest`` replaced; ``None`` removes the record."""
         old = self.by_digest.get(digest)
         if old == shutdown:
             return self
@@ -264,10 +249,7 @@ class RecentShutdowns:
     def forget(
         self, now: datetime, requesters: Iterable[str] = ()
     ) -> tuple[RecentShutdowns, tuple[str, ...]]:
-        """Return the records that are left, and the digests of those that are removed.
-
-        Those are the ten oldest of more than an hour, and all that name one of ``requesters``.
-        """
+        """Return the records that are left, and the digests of those that are removed."""
         ended = sorted(minute for minute in self.by_minute if minute < minute_of(now - _KEPT))
         old = (digest for minute in ended for digest in sorted(self.by_minute[minute]))
         forgotten = {*islice(old, _FORGOTTEN)}
@@ -318,7 +300,6 @@ class _ShutdownFile(FrozenModel):
 
 
 def read_shutdowns(text: str, path: str) -> RecentShutdown | None:
-    """Return the record in a file; ``None`` if the file is not valid or belongs at another path."""
     try:
         file = parse_file(_ShutdownFile, text, path)
     except InvalidInput:
@@ -329,7 +310,6 @@ def read_shutdowns(text: str, path: str) -> RecentShutdown | None:
 
 
 def read_all_shutdowns(files: Mapping[str, str]) -> RecentShutdowns:
-    """Return the records in ``files``, a map from path to text; invalid files are skipped."""
     shutdowns = RecentShutdowns()
     for path, text in files.items():
         if record := read_shutdowns(text, path):
@@ -337,9 +317,7 @@ def read_all_shutdowns(files: Mapping[str, str]) -> RecentShutdowns:
     return shutdowns
 
 
-# ---- waiting ----
-#
-# Waiting demands: no node has room for them, so the ledger keeps them until a node has room.
+# ---- waiting demands, which the ledger keeps until a node has room ----
 #
 # A waiting demand holds nothing. When room may be free, the generator tries to book the waiting
 # demands: those with the highest priority first and, if the priority is the same, the oldest first.
@@ -352,18 +330,17 @@ WAITING_ROOT = f"{LEDGER_ROOT}/waiting"
 
 @dataclass(frozen=True, slots=True)
 class WaitingDemand:
-    """A demand that waits for room; ``since`` is when it was first received."""
+    """A demand that waits for room."""
 
     demand: str
     request: str
     requesters: tuple[str, ...]
-    since: datetime
+    since: datetime  # when it was first received
     priority: int
     goal: Mapping[str, Any]
 
     @property
-    def turn(self) -> tuple[int, datetime, str]:
-        """The key by which waiting demands are sorted: the lowest is tried first."""
+    def turn(self) -> tuple[int, datetime, str]:  # the lowest is tried first
         return -self.priority, self.since, self.demand
 
 
@@ -382,7 +359,6 @@ class Wait(DemandRequest):
 
 
 def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
-    """Return the waiting demands in the order in which the generator tries to book them."""
     return sorted(waiting.values(), key=lambda demand: demand.turn)
 
 
@@ -417,10 +393,6 @@ class _WaitingFile(FrozenModel):
 
 
 def read_waiting(text: str, path: str) -> WaitingDemand | None:
-    """Return the waiting demand in a file, or ``None`` if the file is not valid.
-
-    The put in a valid file may have faults.
-    """
     try:
         file = parse_file(_WaitingFile, text, path)
         if not demand_goal.is_demand_goal(file.goal):
@@ -439,12 +411,11 @@ def read_waiting(text: str, path: str) -> WaitingDemand | None:
 
 
 def read_all_waiting(files: Mapping[str, str]) -> WaitingDemands:
-    """Return the waiting demands in ``files`` (path to text); invalid files are skipped."""
     demands = (demand for path, text in files.items() if (demand := read_waiting(text, path)))
-    return HashTrieMap({each.demand: each for each in demands})
+    return HashTrieMap({demand.demand: demand for demand in demands})
 
 
-# ---- markers: files of the ledger that record which overrides ended, and when ----
+# ---- markers: which overrides ended, and when ----
 #
 # The repo alone, not the clock, decides whether an override applies, because a replay and
 # ``verify`` must give the same bytes as the original run. So the generator commits a marker when an
@@ -478,9 +449,7 @@ def ended_override_text(override: Override) -> str:
 
 
 def read_ended_override(files: Mapping[str, str]) -> dict[str, str]:
-    """Return a map from the name of each ended override to the end that its marker records. Files
-    that are not valid markers are skipped; :func:`stale_markers` lists them for removal.
-    """
+    # by name; `stale_markers` lists what is not valid, so that it is removed
     ended = {}
     for path, text in files.items():
         name = path.removeprefix(f"{MARKERS_ROOT}/").removesuffix(".yaml")
@@ -494,7 +463,6 @@ def read_ended_override(files: Mapping[str, str]) -> dict[str, str]:
 
 
 def stale_markers(files: Mapping[str, str], overrides: Mapping[str, Override]) -> list[str]:
-    """Return the paths of those markers in ``files`` that no longer apply, sorted."""
     # A marker is stale if it is not valid, its override is gone, or the override's end was changed
     ended = read_ended_override(files)
     current = {
