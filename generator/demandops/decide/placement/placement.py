@@ -306,10 +306,14 @@ def _with_services(
         return item, faults
     services = world.config.services.get(app.appdef, {})
     for name in app.named:
-        named, definition = world.config.nodes.get(app.services[name]), services.get(name)
-        if named and definition and (lacking := [*lacks(named, requirement_of(definition))]):
+        node_named, definition = world.config.nodes.get(app.services[name]), services.get(name)
+        if (
+            node_named
+            and definition
+            and (lacking := [*lacks(node_named, requirement_of(definition))])
+        ):
             message = (
-                f"{quoted(named.id)} lacks {joined(lacking)}, which the service requires ('place' "
+                f"{quoted(node_named.id)} lacks {joined(lacking)}, which the service requires ('place' "
                 f"in {definition.file}); name another node, or name none for this service"
             )
             faults.append(item.fault(f"services.{name}", message, code="no-node"))
