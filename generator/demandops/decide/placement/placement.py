@@ -306,14 +306,10 @@ def _with_services(
         return item, faults
     services = world.config.services.get(app.appdef, {})
     for name in app.named:
-        node_named, definition = world.config.nodes.get(app.services[name]), services.get(name)
-        if (
-            node_named
-            and definition
-            and (lacking := [*lacks(node_named, requirement_of(definition))])
-        ):
+        wanted, definition = world.config.nodes.get(app.services[name]), services.get(name)
+        if wanted and definition and (lacking := [*lacks(wanted, requirement_of(definition))]):
             message = (
-                f"{quoted(node_named.id)} lacks {joined(lacking)}, which the service requires ('place' "
+                f"{quoted(wanted.id)} lacks {joined(lacking)}, which the service requires ('place' "
                 f"in {definition.file}); name another node, or name none for this service"
             )
             faults.append(item.fault(f"services.{name}", message, code="no-node"))
