@@ -23,7 +23,7 @@ from demandops.model.config.load import load
 from demandops.model.demand.demand_request import Expire
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import in_turn
-from demandops.serve.timing.own_work import LeaseExpiry
+from demandops.serve.timing.expiry import LeaseExpiry
 from demandops.serve.timing.timers import RateLimit
 from pydantic import Field, model_validator
 

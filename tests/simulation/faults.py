@@ -39,7 +39,8 @@ from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Receipt, Ticket
 from demandops.serve.timing import own_work
-from demandops.serve.timing.own_work import Draining, LeaseExpiry, ScaleDown, WaitingTurns
+from demandops.serve.timing.expiry import LeaseExpiry, ScaleDown
+from demandops.serve.timing.own_work import Draining, WaitingTurns
 from demandops.serve.worker import Worker
 
 Patch = Callable[[Any, str, Any], None]

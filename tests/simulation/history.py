@@ -11,7 +11,7 @@ from tempfile import TemporaryDirectory, mkdtemp
 
 import pygit2
 from demandops.repo.git.repository import MAIN
-from demandops.serve.timing.own_work import LONGEST_WAIT_S
+from demandops.serve.timing.expiry import LONGEST_WAIT_S
 
 from tests.kit import plain_yaml, repo
 from tests.kit.promises import Maker, name_of

@@ -33,7 +33,8 @@ from demandops.serve.approvals.approvals import Approvals, Result
 from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Ticket
-from demandops.serve.timing.own_work import LONGEST_WAIT_S, LeaseExpiry, OwnWork
+from demandops.serve.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
+from demandops.serve.timing.own_work import OwnWork
 from demandops.serve.timing.timers import (
     LIMIT_LOCAL,
     LIMIT_REMOTE,

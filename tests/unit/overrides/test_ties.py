@@ -12,9 +12,13 @@ from typing import Any
 from demandops.decide.changeset import trial_releases
 from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
 from demandops.model.config.config import Config
-from demandops.model.config.cross_check import contested_effects, patches_commute, patterns_overlap
 from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile, Selector, merge_patch
+from demandops.model.config.override_conflicts import (
+    contested_effects,
+    patches_commute,
+    patterns_overlap,
+)
 from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
 from hypothesis import example, given

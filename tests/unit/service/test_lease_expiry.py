@@ -11,7 +11,7 @@ from demandops.connections.connection import Connection, Route
 from demandops.connections.mqtt import MQTT
 from demandops.model.demand.claim import Claim, Lease
 from demandops.model.ledger.ledger import Ledger
-from demandops.serve.timing.own_work import LeaseExpiry
+from demandops.serve.timing.expiry import LeaseExpiry
 
 from tests.kit.clock import Clock
 from tests.kit.memory import NOW as START

@@ -1,0 +1,229 @@
+"""Two overrides of equal priority that could change one release differently.
+
+Such a pair needs an order, and only different priorities give one. It is refused even if no
+release matches both overrides yet, because a later demand could add a release that does.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from bisect import bisect_left, insort
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+
+from demandops.connections import connection_types
+from demandops.model.config.config import (
+    Config,
+    ConfigReader,
+)
+from demandops.model.config.override import Override, Selector, by_rank
+from demandops.model.config.policy import matches
+
+_MERGED = ("values", "images")
+_SINGLE = ("version", "replicas", "node")
+_FROZEN = (*_SINGLE, *_MERGED)
+
+# A merge may bring thousands of overrides, each of which contradicts all others
+_MOST_SHOWN = 3
+_INDEXED = ("nodes", "services", "applications", "connections", "appdefs")
+
+
+def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
+    contests = defaultdict[tuple[int, tuple[str, ...]], list[tuple[Override, str]]](list)
+    for override in by_rank(config.overrides.values()):
+        # (what, token) for all that the override sets; another token contradicts it
+        settings: list[tuple[tuple[str, ...], str]] = [
+            ((name,), str(value))
+            for name in _SINGLE
+            if (value := getattr(override, name)) is not None
+        ]
+        settings += _leaves(("values",), override.values or {})
+        pins = (override.images or {}).items()
+        settings += ((("images", name), pin.model_dump_json()) for name, pin in pins)
+        if override.hold or any(name in _FROZEN for name in override.effects()):
+            settings.append((("hold",), str(override.hold)))
+        for what, token in settings:
+            contests[override.priority, what].append((override, token))
+    rivals = defaultdict[str, dict[str, Override]](dict)
+    for contenders in contests.values():
+        if len({token for _, token in contenders}) > 1:
+            for rival, override in _rivals(contenders, config):
+                rivals[override.name][rival.name] = rival
+    for override in by_rank(config.overrides[name] for name in rivals):
+        for rival in by_rank(rivals[override.name].values())[:_MOST_SHOWN]:
+            names = " and ".join(f"'{name}'" for name in contested_effects(rival, override))
+            reader.add_fault(
+                override.path,
+                "priority",
+                f"is {override.priority}, as in {rival.path}, and both overrides may set {names} "
+                "of the same release; change one of the priorities, or select different releases",
+            )
+
+
+def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, ...], str]]:
+    if not isinstance(patch, Mapping):
+        yield path, json.dumps(patch, sort_keys=True)
+        return
+    yield path, "mapping"
+    for key, value in patch.items():
+        yield from _leaves((*path, key), value)
+
+
+def _rivals(
+    contenders: list[tuple[Override, str]], config: Config
+) -> Iterator[tuple[Override, Override]]:
+    """Yield (earlier, later) for overrides with different tokens that may select one release."""
+    # Only selectors are compared whose patterns begin alike in one field, the one in which the
+    # selectors differ most. So the cost grows with the number of overrides, not with that of pairs,
+    # unless patterns hardly differ.
+    shares = shares_any_clients(config)
+
+    def crowding(field: str) -> int:
+        starts = Counter(
+            s for o, _ in contenders for left in o.select for s in starts_of(left, field)
+        )
+        return sum(count * (count - 1) for count in starts.values())
+
+    def starts_of(selector: Selector, field: str) -> set[str]:
+        patterns = (
+            getattr(selector, field)
+            if field in _separating_fields(selector, selector, config, shares)
+            else ()
+        )
+        return {re.split("[*?]", pattern)[0] for pattern in patterns or ("",)}
+
+    field = min(_INDEXED, key=crowding)
+    earlier: dict[str, dict[str, list[tuple[Override, Selector]]]] = {}
+    starts: list[str] = []  # the keys of `earlier`, sorted
+
+    def alike(start: str) -> Iterator[str]:
+        # those that begin with `start`, or with which it begins
+        yield from (start[:end] for end in range(len(start)) if start[:end] in earlier)
+        for place in range(bisect_left(starts, start), len(starts)):
+            if not starts[place].startswith(start):
+                return
+            yield starts[place]
+
+    for override, token in contenders:
+        rivals = dict[str, Override]()
+        for right in override.select:
+            for start in starts_of(right, field):
+                if len(rivals) < _MOST_SHOWN:
+                    near = (
+                        pair
+                        for begin in alike(start)
+                        for other_token, pairs in earlier[begin].items()
+                        if other_token != token
+                        for pair in pairs
+                    )
+                    for rival, left in near:
+                        if rival.name not in rivals and may_match_same_release(
+                            left, right, config, shares
+                        ):
+                            rivals[rival.name] = rival
+                            if len(rivals) == _MOST_SHOWN:
+                                break
+        for right in override.select:
+            for start in starts_of(right, field):
+                if start not in earlier:
+                    insort(starts, start)
+                earlier.setdefault(start, {}).setdefault(token, []).append((override, right))
+        yield from ((rival, override) for rival in rivals.values())
+
+
+def contested_effects(first: Override, second: Override) -> list[str]:
+    contested = [
+        name
+        for name in _SINGLE
+        if None not in (left := getattr(first, name), right := getattr(second, name))
+        and left != right
+    ]
+    if first.values and second.values and not patches_commute(first.values, second.values):
+        contested.append("values")
+    pins = (first.images or {}, second.images or {})
+    contested += [
+        f"images.{name}"
+        for name in sorted({*pins[0]} & {*pins[1]})
+        if pins[0][name] != pins[1][name]
+    ]
+    for holding, shaping in ((first, second), (second, first)):
+        effects = [name for name in shaping.effects() if name in _FROZEN]
+        if holding.hold and effects:
+            contested += ["hold", *effects]
+    return contested
+
+
+def patches_commute(first: object, second: object) -> bool:
+    if isinstance(first, Mapping) and isinstance(second, Mapping):
+        return all(patches_commute(first[key], second[key]) for key in first if key in second)
+    # unlike ==, JSON distinguishes 1 from True
+    return json.dumps(first, sort_keys=True) == json.dumps(second, sort_keys=True)
+
+
+def may_match_same_release(
+    first: Selector, second: Selector, config: Config, shares_clients: bool
+) -> bool:
+    # a later demand may add the release
+    if (first.connections and _selects_services(second)) or (
+        second.connections and _selects_services(first)
+    ):
+        return False
+    for name in _separating_fields(first, second, config, shares_clients):
+        left, right = getattr(first, name), getattr(second, name)
+        if left and right and not _any_overlap(left, right):
+            return False
+    left, right = first.labels or {}, second.labels or {}
+    return all(left[key] == right[key] for key in left if key in right)
+
+
+def _any_overlap(left: Iterable[str], right: Iterable[str]) -> bool:
+    plain = [{text for text in side if not {*text} & {*"*?"}} for side in (left, right)]
+    if plain[0] & plain[1]:
+        return True
+    # two texts without wildcards overlap only if they are equal, and lists of names may be long
+    return any(
+        patterns_overlap(first, second)
+        for first in left
+        for second in ({*right} - plain[1] if first in plain[0] else right)
+    )
+
+
+def _selects_services(selector: Selector) -> bool:
+    return bool(selector.applications or selector.appdefs or selector.services)
+
+
+def shares_any_clients(config: Config) -> bool:
+    return any(kind.shares_clients(config) for kind in connection_types.CONNECTION_TYPES)
+
+
+def _separating_fields(
+    first: Selector, second: Selector, config: Config, shares_clients: bool
+) -> Iterator[str]:
+    # A release has only one service and one node. But a shared service has many applications and
+    # requesters, and a Zenoh bridge has many connections.
+    yield from ("services", "nodes")
+    may_match_shared_service = any(
+        service.scope != "application"
+        and all(not s.services or matches(name, s.services) for s in (first, second))
+        for services in config.services.values()
+        for name, service in services.items()
+    )
+    if not may_match_shared_service:
+        yield from ("applications", "appdefs")
+    if first.connections and second.connections and not shares_clients:
+        yield "connections"
+
+
+def patterns_overlap(first: str, second: str) -> bool:
+    # row[i]: whether the part of `first` read so far overlaps with i characters of `second`
+    row = [not second[:length].strip("*") for length in range(len(second) + 1)]
+    for a in first:
+        after = [row[0] and a == "*"]
+        for b, above, before in zip(second, row[1:], row, strict=False):
+            if "*" in (a, b):
+                after.append(above or after[-1])
+            else:
+                after.append(before and (a == b or "?" in (a, b)))
+        row = after
+    return row[-1]
