@@ -8,6 +8,7 @@ kept replicas get no more time after a jump.
 
 from __future__ import annotations
 
+import logging
 from concurrent.futures import Future
 from datetime import datetime, timedelta, timezone
 
@@ -21,7 +22,8 @@ from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.ledger.records import Instance
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.queue import Receipt, Ticket
-from demandops.serve.timing.own_work import log
+
+log = logging.getLogger("demandops")
 
 # By how much the clock may gain on the monotonic clock before leases get their full term again.
 _JUMP = timedelta(seconds=30)
@@ -31,7 +33,7 @@ _SHORTEST_S = 1.0
 # The longest time between two checks of the leases; short, because a person may set the clock.
 LONGEST_WAIT_S = 60.0
 # The pause after a failed try to end a lease or an override, or to scale down.
-_RETRY = timedelta(seconds=LONGEST_WAIT_S)
+RETRY = timedelta(seconds=LONGEST_WAIT_S)
 
 
 class LeaseExpiry:
@@ -49,7 +51,7 @@ class LeaseExpiry:
         now, claims = self.ended_claims(ledger)
         ended = dict.fromkeys(claim.demand for claim in claims)
         # forget demands that were released or renewed meanwhile
-        self._tried = {d: at for d, at in self._tried.items() if at > now - _RETRY and d in ended}
+        self._tried = {d: at for d, at in self._tried.items() if at > now - RETRY and d in ended}
         return [self._ticket(demand, now) for demand in ended if demand not in self._tried]
 
     def _ticket(self, demand: str, now: datetime) -> Ticket:
@@ -114,7 +116,7 @@ class OverrideExpiry:
                 commits.end_override(override, now)
                 log.info("%s ended as planned at %s", override.path, override.expires)
             except InvalidInput as error:
-                self._retry_at[override.name, override.end] = now + _RETRY
+                self._retry_at[override.name, override.end] = now + RETRY
                 for problem in error.faults:
                     log.error("%s cannot be ended: %s; trying again later", override.path, problem)
 
@@ -146,7 +148,7 @@ class ScaleDown:
                 log.info("%s", commits.scale_down(instance, now))
                 self._retry_at.pop(instance, None)
             except InvalidInput as error:
-                self._retry_at[instance] = now + _RETRY
+                self._retry_at[instance] = now + RETRY
                 for problem in error.faults:
                     log.error("cannot scale down: %s; trying again later", problem)
                 if isinstance(error, OverLimit):  # the next may take as long, and demands wait

@@ -16,7 +16,7 @@ from demandops.model.config.config import Config
 from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import in_turn
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.serve.timing.expiry import _RETRY, OverrideExpiry, ScaleDown
+from demandops.serve.timing.expiry import RETRY, OverrideExpiry, ScaleDown
 from demandops.serve.timing.timers import within
 
 # ---- drained nodes: placed applications and services move off them ----
@@ -166,7 +166,7 @@ class OwnWork:
 
     def postpone(self) -> None:
         # because a fetch or a publication failed
-        later = self._runtime.now() + _RETRY
+        later = self._runtime.now() + RETRY
         self._override_expiry.not_before = self._scale_down.not_before = later
         self._draining.after.clear()
         self._waiting_turns.left.clear()
