@@ -14,7 +14,7 @@ from demandops.decide.state import rendered_files
 from demandops.model.config.appdef import Scaling
 from demandops.model.demand.claim import InputTopic
 from demandops.model.release import ServiceKey, replicas_of
-from demandops.views.explanations import override_report, warnings
+from demandops.views.release_causes import override_report, warnings
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -19,8 +19,8 @@ from demandops.decide.admission import admitted_request, permission
 from demandops.decide.checks import quotas
 from demandops.decide.decision import Decision
 from demandops.decide.placement import placement, relocation
+from demandops.decide.placement.candidates import Choice
 from demandops.decide.placement.capacity import Room, Usage
-from demandops.decide.placement.choice import Choice
 from demandops.decide.planning import overrides, planner, release_keys
 from demandops.model.config.appdef import Scaling
 from demandops.model.config.config import Config

@@ -113,7 +113,7 @@ def test_a_package_that_no_ros_command_needs_has_another_remedy(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delitem(sys.modules, "demandops.cli.views.diff", raising=False)
-    monkeypatch.delitem(sys.modules, "demandops.decide.merge_preview", raising=False)
+    monkeypatch.delitem(sys.modules, "demandops.decide.changeset", raising=False)
     monkeypatch.setitem(sys.modules, "difflib", None)
     assert main.run(["diff", "a", "b"]) == 1
     assert capsys.readouterr().err == (

@@ -24,7 +24,7 @@ from demandops.model.ledger.ledger import Ledger
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import path_of
 from demandops.repo.history.commit_log import LogEntry
-from demandops.views.explanations import versions_asked
+from demandops.views.release_causes import versions_asked
 
 Json = dict[str, Any]
 Command = Callable[..., Any]

@@ -22,7 +22,7 @@ from demandops.repo import reader
 from demandops.repo.git.local_repository import checkout_around, is_url, origin_of
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
-from demandops.views import explanations
+from demandops.views import release_causes
 
 # ---- contexts: the fleets that a person works with ----
 #
@@ -315,7 +315,7 @@ def _names(repo: Reader, kind: str) -> Iterator[str]:
         return
     world = repo.last_valid_snapshot(repo.commit()).state
     if kind == "releases":
-        yield from (release.name for release in explanations.releases(world))
+        yield from (release.name for release in release_causes.releases(world))
     elif kind in ("requesters", "demands"):
         yield from world.ledger.indexed_names(kind[:-1])
     elif kind in ("applications", "connections"):

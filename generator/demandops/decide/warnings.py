@@ -14,8 +14,8 @@ from demandops.connections.connection import Connection
 from demandops.decide.admission.permission import PEERS, needed_access
 from demandops.decide.booking import Drain
 from demandops.decide.checks.collisions import all_names
+from demandops.decide.placement.candidates import lacks, requirement_of, unmet
 from demandops.decide.placement.capacity import overcommitted, whole_usage
-from demandops.decide.placement.choice import lacks, requirement_of, unmet
 from demandops.decide.placement.relocation import following_overrides, with_moves
 from demandops.decide.planning.flows import flows
 from demandops.decide.planning.overrides import without_suspended

@@ -19,7 +19,7 @@ from demandops.model.demand.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import ServiceRelease, claims_of
-from demandops.views import explanations
+from demandops.views import release_causes
 
 # those that the plain data lacks if they are empty
 _LEFT_OUT = ("demands", "suspended", "nodes", "waiting")
@@ -111,7 +111,7 @@ class Bookkeeping:
 def bookkeeping(world: World) -> Bookkeeping:
     active = without_suspended(world)
     services, connections = {}, {}
-    for release in explanations.releases(world):
+    for release in release_causes.releases(world):
         if not isinstance(release, ServiceRelease):
             continue
         inputs = {
@@ -130,7 +130,7 @@ def bookkeeping(world: World) -> Bookkeeping:
             source_topic=release.key.topic,
             version=release.chart.version,
             application_version=release.version.name or None,
-            versions_asked=explanations.versions_asked(release, active.ledger),
+            versions_asked=release_causes.versions_asked(release, active.ledger),
             parameters=dict(release.parameters),
             inputs={role: _sorted(topics) for role, topics in inputs.items()},
             requesters=list(release.requesters),

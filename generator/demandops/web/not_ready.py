@@ -18,7 +18,7 @@ from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import GENERATOR_NAME, LogEntry
 from demandops.repo.load.last_valid_config import Problem
-from demandops.views import explanations
+from demandops.views import release_causes
 from demandops.web.lists import Cell, Filter, Link, Part, Row, cell, exactly
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of, worst_word
 
@@ -288,7 +288,7 @@ def _overridden(commit_state: CommitState, last_change: LastChange) -> Iterator[
         yield denial(override, what, "is booked", suspended, applications)
     # the claims that need a denied release are not suspended as a whole
     for release, override in commit_state.denied:
-        needing = explanations.claims_behind(commit_state.active.ledger, release)
+        needing = release_causes.claims_behind(commit_state.active.ledger, release)
         what = Part(release.description, Link("release", {"name": release.name}))
         served = release.applications if isinstance(release, ServiceRelease) else ()
         yield denial(override, what, "is needed", needing, served, (release.name,))

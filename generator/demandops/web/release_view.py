@@ -21,8 +21,8 @@ from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import path_of
 from demandops.repo.history.commit_log import LogEntry, PathHistory
 from demandops.repo.reader import Reader
-from demandops.views import explanations
-from demandops.views.explanations import how_to_release, is_released_by_demand_id
+from demandops.views import release_causes
+from demandops.views.release_causes import how_to_release, is_released_by_demand_id
 from demandops.web.situation import WORDS, CommitState, Situation, since_of, word_of
 
 # ---- the view of one demand ----
@@ -127,7 +127,7 @@ class Explained:
 def explained_release(now: Situation, reader: Reader, name: str) -> Explained:
     commit_state = now.commit_state
     release = commit_state.releases.get(name)
-    denied = None if release else explanations.denied_release_named(commit_state.state, name)
+    denied = None if release else release_causes.denied_release_named(commit_state.state, name)
     planned = release or (denied[0] if denied else None)
     path = path_of(planned) if planned else None
     path = path or reader.release_path(name, commit_state.commit)
@@ -155,7 +155,7 @@ def explained_release(now: Situation, reader: Reader, name: str) -> Explained:
         denied_by=denied[1] if denied else None,
         status=now.status(name),
         claims=tuple(commit_state.claims_of_releases.get(name, ())),
-        files=tuple(explanations.shaping_files(release, commit_state.config)) if release else (),
+        files=tuple(release_causes.shaping_files(release, commit_state.config)) if release else (),
         overrides=release.shaping.by if release else (),
         text=reader.file_reader(commit_state.commit)(path) or "",
         history=history,

@@ -34,7 +34,7 @@ from demandops.base.quoting import escaped, lines
 from demandops.model.config.base_model import relative
 from demandops.serve import http_server
 from demandops.serve.http_server import HttpServer
-from demandops.views.explanations import override_state
+from demandops.views.release_causes import override_state
 from demandops.web import fleet_map, lists, not_ready, release_view, time_line
 from demandops.web.follower import MOST_COMMITS, Follower
 from demandops.web.lists import LISTS, Filter, Link, Row, rows_of

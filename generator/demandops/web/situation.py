@@ -31,8 +31,8 @@ from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.last_valid_config import Problem
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.proposal_branch import PendingProposal
-from demandops.views import explanations
-from demandops.views.explanations import Entry, override_report
+from demandops.views import release_causes
+from demandops.views.release_causes import Entry, override_report
 
 # ---- the health of a release in one word ----
 
@@ -184,16 +184,16 @@ class CommitState:
                 continue
             kept = [claim for claim in planned.claims if id(claim) not in gone]
             added = [claim for id in ids for claim in fresh[kind].get(id, ())]
-            needing = [claim for claim in added if explanations.needs(claim, release)]
+            needing = [claim for claim in added if release_causes.needs(claim, release)]
             if needing or len(kept) < len(planned.claims):
-                yield key, replace(planned, claims=explanations.by_booking([*kept, *needing]))
+                yield key, replace(planned, claims=release_causes.by_booking([*kept, *needing]))
 
     def _plan(self, key: ReleaseKey) -> Planned | None:
         release = plan(self.state, key)
         if release is None:
             return None
         target = rollouts.target_of(release, self.config.repo_settings)
-        return Planned(release, target, explanations.claims_behind(self.active.ledger, release))
+        return Planned(release, target, release_causes.claims_behind(self.active.ledger, release))
 
     @property
     def planned(self) -> dict[ReleaseKey, Planned | None]:

@@ -30,7 +30,7 @@ from demandops.connections.connection import (
 from demandops.decide.decision import Decision
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.ledger import claim_file
-from demandops.views import explanations
+from demandops.views import release_causes
 
 from tests.kit.connections import ROS_IMAGE, demand, routes, state
 from tests.kit.goals import connection, goal
@@ -188,9 +188,9 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     world, _ = booked()
     ledger = world.state.ledger
     subject = Subject(SubjectKind.CONNECTION, "c")
-    (release,) = explanations.releases(world.state, subject)
-    assert explanations.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
-    files = [each[:2] for each in explanations.shaping_files(release, world.config)]
+    (release,) = release_causes.releases(world.state, subject)
+    assert release_causes.claims_behind(ledger, release) == [*ledger.claims_on(subject)]
+    files = [each[:2] for each in release_causes.shaping_files(release, world.config)]
     assert ("inventory/nodes.yaml", "edge.wan") in files
     assert ("registry/images.yaml", "images.relay") in files
 

@@ -21,7 +21,7 @@ from demandops.model.config.config import Config
 from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile, Selector
 from demandops.model.release import ServiceKey
-from demandops.views.explanations import releases
+from demandops.views.release_causes import releases
 from hypothesis import given
 from hypothesis import strategies as st
 

@@ -32,7 +32,7 @@ from demandops.model.config.base_model import seconds_of
 from demandops.model.config.load import is_override_name
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time, parse_time
 from demandops.repo.reader import Reader
-from demandops.views.explanations import Entry
+from demandops.views.release_causes import Entry
 
 # ---- ``demandops override``: create or end an override ----
 

@@ -43,7 +43,7 @@ from demandops.repo.history.commit_message import Person
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published
-from demandops.views.explanations import Entry, override_report
+from demandops.views.release_causes import Entry, override_report
 
 reason_option = click.option(
     "-m",

@@ -13,8 +13,7 @@ from demandops.base.quoting import lines, one_line
 from demandops.cli.json_output import Json, output_formats, print_json
 from demandops.cli.output import busy, console, errors
 from demandops.cli.views.diff import entry_lines, release_lines
-from demandops.decide.changeset import CHANGE_ORDER
-from demandops.decide.merge_preview import FileChange, MergePreview
+from demandops.decide.changeset import CHANGE_ORDER, FileChange, MergePreview
 from demandops.repo.pull_request import merge_check
 from demandops.repo.pull_request.merge_check import CheckResult
 from demandops.repo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts

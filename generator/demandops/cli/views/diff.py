@@ -10,8 +10,7 @@ import click
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import SIGNS, progress, warn_of
 from demandops.cli.target import state_repo_option
-from demandops.decide.changeset import ReleaseChange
-from demandops.decide.merge_preview import MergePreview, planned_releases, preview
+from demandops.decide.changeset import MergePreview, ReleaseChange, planned_releases, preview
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo import reader
 from demandops.repo.load.snapshot import Snapshot

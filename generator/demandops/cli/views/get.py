@@ -52,9 +52,9 @@ from demandops.repo.git.repository import RemoteAway
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
 from demandops.repo.write.proposal_branch import pending_proposals
-from demandops.views import demand_lists, explanations
+from demandops.views import demand_lists, release_causes
 from demandops.views.bookkeeping import bookkeeping
-from demandops.views.explanations import override_report, override_state
+from demandops.views.release_causes import override_report, override_state
 
 # ---- the kinds of things: their data, columns and filters ----
 
@@ -299,7 +299,7 @@ class _Nodes(Kind):
         world = source.snapshot.state
         return [
             {**asdict(node), "position": node.position.model_dump() if node.position else None}
-            for node in demand_lists.nodes(world, explanations.releases(world))
+            for node in demand_lists.nodes(world, release_causes.releases(world))
         ]
 
 

@@ -41,9 +41,9 @@ from demandops.repo.history.commit_log import LogEntry, PathHistory
 from demandops.repo.load import ledger_files
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.reader import Reader
-from demandops.views import explanations
+from demandops.views import release_causes
 from demandops.views.demand_lists import nodes_of
-from demandops.views.explanations import affected_releases, override_report
+from demandops.views.release_causes import affected_releases, override_report
 
 # ---- the object that has the given name ----
 
@@ -78,10 +78,10 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         return _by_path(repo, snapshot, name)
     world = snapshot.state
     matches = []
-    release = explanations.release_named(world, name)
+    release = release_causes.release_named(world, name)
     path = path_of(release) if release else repo.release_path(name, str(snapshot.commit))
     if path is None:  # a release that an override denies may never have run
-        denied = explanations.denied_release_named(world, name)
+        denied = release_causes.denied_release_named(world, name)
         path = path_of(denied[0]) if denied else None
     if path is not None:
         matches.append(Match("release", name, path, release))
@@ -105,7 +105,7 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
         )
     if "/" in name and _has_history(repo, snapshot, name.rstrip("/")):
         return _by_path(repo, snapshot, name)
-    running_names = {release.name for release in explanations.releases(world)}
+    running_names = {release.name for release in release_causes.releases(world)}
     names = {*running_names, *repo.stopped_release_names(str(snapshot.commit))}
     names |= {id for subject_kind in SubjectKind for id in world.ledger.subjects(subject_kind)}
     names |= {*world.config.nodes, *world.config.appdefs, *world.config.overrides}
@@ -141,7 +141,7 @@ def _by_looser_match(
             return
     # what runs or is held comes before what has ended
     if kind in (None, "release"):
-        parts = {r.name: r for r in explanations.releases(world) if name in r.name}
+        parts = {r.name: r for r in release_causes.releases(world) if name in r.name}
         if parts:
             release = parts[_the_only_name(name, [*parts])]
             yield Match("release", release.name, path_of(release), release)
@@ -185,7 +185,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
     if key is not None:
         return Match("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
-    release = explanations.release_named(snapshot.state, name)
+    release = release_causes.release_named(snapshot.state, name)
     if release is not None and path_of(release) == path:
         return Match("release", name, path, release)
     if text is None and not _has_history(repo, snapshot, path):
@@ -403,14 +403,14 @@ def _described(world: World, match: Match) -> Json:
     name, config = match.name, world.config
     if match.release is not None:
         release = match.release
-        claims = explanations.claims_behind(without_suspended(world).ledger, release)
+        claims = release_causes.claims_behind(without_suspended(world).ledger, release)
         return {
             "runs": True,
             **place_data(release),
             **_claims(claims, world),
             "shaped_by": [
                 {"file": file, "entry": entry or None, "what": what}
-                for file, entry, what in explanations.shaping_files(release, config)
+                for file, entry, what in release_causes.shaping_files(release, config)
             ],
             "overrides": [override_data(*each) for each in release.shaping.by],
         }
@@ -421,7 +421,7 @@ def _described(world: World, match: Match) -> Json:
             connection = claims[0].connection
             word = connection.type.word.upper() if connection.type else ""
             what = f"{word} {what} from {connection.source} to {connection.target}".lstrip()
-        releases = explanations.releases(world, match.subject)
+        releases = release_causes.releases(world, match.subject)
         return {
             "runs": any(suspended_by(claim, world) is None for claim in claims),
             "what": what,
@@ -431,7 +431,7 @@ def _described(world: World, match: Match) -> Json:
         }
     if match.kind == "release":  # it does not run; perhaps an override denies it
         file_name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
-        denied = explanations.denied_release_named(world, file_name)
+        denied = release_causes.denied_release_named(world, file_name)
         if denied is None:
             return {"runs": False}
         release, override = denied
@@ -454,7 +454,7 @@ def _described(world: World, match: Match) -> Json:
         node, domain = config.nodes[name], config.domain_of.get(name)
         claims = [claim for claim in world.ledger if name in nodes_of(claim)]
         claims.sort(key=lambda claim: (str(claim.subject), claim.demand))
-        running = [release for release in explanations.releases(world) if release.node.id == name]
+        running = [release for release in release_causes.releases(world) if release.node.id == name]
         return {
             "runs": bool(running or claims),
             "what": f"{node.type} in cluster {node.cluster}, access domain "
@@ -484,7 +484,7 @@ def _held(world: World, what: str, is_held: Callable[[Claim], bool]) -> Json:
     needed = {
         release.name: release
         for claim in claims
-        for release in explanations.releases(world, claim.subject)
+        for release in release_causes.releases(world, claim.subject)
     }
     return {
         "runs": any(suspended_by(claim, world) is None for claim in claims),
@@ -502,7 +502,7 @@ def _claims(claims: list[Claim], world: World) -> Json:
         rows.append(
             claim_data(claim)
             | {
-                "release_by": explanations.how_to_release(claim),
+                "release_by": release_causes.how_to_release(claim),
                 "overdue": claim.lease is not None and claim.lease.has_ended(REAL.now()),
                 "kept_by": override_data(kept, ("keep",)) if kept else None,
                 "suspended_by": override_data(suspended, ("deny",)) if suspended else None,

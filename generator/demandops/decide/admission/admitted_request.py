@@ -14,7 +14,7 @@ from demandops.connections.connection import Connection
 from demandops.decide.admission import admission, permission
 from demandops.decide.admission.permission import may_place
 from demandops.decide.placement import placement
-from demandops.decide.placement.choice import NO_ROOM
+from demandops.decide.placement.candidates import NO_ROOM
 from demandops.decide.planning import flows
 from demandops.decide.state import State
 from demandops.model.config.config import Config

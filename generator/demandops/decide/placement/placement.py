@@ -15,8 +15,7 @@ from types import MappingProxyType
 from demandops.base.errors import Fault
 from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
-from demandops.decide.placement.capacity import Room, Usage
-from demandops.decide.placement.choice import (
+from demandops.decide.placement.candidates import (
     Choice,
     Chosen,
     joined,
@@ -25,6 +24,7 @@ from demandops.decide.placement.choice import (
     requirement_of,
     shares,
 )
+from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.model.config.appdef import Service
 from demandops.model.demand.claim import Application, Claim, demand_id

@@ -17,8 +17,7 @@ from demandops.decide.admission import admission, permission
 from demandops.decide.booking import Drain, conflicts
 from demandops.decide.checks import collisions, quotas
 from demandops.decide.checks.collisions import Names
-from demandops.decide.placement.capacity import Room, Usage
-from demandops.decide.placement.choice import (
+from demandops.decide.placement.candidates import (
     MOST_TRIED,
     Choice,
     Chosen,
@@ -27,6 +26,7 @@ from demandops.decide.placement.choice import (
     requirement_of,
     shares,
 )
+from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning.flows import Flow, connection_for, flows
 from demandops.decide.planning.overrides import (
     kept_subjects,

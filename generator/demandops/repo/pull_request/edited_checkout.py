@@ -18,8 +18,8 @@ from demandops.base.errors import Fault, InvalidInput, StateRepoError, fault
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import API_VERSION, GENERATED_ROOTS, MAIN_BRANCH, NOTES_ROOT, modeline
-from demandops.decide import merge_preview
-from demandops.decide.merge_preview import ABSENT, leaf_differences
+from demandops.decide import changeset
+from demandops.decide.changeset import ABSENT, leaf_differences
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS, Config
@@ -161,7 +161,7 @@ class Base:
     merged: Mapping[str, str] = field(default_factory=dict)
 
     def releases(self) -> dict[ReleaseKey, Release]:
-        return merge_preview.planned_releases(self.state) if self.state else {}
+        return changeset.planned_releases(self.state) if self.state else {}
 
 
 def files_of(folder: Path) -> tuple[dict[str, str], list[Fault]]:

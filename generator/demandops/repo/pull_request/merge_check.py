@@ -19,9 +19,9 @@ from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.runtime import REAL
 from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.base.strict_yaml import with_lines
-from demandops.decide import merge_preview, warnings
+from demandops.decide import changeset, warnings
+from demandops.decide.changeset import MergePreview
 from demandops.decide.decision import faults_of_edit
-from demandops.decide.merge_preview import MergePreview
 from demandops.decide.placement.relocation import expired_overrides, update_ledger
 from demandops.decide.state import State, rendered_files, try_configuration
 from demandops.decide.warnings import missing_inputs
@@ -39,7 +39,7 @@ from demandops.repo.pull_request.edited_checkout import Base, author_of, base_of
 from demandops.repo.pull_request.rendered_charts import RenderedCharts
 from demandops.templating import charts
 from demandops.templating.evaluator import EVALUATE
-from demandops.views import explanations
+from demandops.views import release_causes
 from demandops.views.bookkeeping import EntryChange, bookkeeping, bookkeeping_changes
 
 _MOST_LEFT = 5
@@ -111,8 +111,8 @@ def check(
         edited = [
             path for path in edited if not _generated(path) or files.get(path) != wanted.get(path)
         ]
-        new = merge_preview.planned_releases(state)
-        preview = merge_preview.preview(
+        new = changeset.planned_releases(state)
+        preview = changeset.preview(
             new if start is None else start.releases(), new, edit.before_merge(wanted), wanted
         )
         charts = rendered_charts.render_charts(
@@ -121,7 +121,7 @@ def check(
         faults += charts.faults
         if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
             faults.append(fault("", rendered_charts.NO_HELM))
-        idle = explanations.warnings(explanations.override_report(state, edit.now))
+        idle = release_causes.warnings(release_causes.override_report(state, edit.now))
         # a topic that was lacking before is not of this edit
         old = missing_inputs(start.state) if start and start.state else ()
         lacking = {(topic.application, topic.reason) for topic in old}
@@ -317,7 +317,7 @@ class _Edit:
         try:
             return rendered_files(state, self.generated_before)
         except InvalidInput as error:
-            faults = merge_preview.render_faults(state, state.evaluate, self.changed)
+            faults = changeset.render_faults(state, state.evaluate, self.changed)
             raise InvalidInput(faults or error.faults) from None
 
     def changed_bootstraps(self, wanted: Mapping[str, str]) -> Iterator[Fault]:

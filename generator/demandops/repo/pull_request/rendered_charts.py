@@ -23,7 +23,7 @@ from typing import Any
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.decide import merge_preview
+from demandops.decide import changeset
 from demandops.decide.changeset import trial_releases
 from demandops.decide.state import State
 from demandops.model.config.config import DOMAINS_FILE
@@ -67,7 +67,7 @@ def render_charts(
     """
     config = state.config
     by_folder: dict[str | None, list[tuple[ServiceRelease, bool]]] = {}
-    for release in merge_preview.planned_releases(state).values():
+    for release in changeset.planned_releases(state).values():
         if isinstance(release, ServiceRelease):
             by_folder.setdefault(release.chart.folder, []).append((release, False))
     edited = sorted(changed or ())
