@@ -58,8 +58,8 @@ COMMANDS = {
     "upgrade": ("repo.state_repo", "Render everything again, in one commit."),
     "verify": ("repo.state_repo", "Render commits again from their ledger and compare the bytes."),
     "version": ("repo.program", "Print the versions of the program and of its formats."),
-    "watch": ("views.watch", "Show releases, demands and the latest commits live."),
-    "web": ("views.web", "Show the state repo on a web page."),
+    "watch": ("views.live", "Show releases, demands and the latest commits live."),
+    "web": ("views.live", "Show the state repo on a web page."),
     "why": ("views.why", "Explain why something runs or ran."),
 }
 
