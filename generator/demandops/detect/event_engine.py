@@ -1,4 +1,4 @@
-"""Rules in a form that checks observations quickly; a rule's condition determines its class."""
+"""Turns observations into events, by the rules of one file."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ from demandops.detect.condition import Area, Count, Hours, Near, Threshold, Toge
 from demandops.detect.observations import Cell, Event, Key, Observation, Phase, State, Who
 from demandops.detect.rule_file import Rule, RuleFile, Values
 from demandops.model.config.base_model import seconds_of
+
+# ---- compiled rules: what a rule of the file means for the engine ----
+
 
 Seen = Mapping[Who, Observation]
 

@@ -1,4 +1,4 @@
-"""``demandops watch``: releases, demands and the latest commits on the whole screen, live."""
+"""``demandops watch`` and ``demandops web``: the state repo live, on the terminal and on a page."""
 
 from __future__ import annotations
 
@@ -28,6 +28,9 @@ from demandops.repo.reader import Reader
 from demandops.serve.timing.timers import parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
+
+# ---- ``demandops watch``: releases, demands and the latest commits live ----
+
 
 _PAUSE_S = 2.0
 _COMMITS = 6
