@@ -38,7 +38,7 @@ from demandops.serve.approvals.approvals import Approvals
 from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Receipt, Ticket
-from demandops.serve.timing import own_work
+from demandops.serve.timing import expiry, own_work
 from demandops.serve.timing.expiry import LeaseExpiry, ScaleDown
 from demandops.serve.timing.own_work import Draining, WaitingTurns
 from demandops.serve.worker import Worker
@@ -288,7 +288,7 @@ def book_what_is_denied(patch: Patch) -> None:
 
 
 def end_overrides_early(patch: Patch) -> None:
-    for module in (own_work, relocation):
+    for module in (expiry, relocation):
         expired = module.expired_overrides
         patch(
             module,

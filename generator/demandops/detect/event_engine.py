@@ -183,8 +183,6 @@ def compiled(rule: Rule) -> CompiledRule:
     return HoursRule(rule, condition)
 
 
-# ---- turns observations into events, by the rules of one file ----
-
 # ---- an index of areas by position, so that an entity is compared only with those near it ----
 
 Item = TypeVar("Item")
