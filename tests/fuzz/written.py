@@ -237,7 +237,7 @@ def branch(words: tuple[str, str]) -> None:
 
 def pull_request(words: tuple[str, list[str]]) -> None:
     message, reasons = words
-    options = proposal.push_options(message, reasons, reasons)
+    options = proposal.push_options(message, reasons)
     assert all("\n" not in one for one in options)
     body = proposal.pull_request_body(message, reasons)
     head = body.partition("`" * 3)[0]
