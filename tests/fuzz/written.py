@@ -19,8 +19,8 @@ import yaml
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.base.naming import Subject, SubjectKind, topic_problem
-from demandops.cli.actions.override import new_override
-from demandops.cli.actions.person_change import EditOptions
+from demandops.cli.actions.override import override_text
+from demandops.cli.actions.person_change import selector
 from demandops.decide.state import try_configuration
 from demandops.model.config.base_model import parse_file
 from demandops.model.config.load import load
@@ -194,10 +194,13 @@ def name_of_object(ids: tuple[str, str]) -> None:
 def override_by_command(words: tuple[str, str, list[str], Any]) -> None:
     """Check that the command refuses what a person gives, or writes all of it to the override."""
     reason, owner, nodes, patch = words
-    options = EditOptions("", None, " ".join(reason.split()) or "x", False, False, False, "text")
-    given = {"owner": owner or "x", "values": patch}
-    text = new_override(None, "x", options, {"node": (*nodes,)}, given)  # type: ignore[arg-type]
-    wanted = {"reason": options.reason, **given, "select": [{"node": nodes}]}
+    wanted = {
+        "reason": " ".join(reason.split()) or "x",
+        "owner": owner or "x",
+        "values": patch,
+        "select": [selector({"node": (*nodes,)})],
+    }
+    text = override_text("x", wanted)
     data = strict_yaml.load(text)
     assert {key: data[key] for key in wanted} == wanted
     assert text.startswith("# yaml-language-server: ") and _yaml(text) == data
@@ -239,7 +242,7 @@ def pull_request(words: tuple[str, list[str]]) -> None:
     message, reasons = words
     options = proposal.push_options(message, reasons)
     assert all("\n" not in one for one in options)
-    body = proposal.pull_request_body(message, reasons)
+    body = proposal.pull_request_texts(message)[1]
     head = body.partition("`" * 3)[0]
     inside = body[len(head) :].split("\n")
     closing = [number for number, line in enumerate(inside) if line == inside[-2]]

@@ -171,8 +171,7 @@ def create_override(
             person = repo.operator()
             owner = person.email if id_problem(person.name) else person.name
         fields = {"reason": options.reason, **more, "owner": owner, "select": [chosen]}
-        given = {key: value for key, value in fields.items() if value is not None}
-        text = document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
+        text = override_text(name, fields)
         edit = Edit(name, text, summary, options.reason)
         if repo.file_reader()(edit.path) is not None:
             message = "exists already; end it first, or choose another name"
@@ -183,6 +182,11 @@ def create_override(
         elif entry.state in ("held back", "expired"):
             errors.print(f"warning: {edit.path} is {entry.state}, so it changes nothing now")
         _carry_out(repo, edit, entry, options)
+
+
+def override_text(name: str, fields: dict[str, Any]) -> str:
+    given = {key: value for key, value in fields.items() if value is not None}
+    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
