@@ -349,6 +349,7 @@ def set_key(text: str, key: str, value: object) -> str:
 
     A form that does not permit this, such as a list, is a fault.
     """
+    before = load(text)  # refuses escapes on which the scanner in Python fails, such as \U with ff
     with _strict(""):
         node = yaml.compose(text, Loader=yaml.SafeLoader)
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
@@ -362,7 +363,7 @@ def set_key(text: str, key: str, value: object) -> str:
         # a file from Windows keeps its line ends
         changed = text + (added.replace("\n", "\r\n") if "\r\n" in text else added)
     try:  # the text may have other forms than those above, such as flow style
-        succeeded = load(changed) == {**load(text), key: value}
+        succeeded = load(changed) == {**before, key: value}
     except (InvalidInput, TypeError):
         succeeded = False
     if not succeeded:

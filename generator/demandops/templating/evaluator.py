@@ -11,6 +11,7 @@ only what changed since.
 
 from __future__ import annotations
 
+import fcntl
 import json
 import logging
 import os
@@ -39,6 +40,7 @@ DEMAND_S = 0.5
 MEMORY_MIB = 512
 _MOST_IDLE = 2  # the worker's and the page's
 _LONGEST_ANSWER = 64_000_000
+_PIPE = 1 << 20  # the most that Linux gives everybody
 # Waiting for an answer is bounded too, in case the child is stopped. A busy machine runs it slowly.
 _LONGEST_WAIT_S = 60
 _START = (
@@ -149,6 +151,9 @@ class _Child:
         )
         assert self._process.stdin is not None  # noqa: S101
         os.set_blocking(self._process.stdin.fileno(), False)  # a stopped child reads nothing
+        # so that one write is enough; without room for the larger pipe, more writes do as well
+        with suppress(OSError, AttributeError):
+            fcntl.fcntl(self._process.stdin.fileno(), fcntl.F_SETPIPE_SZ, _PIPE)
         self._files: Mapping[str, str] = MappingProxyType({})
 
     def answer(
