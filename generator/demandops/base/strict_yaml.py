@@ -41,7 +41,7 @@ MAX_DEPTH = 100
 # How many bits a whole number may have. Python prints at most 4,300 digits.
 _MAX_BITS = 14_000
 # what PyYAML raises, beside its own errors, for texts that do not fit a tag, such as `!!int x`
-_MISFITS = (ValueError, TypeError, KeyError, AttributeError, IndexError, RecursionError)
+_MISFITS = (ArithmeticError, AttributeError, LookupError, RecursionError, TypeError, ValueError)
 
 # Finds the digits before the `e` of a JSON number like `1e-09`. YAML 1.1 would read such a number
 # as text. The pattern matches quoted texts as a whole, so that no digits inside them are found.
@@ -349,7 +349,6 @@ def set_key(text: str, key: str, value: object) -> str:
 
     A form that does not permit this, such as a list, is a fault.
     """
-    before = load(text)  # refuses escapes on which the scanner in Python fails, such as \U with ff
     with _strict(""):
         node = yaml.compose(text, Loader=yaml.SafeLoader)
     pairs = node.value if isinstance(node, yaml.MappingNode) else []
@@ -363,7 +362,7 @@ def set_key(text: str, key: str, value: object) -> str:
         # a file from Windows keeps its line ends
         changed = text + (added.replace("\n", "\r\n") if "\r\n" in text else added)
     try:  # the text may have other forms than those above, such as flow style
-        succeeded = load(changed) == {**before, key: value}
+        succeeded = load(changed) == {**load(text), key: value}
     except (InvalidInput, TypeError):
         succeeded = False
     if not succeeded:

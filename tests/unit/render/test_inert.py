@@ -243,7 +243,7 @@ def test_a_file_that_is_too_long_is_not_parsed() -> None:
         strict_yaml.load(text)
 
 
-@pytest.mark.parametrize("text", ["a: *b\n", "a: [", "a: \x00", "a: b: c"])
+@pytest.mark.parametrize("text", ["a: *b\n", "a: [", "a: \x00", "a: b: c", '"\\Uffffffff": 1'])
 def test_no_key_is_set_in_what_is_no_yaml(text: str) -> None:
     with pytest.raises(InvalidInput, match="not valid YAML"):
         strict_yaml.set_key(text, "key", 1)
