@@ -286,7 +286,7 @@ def _only_document(text: str) -> Any:  # noqa: ANN401
     if _LONG <= len(text) <= MAX_LENGTH and _STAND_IN not in text:
         short = _LISTED.sub(stand_in, text)
         if lists:
-            # a text that cannot be read in this way is read as it is, for the right fault and line
+            # if this fails, the text is read unchanged, so that the fault names the right line
             with suppress(_Misread, yaml.YAMLError, InvalidInput, *_MISFITS):
                 if documents := list(_Parser(short, lists).documents(1)):
                     return documents[0]

@@ -42,7 +42,7 @@ class Table:
     rows: Sequence[Sequence[Cell]]
     title: str = ""
     empty: str = "(nothing)"
-    # The colors of cells, by the text of the cell, for a terminal that shows colors.
+    # Maps a cell's text to its color, for terminals that show colors.
     styles: dict[str, str] = field(default_factory=dict)
     # Whether to keep every column and wrap nothing, however wide the table gets.
     whole: bool = False

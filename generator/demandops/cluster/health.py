@@ -40,7 +40,7 @@ class ClusterDomain:
     cluster: str
     name: str
     namespace: str
-    application: ObjectName | None = None  # of Argo CD, for the domain's folder; None with Flux
+    application: ObjectName | None = None  # Argo CD's, for the domain's folder; None with Flux
 
 
 @dataclass(frozen=True, slots=True)

@@ -257,7 +257,7 @@ class WantedDemands:
         return self._queue[0][0] if self._queue else inf
 
     def answered(self, sending: Sending, outcome: Outcome, now: float) -> str:
-        """Record the outcome of a goal; return the reason of a failure if it is to be logged."""
+        """Record a goal's outcome; return why the goal failed, if the log should say so."""
         entry, text, is_start = self._entries[sending.key], "", sending.purpose == "start"
         entry.is_under_way = False
         is_over = outcome.code == "not-held" and not is_start
