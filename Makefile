@@ -14,10 +14,10 @@ PACKAGE_TESTS := tests/packages
 PAGE_TESTS := tests/page
 DOCS_TESTS := tests/docs
 SIMULATION_TESTS := tests/simulation
-KILL_TESTS := tests/integration/staterepo/test_kill_and_restart.py tests/ros/test_crash.py
+KILL_TESTS := tests/integration/repo/test_kill_and_restart.py tests/ros/test_crash.py
 # What takes long because it has remotes, crashes, ROS, brokers, servers or much work.
-PROCESS_TESTS := tests/ros tests/experiment tests/unit/plan/test_budget.py \
-  tests/unit/config/test_thousands_of_entries.py $(addprefix tests/integration/,staterepo mqtt web \
+PROCESS_TESTS := tests/ros tests/experiment tests/unit/decide/test_budget.py \
+  tests/unit/model/test_thousands_of_entries.py $(addprefix tests/integration/,repo mqtt web \
     test_command_line.py test_get.py test_hostile_checkouts.py test_inbound_webhook.py \
     test_person_commands.py test_proposals.py)
 # One worker more than cores, because one is busy with the tests of ROS, which mostly wait.
@@ -90,7 +90,7 @@ page: system-page setup  ## Look at the web page in a headless browser: every vi
 # tests/conftest.py, which imports it.
 CORE := config decision demand ledger plan render templating
 CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden tests/model tests/unit \
-  $(addprefix --ignore=tests/unit/,cluster forge service staterepo demand/test_fuzz.py) \
+  $(addprefix --ignore=tests/unit/,cluster serve repo demand/test_fuzz.py) \
   --ignore-glob='tests/unit/test_[!s]*'
 CORE_COVERAGE := 84
 coverage: export DEMANDOPS_EXAMPLES := 1
@@ -144,7 +144,7 @@ format: setup  ## Format the code and mend what the linter can
 golden: setup  ## Rewrite the golden files, and the schemas and tables of the charts; review the diff
 	@$(PY) -m tests.golden.write
 	@$(PY) -m tests.terminal.write
-	@$(PY) -m tests.unit.charts.write
+	@$(PY) -m tests.unit.templating.write
 	@$(PY) -m tests.unit.messages
 
 bench: system-page setup  ## Measure the event detector, the page, and the cost of commits and demands as the ledger grows
@@ -160,7 +160,7 @@ bench-audit: setup  ## Measure the cost of an auditor's questions after 10,000 c
 	@$(PY) -m tests.benchmarks.audit
 
 load: setup  ## Test load: four generators and a person write 2,000 demands at once, while connections are cut
-	@DEMANDOPS_LOAD_DEMANDS=2000 DEMANDOPS_LOAD_FURTHER=1000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/staterepo/test_many_writers.py tests/integration/staterepo/test_people_in_the_loop.py
+	@DEMANDOPS_LOAD_DEMANDS=2000 DEMANDOPS_LOAD_FURTHER=1000 $(PY) -m pytest -q -p no:cacheprovider tests/integration/repo/test_many_writers.py tests/integration/repo/test_people_in_the_loop.py
 
 # The gate sets 2 seconds. Inputs that earlier runs kept in build/fuzz/corpus are tried again.
 fuzz: export FUZZ_S ?= 10

@@ -24,7 +24,7 @@ from tests.kit.chance import examples
 from tests.kit.config import override, skeleton
 from tests.kit.goals import CLOUD, STATION_CLOUD, application, goal
 from tests.kit.memory import NOW, MemoryRepo
-from tests.unit.overrides.test_in_force import demands
+from tests.unit.decide.test_in_force import demands
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "appdef.md").read_text()

@@ -46,9 +46,9 @@ from tests.unit.render.test_inert import TRAPS, UNSEEN
 from tests.unit.render.test_inert import (
     test_a_written_text_is_read_back_by_every_parser as text_is_read_back,
 )
-from tests.unit.staterepo.conftest import Desk
-from tests.unit.staterepo.test_trailers import IDS
-from tests.unit.staterepo.test_trailers import (
+from tests.unit.repo.conftest import Desk
+from tests.unit.repo.test_trailers import IDS
+from tests.unit.repo.test_trailers import (
     test_every_id_is_read_back_by_git_and_by_us_as_it_was as message_is_read_back,
 )
 

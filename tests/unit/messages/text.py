@@ -14,11 +14,11 @@ from tests.kit.connections import routes
 from tests.kit.goals import perception
 from tests.kit.memory import MemoryRepo
 from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS
-from tests.unit.config import test_config_mistakes as of_config
 from tests.unit.connections import test_connection_types as of_connections
+from tests.unit.decide import test_override_mistakes as of_overrides
 from tests.unit.demand import test_refused as of_goals
 from tests.unit.demand import wrong_types as of_form
-from tests.unit.overrides import test_override_mistakes as of_overrides
+from tests.unit.model import test_config_mistakes as of_config
 
 FILE = Path(__file__).with_name("messages.txt")
 _FOREIGN = re.compile(r"(not valid YAML: |input should be )(?!the key|a tag|another).*?(, not |$)")

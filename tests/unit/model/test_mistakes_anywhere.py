@@ -79,7 +79,7 @@ def test_a_mistake_anywhere_is_a_fault_at_its_place(
 
 
 def test_every_field_of_every_file_is_tried() -> None:
-    # these two belong to scopes that the rich configuration lacks; tests/unit/plan tries them
+    # these two belong to scopes that the rich configuration lacks; tests/unit/decide tries them
     tried = {"ServiceDefinition.nodes", "ServiceDefinition.place"}
     for files, file in DOCUMENTS:
         tried |= form_of(file).fields_in(strict_yaml.load(files()[file]))

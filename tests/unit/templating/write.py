@@ -1,6 +1,6 @@
 """Write the generated files of the charts: their schemas, and the tables in their READMEs.
 
-Run ``python -m tests.unit.charts.write`` and review the diff.
+Run ``python -m tests.unit.templating.write`` and review the diff.
 """
 
 from __future__ import annotations

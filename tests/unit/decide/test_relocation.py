@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from tests.kit.chance import chances, examples
 from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo, rebuilt
-from tests.unit.plan.test_flows import (
+from tests.unit.decide.test_flows import (
     NODES,
     Demands,
     Graphs,

@@ -23,7 +23,7 @@ from demandops.templating.charts import merged
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.goals import application, goal
 from tests.kit.memory import MemoryRepo
-from tests.unit.charts import write
+from tests.unit.templating import write
 
 APPDEF = Path(__file__).parents[3] / "appdefs" / "object-detection-fusion"
 CHARTS = ("object-detection", "object-fusion")
@@ -91,7 +91,7 @@ def test_every_value_is_in_the_schema(chart: str) -> None:
 @pytest.mark.parametrize("chart", [write.LIBRARY, *write.CHARTS], ids=lambda chart: chart.name)
 def test_every_value_is_described_in_a_table(chart: Path) -> None:
     text = (chart / "README.md").read_text()
-    assert text == write.readme(chart), "run python -m tests.unit.charts.write"
+    assert text == write.readme(chart), "run python -m tests.unit.templating.write"
     rows = re.findall(r"^\| ([\w.]+) \| \w+ \| `.*` \| (.*) \|$", text, re.MULTILINE)
     assert len(rows) >= 4
     assert all(description.endswith(".") for _, description in rows)
@@ -100,7 +100,7 @@ def test_every_value_is_described_in_a_table(chart: Path) -> None:
 @pytest.mark.parametrize("chart", write.CHARTS, ids=lambda chart: chart.name)
 def test_a_schema_has_what_the_library_has(chart: Path) -> None:
     text = (chart / "values.schema.json").read_text()
-    assert text == write.schema(chart), "run python -m tests.unit.charts.write"
+    assert text == write.schema(chart), "run python -m tests.unit.templating.write"
 
 
 def undescribed(schema: dict[str, Any], path: str = "") -> Iterator[str]:

@@ -23,7 +23,7 @@ from hypothesis import strategies as st
 
 from tests.kit.chance import examples
 from tests.kit.config import configuration, may_select_same_release, override
-from tests.unit.overrides.test_ties import _override, effects, selector
+from tests.unit.decide.test_ties import _override, effects, selector
 
 Files = dict[str, str]
 CONFIG = load(configuration())

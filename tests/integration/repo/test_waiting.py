@@ -12,7 +12,7 @@ from demandops.serve.generator import Generator
 from demandops.serve.timing.own_work import WaitingTurns
 from demandops.templating.evaluator import processor_time
 
-from tests.integration.staterepo.test_hanging_template import ENDLESS, TEMPLATE
+from tests.integration.repo.test_hanging_template import ENDLESS, TEMPLATE
 from tests.kit import rig
 from tests.kit.clock import Clock
 from tests.kit.goals import link

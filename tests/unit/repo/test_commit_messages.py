@@ -17,7 +17,7 @@ from demandops.repo.history.commit_log import compose
 
 from tests.kit import goals
 from tests.kit.repo import git, write_tree
-from tests.unit.plan.test_waiting import put, release, waiting_repo
+from tests.unit.decide.test_waiting import put, release, waiting_repo
 
 CONNECTION = goals.connection(
     "station00/edge", ends=("station00", "edge"), topics=[goals.STATION_CLOUD[0]], broker=""

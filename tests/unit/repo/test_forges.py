@@ -17,7 +17,7 @@ from demandops.serve.approvals.forge_worker import ForgeWorker
 from tests.kit.config import configuration
 from tests.kit.http import Answer, Call, serving
 from tests.kit.turns import Turns
-from tests.unit.forge.replaying import TOKEN, Replay, replaying
+from tests.unit.repo.replaying import TOKEN, Replay, replaying
 
 BRANCH = "demand/one-0123456789ab"
 LINKS = {

@@ -28,7 +28,7 @@ from tests.kit.config import skeleton, state_of
 from tests.kit.goals import application, goal
 from tests.kit.memory import NOW, MemoryRepo, ledger_in
 from tests.scenarios.running import configuration
-from tests.unit.plan.test_flows import (
+from tests.unit.decide.test_flows import (
     NODES,
     Demands,
     Graphs,

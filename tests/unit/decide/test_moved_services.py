@@ -29,7 +29,7 @@ from tests.kit.chance import chances, examples
 from tests.kit.config import configuration, override, state_of
 from tests.kit.goals import application, goal
 from tests.kit.memory import MemoryRepo, ledger_in
-from tests.unit.plan.test_flows import (
+from tests.unit.decide.test_flows import (
     NODES,
     Demands,
     Graphs,

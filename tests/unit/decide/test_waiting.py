@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 from tests.kit.chance import chances, examples
 from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo, ledger_in
-from tests.unit.plan.test_capacity import CAPACITY, recorders, used
+from tests.unit.decide.test_capacity import CAPACITY, recorders, used
 
 
 def waiting_repo() -> MemoryRepo:
