@@ -29,7 +29,6 @@ from demandops.model.ledger.ledger import Changes, Ledger, World
 from demandops.model.release import Release, ServiceRelease
 from demandops.render import manifests, release_file
 from demandops.render.gitops import path_of
-from demandops.render.release_file import check_files
 from demandops.templating.values import Evaluate
 
 # ---- the changes that a decision makes: files by path, and how releases change ----
@@ -137,7 +136,6 @@ def build_changeset(  # noqa: PLR0913 - each is an input of its own
         if old or new:
             releases.append(describe_change(old, new, current is not None))
     _refuse_large(files, most, read)
-    check_files(files, checkpoint)
     releases.sort(key=lambda change: change.order)
     return Changeset(files, tuple(releases), tuple(sorted(shaped)), tuple(blocked), now, former)
 

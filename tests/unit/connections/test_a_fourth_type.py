@@ -7,7 +7,6 @@ of this type are booked, planned, rendered and explained.
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -17,7 +16,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base import naming, settings
-from demandops.base.errors import Fault, InvalidInput, fault
+from demandops.base.errors import Fault, fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections import connection_types
 from demandops.connections.connection import (
@@ -36,12 +35,6 @@ from tests.kit.connections import ROS_IMAGE, demand, routes, state
 from tests.kit.goals import connection, goal
 from tests.kit.memory import MemoryRepo
 
-SCHEMA = {
-    "type": "object",
-    "required": ["fetch"],
-    "additionalProperties": False,
-    "properties": {"fetch": {"type": "object", "additionalProperties": {"type": "string"}}},
-}
 TEMPLATE = """\
 apiVersion: v1
 kind: ConfigMap
@@ -136,7 +129,6 @@ def a_fourth_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "templates" / "connections" / "relay"
     folder.mkdir()
     folder.joinpath("client.yaml.j2").write_text(TEMPLATE)
-    folder.joinpath("schema.json").write_text(json.dumps(SCHEMA))
     for name in ("appdefs", "state-repo-skeleton"):
         (tmp_path / name).symlink_to(settings.data_folder(name))
     monkeypatch.setattr(settings, "_CHECKOUT", tmp_path)
@@ -216,10 +208,3 @@ def test_what_it_cannot_do_is_refused_and_others_name_it() -> None:
     ]
     found = repo().faults(routes(demand("ros", {"/a": {"target": "/b"}})))
     assert any(one.endswith("or use type MQTT or RELAY") for one in found)
-
-
-def test_a_field_that_it_does_not_read_never_reaches_a_commit(tmp_path: Path) -> None:
-    schema = tmp_path / "templates" / "connections" / "relay" / "schema.json"
-    schema.write_text(json.dumps(SCHEMA | {"required": ["fetch", "port"]}))
-    with pytest.raises(InvalidInput, match="relay of relay-edge"):
-        booked()

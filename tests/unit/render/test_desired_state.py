@@ -8,9 +8,9 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
-from demandops.base.errors import InvalidInput
-from demandops.render.release_file import check_files
+from demandops.repo.pull_request.rendered_charts import manifest_faults
 
+from tests.kit.connections import schema_faults
 from tests.kit.goals import application, connection, goal, perception
 from tests.kit.golden import CASES, rendered
 from tests.kit.memory import MemoryRepo
@@ -33,6 +33,10 @@ def test_what_is_rendered_fits_the_schemas_of_kubernetes() -> None:
         for document in yaml.load_all(text, Loader=FAST):
             if document["apiVersion"] in BUILT_IN:
                 kubernetes_validate.validate(document, "1.36", strict=True)
+                kind = document["metadata"]["name"].partition("-")[0]
+                if document["kind"] == "ConfigMap" and kind in ("mqtt", "zenoh", "ros"):
+                    configuration, *_ = document["data"].values()
+                    assert not schema_faults(kind, yaml.safe_load(configuration)), path
             else:
                 assert document["metadata"]["namespace"] == "perception", path
 
@@ -74,35 +78,16 @@ X, Y = "clusters/c/d/n/x.yaml", "clusters/c/d/n/y.yaml"
 
 
 @pytest.mark.parametrize(
-    ("files", "told"),
+    ("files", "places"),
     [
-        *(
-            ({path: None}, [f"{path}: is in no folder that the generator writes; report this bug"])
-            for path in ("inventory/nodes.yaml", "demandops.yaml", "clusters/../x.yaml", "x")
-        ),
-        (
-            {"/clusters/x.yaml": None},
-            ["/clusters/x.yaml: is in no folder that the generator writes; report this bug"],
-        ),
-        ({X: CONFIG + "data: {a: 1}\nfoo: bar\n"}, [f"{X}: ", f"{X}: "]),
-        (
-            {X: CONFIG, Y: CONFIG},
-            [f"{Y}: metadata.name: ConfigMap a is in {X} too"],
-        ),
-        ({X: f"{CONFIG}---\n{CONFIG}"}, [f"{X}: "]),
-        ({X: "a: [\n"}, [f"{X}: "]),
-        ({X: "- a\n"}, [f"{X}: "]),
+        ({X: CONFIG + "data: {a: 1}\nfoo: bar\n"}, [(X, "data.a"), (X, "")]),
+        ({X: CONFIG, Y: CONFIG}, [(Y, "metadata.name")]),
+        ({X: f"{CONFIG}---\n{CONFIG}"}, [(X, "metadata.name")]),
+        ({f"clusters/{name}/d/n/x.yaml": CONFIG for name in ("a", "b")}, []),
     ],
-    ids=str,
+    ids=["not of the schema", "twice in two files", "twice in a file", "in two clusters"],
 )
-def test_before_a_commit_what_is_invalid_twice_or_outside_is_refused(
-    files: dict[str, str | None], told: list[str]
+def test_the_check_finds_what_kubernetes_would_refuse(
+    files: dict[str, str], places: list[tuple[str, str]]
 ) -> None:
-    with pytest.raises(InvalidInput) as invalid:
-        check_files(files)
-    found = [str(each) for each in invalid.value.faults]
-    assert all(each.startswith(start) for each, start in zip(found, told, strict=True)), found
-
-
-def test_one_name_on_two_clusters_is_no_clash() -> None:
-    check_files({f"clusters/{name}/d/n/x.yaml": CONFIG for name in ("a", "b")})
+    assert [(fault.file, fault.field) for fault in manifest_faults(files)] == places

@@ -20,7 +20,7 @@ from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
 from demandops.model.config.policy import matches
 from demandops.render.gitops import expression_of, node_rule
-from demandops.render.release_file import check_files
+from demandops.repo.pull_request.rendered_charts import manifest_faults
 
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
@@ -86,7 +86,7 @@ def test_a_node_without_labels_to_select_is_any() -> None:
 
 def bootstrap(files: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     text = rendered_files(MemoryRepo(files).state)[BOOTSTRAP].split("\n---\n", 1)[1]
-    check_files({BOOTSTRAP: text})  # it compares the objects with the schemas of Kubernetes
+    assert not [*manifest_faults({BOOTSTRAP: text})]
     return {item["kind"]: item for item in yaml.safe_load_all(text)}
 
 

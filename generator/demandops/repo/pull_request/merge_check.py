@@ -119,6 +119,8 @@ def check(
             state, edit.changed if start else None, {file.path for file in preview.files}
         )
         faults += charts.faults
+        written = {file.path: file.after for file in preview.files if file.after is not None}
+        faults += rendered_charts.manifest_faults(written)
         if require_helm and rendered_charts.MISSING in charts.not_rendered.values():
             faults.append(fault("", rendered_charts.NO_HELM))
         idle = release_causes.warnings(release_causes.override_report(state, edit.now))

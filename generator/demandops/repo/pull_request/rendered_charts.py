@@ -13,14 +13,20 @@ helm would fetch what a schema refers to; the generator's own validator checks t
 from __future__ import annotations
 
 import json
+import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from demandops.base.errors import Fault, InvalidInput, fault
+import jsonschema_rs
+
+from demandops.base import strict_yaml
+from demandops.base.errors import Fault, InvalidInput, fault, field_path
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.decide import changeset
@@ -237,3 +243,56 @@ class _Run:
                     f"{domain.how_to_allow(kind, file)}, or leave the object out"
                 )
                 yield fault("", message).within(str(release.chart.folder))
+
+
+# ---- whether what the generator writes is what Kubernetes takes ----
+#
+# Only objects of built-in kinds are compared with the schemas of Kubernetes: an override or an
+# entry of the inventory may give them what its own file allows, and a cluster would refuse.
+
+KUBERNETES_VERSION = "1.36.0"  # whose schemas
+_BUILT_IN = (
+    *("v1", "apps/v1", "admissionregistration.k8s.io/v1", "networking.k8s.io/v1"),
+    "rbac.authorization.k8s.io/v1",
+)
+_API = re.compile(r"^apiVersion: (\S+)$", re.MULTILINE)
+
+
+def manifest_faults(files: Mapping[str, str]) -> Iterator[Fault]:
+    seen: dict[tuple[str, str, str, str], str] = {}
+    for path, text in sorted(files.items()):
+        for part in text.split("\n---\n"):
+            api = _API.search(part)
+            is_built_in = api is not None and api[1] in _BUILT_IN
+            # nothing here reads the spec of other kinds, and Helm values may be long
+            document = strict_yaml.load(part if is_built_in else part.partition("\nspec:\n")[0])
+            if document is None:  # the comments above a bootstrap file
+                continue
+            metadata, kind = document["metadata"], document["kind"]
+            cluster = path.split("/")[1].removesuffix(".yaml")
+            identity = (cluster, kind, str(metadata.get("namespace")), metadata["name"])
+            if other := seen.get(identity):
+                message = f"{kind} {metadata['name']} is in {other} too; rename one of the two"
+                yield fault("metadata.name", message).within(path)
+            seen[identity] = path
+            if is_built_in:
+                for error in _schema_of(document["apiVersion"], kind).iter_errors(document):
+                    place = field_path(tuple(error.instance_path))
+                    yield fault(place, error.message).within(path)
+
+
+@lru_cache(maxsize=64)
+def _schema_of(api: str, kind: str) -> jsonschema_rs.Draft7Validator:
+    group, _, version = api.rpartition("/")
+    package = find_spec("kubernetes_validate")  # only its files are used; an import is slow
+    assert package and package.origin  # noqa: S101 - it is one of our dependencies
+    schemas = Path(package.origin).parent / "kubernetes-json-schema"
+    folder = schemas / f"v{KUBERNETES_VERSION}-local-strict"
+    name = "-".join(filter(None, [kind.lower(), group.partition(".")[0], version]))
+    # the definitions are put into each schema, because no file is at the path that it refers to
+    foreign, local = "/api/_definitions.json#/$defs/", "#/$defs/"
+    schema, definitions = (
+        json.loads((folder / file).read_text().replace(foreign, local))
+        for file in (f"{name}.json", "_definitions.json")
+    )
+    return jsonschema_rs.Draft7Validator({**schema, "$defs": definitions["$defs"]})
