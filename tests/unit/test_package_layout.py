@@ -71,7 +71,7 @@ def test_an_allowed_name_still_occurs_more_than_once(name: str) -> None:
 
 
 def test_only_the_runtime_reads_a_clock_or_starts_threads() -> None:
-    """The import contract `door-runtime` cannot check this, because it must allow `datetime`."""
+    """The import contract of the doors cannot check this, because it must allow `datetime`."""
     uses = re.compile(r"\b(datetime|date)\.(now|utcnow|today)\(|PoolExecutor\b|\burandom\(")
     assert [dotted(path) for path in MODULES if uses.search(path.read_text())] == [
         "demandops.base.runtime.py"
