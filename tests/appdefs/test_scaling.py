@@ -9,11 +9,12 @@ from typing import Any, Literal
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.decide.changeset import render_trial_demands
+from demandops.decide.planning.planner import replicas_of
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import rendered_files
 from demandops.model.config.appdef import Scaling
 from demandops.model.demand.claim import InputTopic
-from demandops.model.release import ServiceKey, replicas_of
+from demandops.model.release import ServiceKey
 from demandops.views.release_causes import override_report, warnings
 from hypothesis import given
 from hypothesis import strategies as st

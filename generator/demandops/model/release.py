@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-from demandops.base import strict_yaml
-from demandops.base.errors import Refused, suggestion
 from demandops.connections.connection import Client
-from demandops.model.config.appdef import Resource, Scaling, Scope, Service
+from demandops.model.config.appdef import Resource, Scope, Service
 from demandops.model.config.config import CHARTS_FILE, VERSIONS_FILE, Config
 from demandops.model.config.inventory import Node
 from demandops.model.config.override import UNSHAPED, Shaping, format_time
@@ -17,9 +15,7 @@ from demandops.model.config.registry import ApplicationVersion, ChartSource, Ima
 from demandops.model.demand.claim import Claim, InputTopic
 from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Ledger
-from demandops.model.ledger.records import Instance, Kept, Steps
-
-# ---- the number of replicas of a service ----
+from demandops.model.ledger.records import Instance, Kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,43 +33,6 @@ class Autoscaler:
     def values(self) -> dict[str, int]:
         targets = {str(name): percent for name, percent in self.targets.items()}
         return {"min": self.min, "max": self.max} | targets
-
-
-def replicas_of(
-    scaling: Scaling,
-    parameters: Mapping[str, object],
-    topics: Collection[InputTopic],
-    claims: Collection[Claim],
-    requesters: Collection[str],
-) -> int | Autoscaler:
-    if scaling.autoscaler:
-        return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
-    if scaling.sizes:
-        name = scaling.sizes.parameter
-        replicas = scaling.sizes.replicas_for(parameters[name])
-        if replicas is None:
-            value = parameters[name]
-            message = f"{strict_yaml.short_repr(value)} is not a size" + suggestion(
-                str(value), scaling.sizes.replicas
-            )
-            raise Refused.at(f"parameters.{name}", message)
-        return replicas
-    for measure, share in (scaling.per or {}).items():
-        sources = {topic.source for topic in topics}
-        counted = {"topics": topics, "sources": sources, "claims": claims, "requesters": requesters}
-        needed = -(-len(counted[measure]) // share)  # rounded up
-        return max(scaling.min, min(scaling.max, needed))
-    return scaling.min
-
-
-def with_kept(
-    needed: int | Autoscaler, scaling: Scaling, steps: Steps
-) -> tuple[int | Autoscaler, Kept | None]:
-    """Return how many replicas a service has, and the step that decides this, if one does."""
-    if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
-        return needed, None
-    kept = min(steps[0].replicas, scaling.most)  # a person may have lowered the limit meanwhile
-    return (kept, steps[0]) if kept > needed else (needed, None)
 
 
 def overridden(replicas: int | Autoscaler, number: int) -> int | Autoscaler:

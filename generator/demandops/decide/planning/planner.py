@@ -7,14 +7,14 @@ configuration alone, so every generator and every replay of a commit plans the s
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from types import MappingProxyType, SimpleNamespace
 from typing import Any, TypeAlias, TypeGuard, TypeVar, cast
 
 from demandops.base import naming, strict_yaml
-from demandops.base.errors import Refused
+from demandops.base.errors import Refused, suggestion
 from demandops.base.naming import Subject, TopicKey
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection, ConnectionType, Route
@@ -29,13 +29,13 @@ from demandops.decide.planning.release_keys import (
     services_of,
     version_of_service,
 )
-from demandops.model.config.appdef import Parameter, Service
+from demandops.model.config.appdef import Parameter, Scaling, Service
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override
 from demandops.model.demand.claim import Application, Claim, InputTopic, requesters_of
 from demandops.model.ledger.ledger import ClaimChange, Ledger, World, index_entries
-from demandops.model.ledger.records import Instance, Steps, extended
-from demandops.model.release import Release, ServiceKey, ServiceRelease, replicas_of, with_kept
+from demandops.model.ledger.records import Instance, Kept, Steps, extended
+from demandops.model.release import Autoscaler, Release, ServiceKey, ServiceRelease
 
 
 def plan(world: World, key: ReleaseKey) -> Release | None:
@@ -288,11 +288,48 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
     return route.read_topic in node.bridged.get(receiver, ())
 
 
-# ---- scale down: a service gets fewer replicas at once, or after the time in its definition ----
+# ---- replicas: how many a service has, and how long it keeps those that no demand needs ----
 #
 # If the definition has such a time and demands need fewer replicas than before, the decision
 # records how many replicas the service keeps, and until when (:mod:`.records`). When that time is
 # over, the generator publishes a commit that removes these replicas from the record.
+
+
+def replicas_of(
+    scaling: Scaling,
+    parameters: Mapping[str, object],
+    topics: Collection[InputTopic],
+    claims: Collection[Claim],
+    requesters: Collection[str],
+) -> int | Autoscaler:
+    if scaling.autoscaler:
+        return Autoscaler(scaling.min, scaling.max, scaling.autoscaler)
+    if scaling.sizes:
+        name = scaling.sizes.parameter
+        replicas = scaling.sizes.replicas_for(parameters[name])
+        if replicas is None:
+            value = parameters[name]
+            message = f"{strict_yaml.short_repr(value)} is not a size" + suggestion(
+                str(value), scaling.sizes.replicas
+            )
+            raise Refused.at(f"parameters.{name}", message)
+        return replicas
+    for measure, share in (scaling.per or {}).items():
+        sources = {topic.source for topic in topics}
+        counted = {"topics": topics, "sources": sources, "claims": claims, "requesters": requesters}
+        needed = -(-len(counted[measure]) // share)  # rounded up
+        return max(scaling.min, min(scaling.max, needed))
+    return scaling.min
+
+
+def with_kept(
+    needed: int | Autoscaler, scaling: Scaling, steps: Steps
+) -> tuple[int | Autoscaler, Kept | None]:
+    """Return how many replicas a service has, and the step that decides this, if one does."""
+    if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
+        return needed, None
+    kept = min(steps[0].replicas, scaling.most)  # a person may have lowered the limit meanwhile
+    return (kept, steps[0]) if kept > needed else (needed, None)
 
 
 def with_kept_replicas(

@@ -106,7 +106,8 @@ def keys_of_claims(
     keys: dict[ReleaseKey, None] = {}
     for claim in claims:
         if not claim.is_on_application:
-            keys |= dict.fromkeys(_client_keys(world, claim))
+            connection = world.ledger.connection(claim.subject.id) or claim.connection
+            keys |= dict.fromkeys(connection.known_type.keys(connection.id, *connection.nodes))
             continue
         # The first claim on an application decides its appdef and nodes for all claims on it.
         first = world.ledger.application(claim.subject.id) or claim.application
@@ -115,11 +116,6 @@ def keys_of_claims(
             for service in services_of(world.config, first.appdef).values():
                 keys |= dict.fromkeys(instances(app, service))
     yield from keys
-
-
-def _client_keys(world: World, claim: Claim) -> Iterable[ClientKey]:
-    first = world.ledger.connection(claim.subject.id) or claim.connection
-    return first.known_type.keys(first.id, *first.nodes)
 
 
 def claims_needing(world: World, key: ServiceKey) -> tuple[Claim, ...]:
