@@ -9,12 +9,11 @@ first installed file. It writes the new record as its last step. So an interrupt
 counts as finished.
 
 Exit codes: 0 installed or already up to date, 1 a requirement is missing (the message names it),
-2 usage, 3 a stage failed, 130 interrupted.
+3 a stage failed, 130 interrupted.
 """
 
 from __future__ import annotations
 
-import argparse
 import fcntl
 import hashlib
 import json
@@ -26,7 +25,7 @@ import sys
 import sysconfig
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -72,12 +71,11 @@ class StageFailed(Exception):
         super().__init__(f"{tail}\nfailed: {stage}\nthe full log: {log}")
 
 
-def main(argv: Sequence[str] | None = None) -> int:
+def main() -> int:
     """Build if necessary, print what happened, and return the exit code."""
-    options = _parse(argv)
     digest = fingerprint()
     try:
-        if options.force or not is_current(digest):
+        if not is_current(digest):
             faults = missing(os.environ)
             if faults:
                 print("\n".join(faults), file=sys.stderr)
@@ -86,8 +84,16 @@ def main(argv: Sequence[str] | None = None) -> int:
             with RECORD.with_suffix(".lock").open("w") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
                 # Another build may have finished while this one waited.
-                if options.force or not is_current(digest):
-                    _build_somewhere(options.build_dir, digest)
+                if not is_current(digest):
+                    folder = Path(tempfile.mkdtemp(prefix="demandops-interfaces-"))
+                    try:
+                        build(folder, digest)
+                    except StageFailed:  # it names the log, which stays
+                        raise
+                    except BaseException:
+                        shutil.rmtree(folder, ignore_errors=True)
+                        raise
+                    shutil.rmtree(folder, ignore_errors=True)
                     return 0
         print(f"interfaces: up to date in {PREFIX}")
     except StageFailed as failure:
@@ -97,27 +103,6 @@ def main(argv: Sequence[str] | None = None) -> int:
         print("interrupted; run it again", file=sys.stderr)
         return 130
     return 0
-
-
-def _parse(argv: Sequence[str] | None) -> argparse.Namespace:
-    parser = argparse.ArgumentParser(
-        description="Build the ROS 2 interfaces into the virtual environment of this interpreter: "
-        f"{PREFIX}. Does nothing if they are up to date."
-    )
-    parser.add_argument("--force", action="store_true", help="build even if nothing has changed")
-    parser.add_argument(
-        "--build-dir",
-        type=Path,
-        metavar="DIR",
-        help="build in this folder and keep the folder, so that the next build compiles less "
-        "(default: a temporary folder, kept only when a stage fails)",
-    )
-    options = parser.parse_args(argv)
-    if options.build_dir is not None:
-        options.build_dir = options.build_dir.resolve()
-        if options.build_dir.is_relative_to(SOURCES):
-            parser.error(f"--build-dir {options.build_dir} is inside the sources; choose another")
-    return options
 
 
 def fingerprint() -> str:
@@ -186,24 +171,6 @@ def _missing_tools(environ: Mapping[str, str]) -> dict[str, str]:
     return {tool: package for present, tool, package in checks if not present}
 
 
-def _build_somewhere(build_dir: Path | None, digest: str) -> None:
-    """Build in ``build_dir``, or in a temporary folder if it is None.
-
-    The temporary folder is kept only if a stage fails.
-    """
-    folder = build_dir or Path(tempfile.mkdtemp(prefix="demandops-interfaces-"))
-    folder.mkdir(parents=True, exist_ok=True)
-    keep = build_dir is not None
-    try:
-        build(folder, digest)
-    except StageFailed:
-        keep = True
-        raise
-    finally:
-        if not keep:
-            shutil.rmtree(folder, ignore_errors=True)
-
-
 def build(folder: Path, digest: str) -> None:
     """Configure, compile and install every package, then write the record.
 
@@ -211,10 +178,6 @@ def build(folder: Path, digest: str) -> None:
         StageFailed: if a command fails.
     """
     cores = len(os.sched_getaffinity(0))
-    for package in PACKAGES:
-        (folder / f"{package}.log").unlink(missing_ok=True)
-        # CMake refuses a cache of another interpreter or source folder.
-        (folder / package / "CMakeCache.txt").unlink(missing_ok=True)
     # CMake configures on one core, so configure the packages in parallel; compilers use all cores.
     with ThreadPoolExecutor(max_workers=min(cores, len(PACKAGES))) as pool:
         list(pool.map(lambda package: _configure(folder, package), PACKAGES))
@@ -253,6 +216,10 @@ def _configure(folder: Path, package: str) -> None:
 
 def _stage(stage: str, command: list[str], log: Path) -> None:
     started = time.monotonic()
+    # Other ROS installations must not matter. The wheels set BOOTSTRAPPED in a Python that has
+    # their library path, and its children inherit it, so it may come from another environment.
+    foreign = ("CMAKE_PREFIX_PATH", "DESTDIR", "PYTHONHOME", "PYTHONPATH", BOOTSTRAPPED)
+    kept = {name: value for name, value in os.environ.items() if name not in foreign}
     with log.open("ab") as out:
         out.write(f"$ {shlex.join(command)}\n".encode())
         out.flush()
@@ -262,20 +229,11 @@ def _stage(stage: str, command: list[str], log: Path) -> None:
             stdin=subprocess.DEVNULL,
             stdout=out,
             stderr=subprocess.STDOUT,
-            env=_environ(),
+            env={**kept, "AMENT_PREFIX_PATH": str(PREFIX)},
         )
     if result.returncode != 0:
         raise StageFailed(stage, log)
     print(f"{stage}: {time.monotonic() - started:.1f} s", flush=True)
-
-
-def _environ() -> dict[str, str]:
-    """Return the environment of a stage, without variables of other ROS installations."""
-    # The wheels set BOOTSTRAPPED in a Python that has their library path. Child processes
-    # inherit it, so it may come from another environment's wheels.
-    foreign = ("CMAKE_PREFIX_PATH", "DESTDIR", "PYTHONHOME", "PYTHONPATH", BOOTSTRAPPED)
-    kept = {name: value for name, value in os.environ.items() if name not in foreign}
-    return {**kept, "AMENT_PREFIX_PATH": str(PREFIX)}
 
 
 def _remove_installed(package: str) -> None:
