@@ -11,14 +11,8 @@ import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
-from demandops.base.errors import (
-    DemandOpsError,
-    InvalidInput,
-    NotReached,
-    ShuttingDown,
-    TurnedDown,
-    Withdrawn,
-)
+from demandops.base import errors
+from demandops.base.errors import DemandOpsError, InvalidInput, Withdrawn
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.cluster.health import Level
@@ -40,8 +34,8 @@ from demandops_ros.ros_process import ExecutorThread
 # The first kind that fits counts.
 _CODES: tuple[tuple[type[BaseException], str], ...] = (
     (Withdrawn, "withdrawn"),
-    (TurnedDown, "turned-down"),
-    (ShuttingDown, "shutting-down"),
+    (errors.TurnedDown, "turned-down"),
+    (errors.ShuttingDown, "shutting-down"),
     (DemandOpsError, "state-repo"),
     (BaseException, "fault"),
 )
@@ -117,7 +111,7 @@ def _code(outcome: Receipt | BaseException) -> str:
         return "ok"
     if isinstance(outcome, InvalidInput):
         return outcome.faults[0].code
-    if isinstance(outcome, NotReached):
+    if isinstance(outcome, errors.NotReached):
         return f"not-{outcome.level}"
     return next(code for kind, code in _CODES if isinstance(outcome, kind))
 

@@ -30,13 +30,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.task import Future
 
-from demandops_ros.actions import (
-    DEEP_QOS,
-    DemandAdapter,
-    DeploymentRequestAdapter,
-    LastingResults,
-    OtherServers,
-)
+from demandops_ros import actions
+from demandops_ros.actions import DeploymentRequestAdapter, LastingResults
 
 # ---- the bookkeeping over ROS 2, by a ROS service and on a latched topic ----
 #
@@ -134,7 +129,7 @@ class DemandNode(Node):  # type: ignore[misc]
         )
         self._servers = [
             self._serve(DeploymentRequestAdapter(), action_name),
-            self._serve(DemandAdapter(), demand_action_name),
+            self._serve(actions.DemandAdapter(), demand_action_name),
         ]
         self.create_service(
             GetBookkeeping,
@@ -149,7 +144,7 @@ class DemandNode(Node):  # type: ignore[misc]
         self._has_news.set()
         generator.on_publish(lambda config: self._has_news.set())
         REAL.keep_running("bookkeeping-topic", self._publish_bookkeeping)
-        self._others = OtherServers(self, (action_name, demand_action_name))
+        self._others = actions.OtherServers(self, (action_name, demand_action_name))
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_timer(_PERIOD_S, self._report)
 
@@ -163,10 +158,10 @@ class DemandNode(Node):  # type: ignore[misc]
             handle_accepted_callback=self._accepted,
             cancel_callback=self._cancel,
             callback_group=ReentrantCallbackGroup(),  # goals arrive while others are journaled
-            goal_service_qos_profile=DEEP_QOS,
-            result_service_qos_profile=DEEP_QOS,
-            cancel_service_qos_profile=DEEP_QOS,
-            feedback_pub_qos_profile=DEEP_QOS,
+            goal_service_qos_profile=actions.DEEP_QOS,
+            result_service_qos_profile=actions.DEEP_QOS,
+            cancel_service_qos_profile=actions.DEEP_QOS,
+            feedback_pub_qos_profile=actions.DEEP_QOS,
         )
 
     def close(self) -> None:

@@ -7,13 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import click
+from demandops.base import settings
 from demandops.base.quoting import quoted
-from demandops.base.settings import (
-    DEFAULT_ACTION_NAME,
-    DEFAULT_DEMAND_ACTION_NAME,
-    QUEUE_LIMIT,
-    REQUESTER_QUEUE_LIMIT,
-)
 from demandops.model.config.config import (
     BROKERS_FILE,
     DOMAINS_FILE,
@@ -130,13 +125,13 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
 
 _CHOICES = {"answer": ANSWER_LEVELS, "log_level": ("debug", "info", "warn", "error", "fatal")}
 DEFAULTS: dict[str, Any] = {
-    "action_name": DEFAULT_ACTION_NAME,
-    "demand_action_name": DEFAULT_DEMAND_ACTION_NAME,
+    "action_name": settings.DEFAULT_ACTION_NAME,
+    "demand_action_name": settings.DEFAULT_DEMAND_ACTION_NAME,
     "answer": ANSWER_LEVELS[0],
     "answer_timeout": 120.0,
     "state_repo": "",
     "fetch_interval": DEFAULT_INTERVAL,
-    "requester_queue_limit": REQUESTER_QUEUE_LIMIT,
+    "requester_queue_limit": settings.REQUESTER_QUEUE_LIMIT,
     "log_level": "info",
 }
 _DESCRIPTIONS = {
@@ -153,7 +148,7 @@ _DESCRIPTIONS = {
 }
 
 _SECONDS = [FloatingPointRange(from_value=0.001, to_value=86_400.0)]
-_COUNT = [IntegerRange(from_value=1, to_value=QUEUE_LIMIT, step=1)]
+_COUNT = [IntegerRange(from_value=1, to_value=settings.QUEUE_LIMIT, step=1)]
 _RANGES: dict[str, Any] = {
     "answer_timeout": {"floating_point_range": _SECONDS},
     "requester_queue_limit": {"integer_range": _COUNT},

@@ -7,15 +7,8 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from demandops.base.errors import (
-    DemandOpsError,
-    Fault,
-    ShuttingDown,
-    StateRepoError,
-    Unsound,
-    Withdrawn,
-    internal,
-)
+from demandops.base import errors
+from demandops.base.errors import DemandOpsError, StateRepoError, Unsound
 from demandops.base.runtime import Runtime
 from demandops.decide.decision import Decision
 from demandops.model.config.config import Config
@@ -33,18 +26,10 @@ from demandops.serve.approvals.approvals import Approvals, Result
 from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Ticket
+from demandops.serve.timing import timers
 from demandops.serve.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
 from demandops.serve.timing.own_work import OwnWork
-from demandops.serve.timing.timers import (
-    LIMIT_LOCAL,
-    LIMIT_REMOTE,
-    LONGEST_EVALUATION_S,
-    Backoff,
-    Heartbeat,
-    PollTimer,
-    Rest,
-    may_take_long,
-)
+from demandops.serve.timing.timers import LONGEST_EVALUATION_S, Backoff, PollTimer
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 # ---- whether the remote can be reached, for logs and diagnostics ----
@@ -102,10 +87,10 @@ class RemoteMonitor:
 class FaultLog:
     def __init__(self, repository: StateRepository) -> None:
         self._repository = repository
-        self._logged: frozenset[Fault] = frozenset()
+        self._logged: frozenset[errors.Fault] = frozenset()
         self._warned_of_signers = False
 
-    def log_changes(self, problems: Iterable[Fault]) -> None:
+    def log_changes(self, problems: Iterable[errors.Fault]) -> None:
         current = list(dict.fromkeys(problems))
         for problem in current:
             if problem not in self._logged:
@@ -152,7 +137,7 @@ class Worker:
         approvals: Approvals,
         with_targets: bool,
         fetch_interval: float,
-        heartbeat: Heartbeat,
+        heartbeat: timers.Heartbeat,
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
@@ -165,12 +150,12 @@ class Worker:
         self._lease_expiry = LeaseExpiry(repository.runtime)
         self._own_work = OwnWork(repository.runtime)
         self._ahead = ReadAhead()
-        self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
+        self._batch_limit = timers.LIMIT_LOCAL if repository.always_current else timers.LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
         self._log = FaultLog(repository)
         self._ends_soon = self._runtime.event()
-        self._rest = Rest(repository.runtime)
+        self._rest = timers.Rest(repository.runtime)
         self._log.warn_if_unsigned(snapshot)
 
     # ---- from any thread ----
@@ -226,7 +211,7 @@ class Worker:
         if isinstance(error, Unsound):  # the process must end; the next one reads the journal
             self._demands.end(error)
             raise error
-        if isinstance(error, ShuttingDown):
+        if isinstance(error, errors.ShuttingDown):
             self._demands.fail(batch, error, keep=True)
             return
         # an expected error is in the answers to the demands, so only other errors are recorded
@@ -242,7 +227,7 @@ class Worker:
             self._rest.begin()
             self._timer.finished(reached=False)
         if not isinstance(error, DemandOpsError):
-            error = internal(error)
+            error = errors.internal(error)
         self._demands.fail(batch, error)
 
     def _seconds_until_due(self) -> float:
@@ -301,7 +286,7 @@ class Worker:
     def _require_not_ending(self) -> None:
         if self._ends_soon.is_set():
             reason = self._demands.blocked or "the generator stops"
-            raise ShuttingDown(
+            raise errors.ShuttingDown(
                 f"{reason}; the demand stays in the journal and is resumed at the next start"
             )
 
@@ -328,7 +313,7 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
-            if number and (is_late or may_take_long(ticket.goal)):
+            if number and (is_late or timers.may_take_long(ticket.goal)):
                 part, left = part[:number], part[number:] + left
                 break
             self._approvals.withdraw_released(results, ticket, commits.head.state)
@@ -384,7 +369,7 @@ class Worker:
         except PushDenied as error:
             # a withdrawn demand gets its answer whatever the remote says
             results[independent:] = [
-                (ticket, result if isinstance(result, Withdrawn) else error)
+                (ticket, result if isinstance(result, errors.Withdrawn) else error)
                 for ticket, result in results[independent:]
             ]
             self.remote.record_push_denied(str(error))

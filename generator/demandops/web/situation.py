@@ -13,14 +13,10 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.cluster import rollouts
 from demandops.cluster.health import Health, Target
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import denied_release, plan
-from demandops.decide.planning.release_keys import (
-    ReleaseKey,
-    affected_keys,
-    all_keys,
-    keys_of_claims,
-)
+from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override
@@ -139,7 +135,7 @@ class CommitState:
         differing = subject_before.keys() ^ subject_now.keys()
         subjects = [*dict.fromkeys(subject_before.get(id) or subject_now[id] for id in differing)]
         changes = changes_on(old.ledger, new.ledger, subjects)
-        keys: set[ReleaseKey] = {*affected_keys(old, new, changes)}
+        keys: set[ReleaseKey] = {*release_keys.affected_keys(old, new, changes)}
         kept_before, kept_now = old.ledger.kept.steps, new.ledger.kept.steps
         keys |= {
             ServiceKey.of(instance)
@@ -150,7 +146,7 @@ class CommitState:
             # the page shows requesters, but `affected_keys` omits a release whose file stays the
             # same although its requesters changed
             if was and now and (was.requesters, was.partial) != (now.requesters, now.partial):
-                keys.update(keys_of_claims(self.active, [now]))
+                keys.update(release_keys.keys_of_claims(self.active, [now]))
         planned = before.planned | dict(self._with_other_claims(before, subjects))
         for key in keys:
             planned.pop(key, None)
@@ -203,7 +199,7 @@ class CommitState:
         the client of a connection carries no topic.
         """
         if self._planned is None:
-            self._planned = {key: self._plan(key) for key in all_keys(self.state)}
+            self._planned = {key: self._plan(key) for key in release_keys.all_keys(self.state)}
         return self._planned
 
     @cached_property

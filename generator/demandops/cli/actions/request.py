@@ -21,12 +21,8 @@ from demandops.base.errors import (
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
-from demandops.cli.actions.ledger_change import (
-    await_answer,
-    print_consequences,
-    print_refusal,
-    started_generator,
-)
+from demandops.cli.actions import ledger_change
+from demandops.cli.actions.ledger_change import started_generator
 from demandops.cli.json_output import Json, faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
@@ -185,7 +181,7 @@ def _book(
             for document in documents:
                 answers.append(_submitted(generator, document, wait))
             for done, answer in enumerate(answers, start=1):
-                await_answer(answer)
+                ledger_change.await_answer(answer)
                 report(done, len(documents))
     except KeyboardInterrupt:
         if not answers:
@@ -262,7 +258,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
                 console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
                 for rule in decision.approval:
                     console().print(f"  needs approval: {rule} requires it")
-                print_consequences(decision)
+                ledger_change.print_consequences(decision)
             more: Json = {
                 "warnings": decision.warnings,
                 "not_held": decision.changes.not_held,
@@ -282,7 +278,7 @@ def _print_rows(rows: list[Json], documents: list[Document], dry_run: bool) -> N
         if not dry_run and _is_unanswered(row):
             errors.print(f"{title} has no answer yet")
         elif row["outcome"] == "refused":
-            print_refusal(f"{title} refused", row["faults"])
+            ledger_change.print_refusal(f"{title} refused", row["faults"])
         elif not dry_run:
             told, proposal = f"{row['outcome']} in {row['commit']}", row.get("proposal")
             if proposal is not None:

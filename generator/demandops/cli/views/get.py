@@ -17,18 +17,8 @@ from demandops.base.naming import SubjectKind
 from demandops.base.quoting import json_escaped, quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
-from demandops.cli.json_output import (
-    Json,
-    claim_data,
-    lease_data,
-    output_formats,
-    override_data,
-    print_json,
-    release_data,
-    show,
-    time_data,
-    time_text,
-)
+from demandops.cli import json_output
+from demandops.cli.json_output import Json, claim_data, time_data, time_text
 from demandops.cli.output import (
     at_option,
     errors,
@@ -239,7 +229,7 @@ class _Demands(Kind):
                 **asdict(demand),
                 "state": _state_now(demand.state, demand.lease, source.now),
                 "since": time_data(demand.since),
-                "lease": lease_data(demand.lease),
+                "lease": json_output.lease_data(demand.lease),
             }
             for demand in demand_lists.demands(source.snapshot.state)
         ]
@@ -333,9 +323,9 @@ class _Overrides(Kind):
     def items(self, source: Source) -> list[Json]:
         return [
             {
-                **override_data(entry.override),
+                **json_output.override_data(entry.override),
                 "state": override_state(entry, source.snapshot.state, source.not_rendered),
-                "releases": [release_data(release) for release in entry.releases],
+                "releases": [json_output.release_data(release) for release in entry.releases],
                 "claims": [claim_data(claim) for claim in entry.claims],
             }
             for entry in override_report(source.snapshot.state, source.now)
@@ -486,7 +476,7 @@ def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
     is_flag=True,
     help="Print the list again when a new commit or proposal changes it.",
 )
-@output_formats("text", "wide", "name", "json", "yaml")
+@json_output.output_formats("text", "wide", "name", "json", "yaml")
 def get(
     kind: str,
     names: tuple[str, ...],
@@ -594,14 +584,14 @@ def _print_list(kind: str, source: Source, items: list[Json], output: str, watch
     if output == "json" and watch:
         click.echo(json_escaped(json.dumps(plain, ensure_ascii=False)))
     elif output == "json":
-        print_json(plain)
+        json_output.print_json(plain)
     elif output == "yaml":
         click.echo(("---\n" if watch else "") + strict_yaml.dump(plain), nl=False)
     elif output == "name":
-        show(output, None, [item["name"] for item in items])
+        json_output.show(output, None, [item["name"] for item in items])
     else:
         table = KINDS[kind].table(items, source.now, wide=output == "wide")
         table = replace(table, empty=f"no {kind}", styles=_COLORS)
         when = f"{source.now:%H:%M:%S} UTC, " if watch else ""
         note = painted(f"{when}at {commit[:10]}", "dim")
-        show(output, None, [table, *([note] if watch else [])])
+        json_output.show(output, None, [table, *([note] if watch else [])])

@@ -11,18 +11,8 @@ from demandops.base.errors import StateRepoError, closest, suggestion
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import (
-    Json,
-    claim_data,
-    commit_data,
-    output_option,
-    override_data,
-    place_data,
-    release_data,
-    show,
-    subject_data,
-    time_text,
-)
+from demandops.cli import json_output
+from demandops.cli.json_output import Json, commit_data, override_data, release_data, time_text
 from demandops.cli.output import at_option, busy
 from demandops.cli.target import names_of, state_repo_option
 from demandops.cli.views.diff import loaded
@@ -353,7 +343,7 @@ _MOST_CARRIED_OUT = 5
     show_default=True,
     help="List at most this many of the commits that changed the object.",
 )
-@output_option
+@json_output.output_option
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
@@ -396,7 +386,7 @@ def why(
                 answer["state"] = "not rendered yet"
             answer["not_rendered"] = not_rendered
             answer |= {"file": match.path or None, **_commits(repo, snapshot, match, most)}
-    show(output, answer, lines_of(answer))
+    json_output.show(output, answer, lines_of(answer))
 
 
 def _described(world: World, match: Match) -> Json:
@@ -406,7 +396,7 @@ def _described(world: World, match: Match) -> Json:
         claims = release_causes.claims_behind(without_suspended(world).ledger, release)
         return {
             "runs": True,
-            **place_data(release),
+            **json_output.place_data(release),
             **_claims(claims, world),
             "shaped_by": [
                 {"file": file, "entry": entry or None, "what": what}
@@ -425,7 +415,7 @@ def _described(world: World, match: Match) -> Json:
         return {
             "runs": any(suspended_by(claim, world) is None for claim in claims),
             "what": what,
-            "subject": subject_data(match.subject),
+            "subject": json_output.subject_data(match.subject),
             **_claims(claims, world),
             "releases": [release_data(release) for release in releases],
         }
@@ -437,7 +427,7 @@ def _described(world: World, match: Match) -> Json:
         release, override = denied
         return {
             "runs": False,
-            **place_data(release),
+            **json_output.place_data(release),
             "denied_by": override_data(override, ("deny",)),
         }
     if match.kind == "demand":
@@ -500,7 +490,7 @@ def _claims(claims: list[Claim], world: World) -> Json:
         suspended = suspended_by(claim, world)
         kept = world.config.overrides.get(claim.keeping_override or "")
         rows.append(
-            claim_data(claim)
+            json_output.claim_data(claim)
             | {
                 "release_by": release_causes.how_to_release(claim),
                 "overdue": claim.lease is not None and claim.lease.has_ended(REAL.now()),

@@ -16,14 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
-from demandops.base.errors import (
-    DemandOpsError,
-    InvalidInput,
-    Refused,
-    ShuttingDown,
-    Withdrawn,
-    fault,
-)
+from demandops.base import errors
+from demandops.base.errors import DemandOpsError, InvalidInput, Refused, fault
 from demandops.base.quoting import quoted
 from demandops.base.settings import PROPOSAL_LIMIT
 from demandops.cluster.rollouts import targets_of_decision
@@ -128,7 +122,7 @@ class Approvals:
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
             if request and isinstance(result, Decision) and releases(request, [result.request]):
-                earlier[index] = (ticket, Withdrawn(RELEASED))
+                earlier[index] = (ticket, errors.Withdrawn(RELEASED))
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
@@ -165,7 +159,7 @@ class Approvals:
             replaces = next((old.record.as_replaced() for old in replaced), "")
             proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
         if not self._demands.propose(ticket, proposal.record):
-            self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
+            self._demands.fail([ticket], errors.Withdrawn(TAKEN_BACK))
             return
         self._proposals[proposal.branch] = proposal
         proposal.tickets.append(ticket)
@@ -400,7 +394,7 @@ class Approvals:
         self._demands.wake()
 
     def suspend(self) -> None:
-        error = ShuttingDown("the demand awaits approval, and is resumed at the next start")
+        error = errors.ShuttingDown("the demand awaits approval, and is resumed at the next start")
         for proposal in self._proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)
         self._proposals = {}
