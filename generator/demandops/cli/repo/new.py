@@ -143,7 +143,8 @@ def application(  # noqa: PLR0913 - as many as options
             f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
             f"{config.file_of(DOMAINS_FILE, domain.name)}",
         )
-    files = scaffold.application_files(plan, config, new_repo.files_of_library(LIBRARY_FOLDER))
+    library, texts = new_repo.files_of_library(LIBRARY_FOLDER), _texts("application")
+    files = scaffold.application_files(plan, config, library, texts)
     _lay_down(directory, existing, files, output, then)
 
 
@@ -234,10 +235,14 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
     Examples:
       demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:f
     """
-    folder = data_folder("templates") / "scaffold" / "image"
-    texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
     then = ["keep .github/workflows/image.yml or .gitlab-ci.yml, whichever you need"]
-    _write_files(directory, scaffold.image_files(name, repository, url, texts), output, then)
+    files = scaffold.image_files(name, repository, url, _texts("image"))
+    _write_files(directory, files, output, then)
+
+
+def _texts(what: str) -> Files:
+    folder = data_folder("templates") / "scaffold" / what
+    return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
