@@ -28,7 +28,7 @@ from demandops.cli.output import (
     warn_of,
     warn_of_not_rendered,
 )
-from demandops.cli.table import Cell, Column, Table
+from demandops.cli.table import CellOf, Column, Table, column, joined, table_of
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.model.config.base_model import duration_text, relative
 from demandops.model.config.override import parse_time
@@ -49,7 +49,6 @@ from demandops.views.release_causes import override_report, override_state
 # ---- the kinds of things: their data, columns and filters ----
 
 Values = Callable[[Json], Iterable[str]]
-CellOf = Callable[[Json, datetime], Cell]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,15 +72,7 @@ class Kind(ABC):
 
     def table(self, items: Iterable[Json], now: datetime, *, wide: bool = False) -> Table:
         shown = [*self.columns, *(self.wide if wide else ())]
-        rows = [[cell_of(item, now) for _, cell_of in shown] for item in items]
-        return Table([column for column, _ in shown], rows, whole=wide)
-
-
-def _column(
-    title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False
-) -> tuple[Column, CellOf]:
-    cell_of = cell if callable(cell) else lambda item, now: item[cell] or ""
-    return Column(title, rank, wraps), cell_of
+        return table_of(shown, items, now, whole=wide)
 
 
 def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
@@ -125,10 +116,6 @@ def _holds(item: Json, now: datetime) -> list[str]:
     return [*item["applications"], *item["connections"]]
 
 
-def _joined(key: str) -> CellOf:
-    return lambda item, now: ", ".join(item[key])
-
-
 def _ago(key: str) -> CellOf:
     return lambda item, now: relative(parse_time(item[key]), now) if item[key] else ""
 
@@ -150,17 +137,17 @@ _COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _ke
 
 class _Claims(Kind):
     columns = (
-        _column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
-        _column("Requesters", _joined("requesters"), 1, wraps=True),
-        _column("State", "state", 2),
-        _column("Since", _ago("since"), 3),
-        _column("Lease", _lease_text, 4, wraps=True),
-        _column("Demand", "demand", 5),
+        column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
+        column("Requesters", joined("requesters"), 1, wraps=True),
+        column("State", "state", 2),
+        column("Since", _ago("since"), 3),
+        column("Lease", _lease_text, 4, wraps=True),
+        column("Demand", "demand", 5),
     )
     wide = (
-        _column("Request", "request"),
-        _column("Since (UTC)", _utc("since")),
-        _column("File", "file"),
+        column("Request", "request"),
+        column("Since (UTC)", _utc("since")),
+        column("File", "file"),
     )
     filters = _COMMON | {
         "application": lambda item: (
@@ -185,13 +172,13 @@ class _Claims(Kind):
 
 class _Connections(Kind):
     columns = (
-        _column("Connection", "name"),
-        _column("Type", "type", 2),
-        _column("From", "source", 1),
-        _column("To", "target", 1),
-        _column("Requesters", _joined("requesters"), 3, wraps=True),
+        column("Connection", "name"),
+        column("Type", "type", 2),
+        column("From", "source", 1),
+        column("To", "target", 1),
+        column("Requesters", joined("requesters"), 3, wraps=True),
     )
-    wide = (_column("Topics", lambda item, now: list(item["topics"])),)
+    wide = (column("Topics", lambda item, now: list(item["topics"])),)
     filters = _COMMON | {"node": lambda item: [item["source"], item["target"]]}
 
     def items(self, source: Source) -> list[Json]:
@@ -208,18 +195,18 @@ class _Connections(Kind):
 
 class _Demands(Kind):
     columns = (
-        _column("Demand", "name"),
-        _column("State", "state", 3),
-        _column("Requesters", _joined("requesters"), 1, wraps=True),
-        _column("Holds", _holds, 2),
-        _column("Since", _ago("since"), 5),
-        _column("Lease", _lease_text, 4, wraps=True),
+        column("Demand", "name"),
+        column("State", "state", 3),
+        column("Requesters", joined("requesters"), 1, wraps=True),
+        column("Holds", _holds, 2),
+        column("Since", _ago("since"), 5),
+        column("Lease", _lease_text, 4, wraps=True),
     )
     wide = (
-        _column("Requests", "requests"),
-        _column("Nodes", "nodes"),
-        _column("Since (UTC)", _utc("since")),
-        _column("Suspended by", "suspended_by"),
+        column("Requests", "requests"),
+        column("Nodes", "nodes"),
+        column("Since (UTC)", _utc("since")),
+        column("Suspended by", "suspended_by"),
     )
     filters = _COMMON | {"application": _key("applications")}
 
@@ -237,10 +224,10 @@ class _Demands(Kind):
 
 class _Leases(Kind):
     columns = (
-        _column("Demand", "name"),
-        _column("Requesters", _joined("requesters"), 2, wraps=True),
-        _column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
-        _column(
+        column("Demand", "name"),
+        column("Requesters", joined("requesters"), 2, wraps=True),
+        column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
+        column(
             "Ends",
             lambda item, now: _lease_text(item, now).removeprefix("ends "),
             1,
@@ -248,8 +235,8 @@ class _Leases(Kind):
         ),
     )
     wide = (
-        _column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
-        _column("Holds", _holds),
+        column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
+        column("Holds", _holds),
     )
     filters = _COMMON | {"application": _key("applications")}
 
@@ -261,23 +248,23 @@ class _Leases(Kind):
 
 class _Nodes(Kind):
     columns = (
-        _column("Node", "name"),
-        _column("Type", "type", 2),
-        _column("Domain", "domain", 3),
-        _column("Cluster", "cluster", 5),
-        _column("State", _node_state, 1),
-        _column("Releases", lambda item, now: str(len(item["releases"])), 4),
-        _column("Requesters", _joined("requesters"), 6, wraps=True),
+        column("Node", "name"),
+        column("Type", "type", 2),
+        column("Domain", "domain", 3),
+        column("Cluster", "cluster", 5),
+        column("State", _node_state, 1),
+        column("Releases", lambda item, now: str(len(item["releases"])), 4),
+        column("Requesters", joined("requesters"), 6, wraps=True),
     )
     wide = (
-        _column("Capabilities", "capabilities"),
-        _column(
+        column("Capabilities", "capabilities"),
+        column(
             "Properties",
             lambda item, now: [
                 f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
             ],
         ),
-        _column("Names of releases", "releases"),
+        column("Names of releases", "releases"),
     )
     filters = _COMMON | {
         "node": _key("name"),
@@ -295,12 +282,12 @@ class _Nodes(Kind):
 
 class _Overrides(Kind):
     columns = (
-        _column("Override", "name"),
-        _column("State", "state", 1),
-        _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
-        _column("Until", _ago("until"), 3),
-        _column("Owner", "owner", 4),
-        _column(
+        column("Override", "name"),
+        column("State", "state", 1),
+        column("Does", lambda item, now: effect_words(item), 2, wraps=True),
+        column("Until", _ago("until"), 3),
+        column("Owner", "owner", 4),
+        column(
             "To",
             lambda item, now: [
                 *dict.fromkeys(release["name"] for release in item["releases"]),
@@ -308,11 +295,11 @@ class _Overrides(Kind):
             ],
             5,
         ),
-        _column("Reason", "reason", 6, wraps=True),
+        column("Reason", "reason", 6, wraps=True),
     )
     wide = (
-        _column("Priority", lambda item, now: str(item["priority"])),
-        _column("Until (UTC)", _utc("until")),
+        column("Priority", lambda item, now: str(item["priority"])),
+        column("Until (UTC)", _utc("until")),
     )
     filters = _COMMON | {
         "node": lambda item: [release["node"] for release in item["releases"]],
@@ -334,14 +321,14 @@ class _Overrides(Kind):
 
 class _Proposals(Kind):
     columns = (
-        _column("Branch", "branch"),
-        _column("Commit", lambda item, now: item["commit"][:10]),
-        _column("Requesters", _joined("requesters"), 1, wraps=True),
-        _column("Since", _ago("since"), 2),
-        _column("What", "summary", 3, wraps=True),
-        _column("Link", "link", 5),
+        column("Branch", "branch"),
+        column("Commit", lambda item, now: item["commit"][:10]),
+        column("Requesters", joined("requesters"), 1, wraps=True),
+        column("Since", _ago("since"), 2),
+        column("What", "summary", 3, wraps=True),
+        column("Link", "link", 5),
     )
-    wide = (_column("Demands", "demands"), _column("Since (UTC)", _utc("since")))
+    wide = (column("Demands", "demands"), column("Since (UTC)", _utc("since")))
     filters: ClassVar[Mapping[str, Values]] = {"requester": _key("requesters")}
 
     def items(self, source: Source) -> list[Json]:
@@ -372,19 +359,19 @@ class _Proposals(Kind):
 
 class _Services(Kind):
     columns = (
-        _column("Service", "name"),
-        _column("Kind", "service", 4),
-        _column("Version", lambda item, now: version_lines(item), 5),
-        _column("Node", "node", 1),
-        _column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
-        _column("Requesters", _joined("requesters"), 2, wraps=True),
+        column("Service", "name"),
+        column("Kind", "service", 4),
+        column("Version", lambda item, now: version_lines(item), 5),
+        column("Node", "node", 1),
+        column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
+        column("Requesters", joined("requesters"), 2, wraps=True),
     )
     wide = (
-        _column(
+        column(
             "Takes in",
             lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
         ),
-        _column(
+        column(
             "Parameters",
             lambda item, now: [f"{name} = {value}" for name, value in item["parameters"].items()],
         ),
@@ -420,19 +407,10 @@ KINDS: dict[str, Kind] = {
 FILTERS = ("node", "requester", "application", "domain")
 _POLL_S = 1.0
 _POLL_REMOTE_S = 10.0  # each look is a fetch
+_OF_NOTE = ("drained", "expired", "held back", "matches nothing", "not rendered yet", "overdue")
 _COLORS = {
-    "drained": "yellow",
-    "expired": "yellow",
-    "held": "green",
-    "in force": "green",
-    "held back": "yellow",
-    "matches nothing": "yellow",
-    "not in the inventory": "red",
-    "not rendered yet": "yellow",
-    "overdue": "yellow",
-    "partly suspended": "yellow",
-    "suspended": "yellow",
-    "waiting": "yellow",
+    **dict.fromkeys((*_OF_NOTE, "partly suspended", "suspended", "waiting"), "yellow"),
+    **{"held": "green", "in force": "green", "not in the inventory": "red"},
 }
 
 

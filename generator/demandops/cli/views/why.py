@@ -38,14 +38,8 @@ from demandops.views.release_causes import affected_releases, override_report
 # ---- the object that has the given name ----
 
 KINDS = (
-    "release",
-    "application",
-    "connection",
-    "demand",
-    "node",
-    "appdef",
-    "requester",
-    "override",
+    *("release", "application", "connection", "demand"),
+    *("node", "appdef", "requester", "override"),
 )
 _MOST_LISTED = 8
 
