@@ -42,14 +42,11 @@ class ClusterWatch:
             for name, access in clusters.items()
             if access.kubeconfig
         }
+        self.clusters = frozenset(self._caches)
         self._domains = set[ClusterDomain]()
         self._states: dict[str, str] = {}
         self._unhealthy_from: dict[str, float] = {}
         self._changes = deque[HealthChange](maxlen=_KEPT)
-
-    @property
-    def clusters(self) -> frozenset[str]:
-        return frozenset(self._caches)
 
     @property
     def changes(self) -> tuple[HealthChange, ...]:

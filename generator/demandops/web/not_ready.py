@@ -28,13 +28,8 @@ Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting
 
 # The color of each kind of cause, in the order in which the view lists the kinds.
 KINDS: dict[str, str] = {
-    "unread": "bad",
-    "failing": "bad",
-    "invalid": "bad",
-    "suspended": "bad",
-    "decision": "busy",
-    "waiting": "busy",
-    "starting": "busy",
+    **dict.fromkeys(("unread", "failing", "invalid", "suspended"), "bad"),
+    **dict.fromkeys(("decision", "waiting", "starting"), "busy"),
 }
 
 # A function that returns the newest commit that changed a file or folder, or None.

@@ -17,8 +17,6 @@ from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import denied_release, plan
 from demandops.decide.planning.release_keys import ReleaseKey
-from demandops.decide.state import State
-from demandops.model.config.config import Config
 from demandops.model.config.override import Override
 from demandops.model.demand.claim import Claim
 from demandops.model.ledger.ledger import World, changes_on
@@ -94,6 +92,8 @@ class CommitState:
         self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
     ) -> None:
         self.snapshot, self.entry, self.problems = snapshot, entry, problems
+        self.commit, self.state = str(snapshot.commit), snapshot.state
+        self.config = snapshot.state.config
         # The rows of each list that was shown, by the list's name.
         self.rows: dict[str, ReusableRows] = {}
         self._entries: list[Entry] | None = None
@@ -103,18 +103,6 @@ class CommitState:
         self.last_changes: dict[str, LogEntry | None] = {}
         # The files that a generator must still write or remove; None until they are looked up.
         self.not_rendered: frozenset[str] | None = None
-
-    @property
-    def commit(self) -> str:
-        return str(self.snapshot.commit)
-
-    @property
-    def state(self) -> State:
-        return self.snapshot.state
-
-    @property
-    def config(self) -> Config:
-        return self.state.config
 
     @cached_property
     def active(self) -> World:
