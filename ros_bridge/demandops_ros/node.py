@@ -44,7 +44,7 @@ def _commit_and_json(snapshot: Snapshot) -> tuple[str, str]:
 
 
 # A node that starts later gets the last message too.
-_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 _SHORTEST_PAUSE_S = 1.0
 # The larger the ledger, the longer it takes to compute the bookkeeping. So this takes at most a
 # 20th of the time, and changes during a pause share one message.
@@ -138,7 +138,7 @@ class DemandNode(Node):  # type: ignore[misc]
             callback_group=ReentrantCallbackGroup(),
         )
         self._bookkeeping_topic = self.create_publisher(
-            BookkeepingMessage, "~/bookkeeping", _LATCHED
+            BookkeepingMessage, "~/bookkeeping", LATCHED
         )
         self._has_news, self._is_closed = REAL.event(), REAL.event()
         self._has_news.set()

@@ -16,7 +16,6 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros import ros_process
 
@@ -82,7 +81,19 @@ class ParameterSetter:
 
     def want(self, parameters: Mapping[str, Any]) -> None:
         # any thread may call this; TypeError or ValueError names a value that ROS cannot carry
-        wanted = [_parameter(name, value).to_parameter_msg() for name, value in parameters.items()]
+        wanted = []
+        for name, value in parameters.items():
+            for number in value if isinstance(value, list) else [value]:
+                if isinstance(number, int) and not -_LARGEST - 1 <= number <= _LARGEST:
+                    raise ValueError(
+                        f"parameter {name}: {quoted(str(number))} is out of ROS's range; write a "
+                        f"number between {-_LARGEST - 1} and {_LARGEST}"
+                    )
+            try:
+                parameter = Parameter(name, value=value)
+            except (TypeError, ValueError) as error:
+                raise type(error)(f"parameter {name}: {error}") from None
+            wanted.append(parameter.to_parameter_msg())
         with self._lock:
             self._wanted, self._version = wanted, self._version + 1
         self._changed.trigger()
@@ -126,19 +137,6 @@ class ParameterSetter:
         self._call.add_done_callback(take_answer)
 
 
-def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401
-    for number in value if isinstance(value, list) else [value]:
-        if isinstance(number, int) and not -_LARGEST - 1 <= number <= _LARGEST:
-            raise ValueError(
-                f"parameter {name}: {quoted(str(number))} is out of ROS's range; write a number "
-                f"between {-_LARGEST - 1} and {_LARGEST}"
-            )
-    try:
-        return Parameter(name, value=value)
-    except (TypeError, ValueError) as error:
-        raise type(error)(f"parameter {name}: {error}") from None
-
-
 # ---- the command ----
 
 # The parameters and their defaults. The names are those of the reference's k8s_configmap_watcher,
@@ -174,10 +172,7 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     Examples:
       demandops parameter-sync --ros-args --params-file fusion.yaml
     """
-    with (
-        ros_process.stop_signals() as wait_for_signal,
-        ros_process.started(ctx.args, SignalHandlerOptions.NO),
-    ):
+    with ros_process.stop_signals() as wait_for_signal, ros_process.started(ctx.args):
         node = Node("parameter_sync")
         ros_process.log_to(get_logger("demandops"), "info")
         given: dict[str, str] = {

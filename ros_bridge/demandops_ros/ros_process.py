@@ -94,9 +94,8 @@ class RosLogHandler(logging.Handler):
 
 
 @contextmanager
-def started(
-    arguments: Sequence[str], signals: SignalHandlerOptions = SignalHandlerOptions.ALL
-) -> Iterator[list[str]]:
+def started(arguments: Sequence[str]) -> Iterator[list[str]]:
+    # without ROS's signal handlers, because each command handles the signals
     ros_args = list(arguments)
     if ros_args and ros_args[0] != "--ros-args":
         raise click.UsageError(
@@ -106,7 +105,8 @@ def started(
         # ROS's log library does not start in a container without a home folder
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     try:
-        rclpy.init(args=["demandops", *ros_args], signal_handler_options=signals)
+        no_signals = SignalHandlerOptions.NO
+        rclpy.init(args=["demandops", *ros_args], signal_handler_options=no_signals)
     except Exception as error:  # rclpy raises errors of many kinds
         if not ros_args:
             raise

@@ -26,7 +26,6 @@ from demandops.serve.timing.timers import DEFAULT_INTERVAL, parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from rclpy.logging import get_logger
-from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros import node_parameters, ros_process
 from demandops_ros.node import DemandNode
@@ -112,7 +111,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
       demandops serve --state-repo fleet.git
       demandops serve --state-repo https://git.example/fleet.git --clusters c.yaml
     """
-    with ros_process.started(ctx.args, SignalHandlerOptions.NO) as ros_args, ExitStack() as parts:
+    with ros_process.started(ctx.args) as ros_args, ExitStack() as parts:
         of_reference = node_parameters.read_reference_parameters(ros_args)
         settings = node_parameters.read_node_parameters(
             {

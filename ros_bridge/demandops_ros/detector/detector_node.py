@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -24,14 +25,16 @@ from demandops_interfaces.msg import Bookkeeping
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
 from demandops_ros import ros_process
 from demandops_ros.actions import DemandError, GoalSender
 from demandops_ros.client import DemandClient
 from demandops_ros.detector import detect_command
 from demandops_ros.messages import fill_message
-from demandops_ros.node import status
+from demandops_ros.node import LATCHED, status
+
+log = logging.getLogger("demandops")
 
 # ---- subscriptions to the topics that match the sources of rules ----
 #
@@ -115,14 +118,9 @@ class SourceSubscriptions:
 _THREADS = 8
 _LONGEST_WAIT_S = 60.0
 
-Log = Callable[[str, str], None]  # of a level, `info` or `warning`, and a text
-
 
 class DemandSender:
-    def __init__(
-        self, action_name: str, demand_action_name: str, timeout_s: float, log: Log
-    ) -> None:
-        self._log = log
+    def __init__(self, action_name: str, demand_action_name: str, timeout_s: float) -> None:
         self._wanted = WantedDemands()
         self._changed = REAL.condition()
         self._is_closed = False
@@ -173,9 +171,9 @@ class DemandSender:
             if subjects:
                 what += f" for {', '.join(subjects)}"
             if told:
-                self._log("warning", f"rule {rule}: {what} failed and will be tried again: {told}")
+                log.warning("rule %s: %s failed and will be tried again: %s", rule, what, told)
             elif not outcome.code and sending.purpose != "renew":
-                self._log("info", f"rule {rule}: {what}: {outcome.message}")
+                log.info("rule %s: %s: %s", rule, what, outcome.message)
 
     def _take(self) -> Sending | None:
         with self._changed:
@@ -221,7 +219,6 @@ _MOST_OBSERVATIONS = 100_000
 _UNHEARD_CLOCK = 0.0
 # If the clock jumps by more, someone has set the clock or restarted the simulation.
 _SET_CLOCK_S = 1.0
-_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class DetectorNode(Node):  # type: ignore[misc]
@@ -240,15 +237,13 @@ class DetectorNode(Node):  # type: ignore[misc]
             settings["action_name"],
             settings["demand_action_name"],
             settings["answer_timeout"],
-            self._log,
         )
         self._topics = self._subscribe(file)
         self._bookkeeping: Mapping[str, Any] | None = None
         self._books: Any = None
         if settings["bookkeeping_topic"]:
-            self._books = self.create_subscription(
-                Bookkeeping, settings["bookkeeping_topic"], self._hear_books, _LATCHED
-            )
+            topic = settings["bookkeeping_topic"]
+            self._books = self.create_subscription(Bookkeeping, topic, self._hear_books, LATCHED)
         else:
             self._bookkeeping = {}
         # by a steady clock, because a simulated one may be what is missing
@@ -256,7 +251,8 @@ class DetectorNode(Node):  # type: ignore[misc]
             _PATIENCE_S, self._say_what_is_missing, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self.create_timer(settings["period"], self._step)
-        self.create_timer(_DISCOVERY_S, self._refresh)
+        # a reload replaces the subscriptions, so this timer is not bound to those of now
+        self.create_timer(_DISCOVERY_S, lambda: self._topics.refresh())  # noqa: PLW0108
         self.create_timer(_RELOAD_S, self._reload_if_changed)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self._problems: tuple[str, ...] = ()
@@ -265,13 +261,6 @@ class DetectorNode(Node):  # type: ignore[misc]
     def close(self) -> None:
         self._topics.close()
         self._sender.close()
-
-    def _log(self, level: str, text: str) -> None:
-        logger = self.get_logger()  # in rclpy, a line of code can log at one level only
-        if level == "warning":
-            logger.warning(one_line(text))
-        else:
-            logger.info(one_line(text))
 
     def _now(self) -> float:
         return float(self.get_clock().now().nanoseconds) / 1e9
@@ -292,10 +281,10 @@ class DetectorNode(Node):  # type: ignore[misc]
             bookkeeping = json.loads(message.bookkeeping_json)
             booked_events(self._detector.file, bookkeeping)
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-            self._log(
-                "warning",
-                f"the bookkeeping cannot be read ({error!r}); check who publishes it; the next one "
-                "is waited for",
+            log.warning(
+                "the bookkeeping cannot be read (%r); check who publishes it; the next one is "
+                "waited for",
+                error,
             )
             return
         self._bookkeeping = bookkeeping
@@ -310,12 +299,9 @@ class DetectorNode(Node):  # type: ignore[misc]
         else:
             missing = "no bookkeeping has come, so nothing is demanded; start demandops serve, or "
             missing += "set the parameter bookkeeping_topic to the topic of the bookkeeping"
-        self.get_logger().warning(missing)
+        log.warning("%s", missing)
 
     # ---- periodic work ----
-
-    def _refresh(self) -> None:
-        self._topics.refresh()  # of the rules in effect: a reload replaces this object
 
     def _step(self) -> None:
         now = self._now()
@@ -328,10 +314,10 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._last_now, self._last_look = now, REAL.monotonic()
             if self._books is not None:
                 self.destroy_subscription(self._books)
-            self._log(
-                "info",
-                f"detecting; rules: {len(self._detector.file.rules)}, demands booked before "
-                f"the start: {len(booked)}",
+            log.info(
+                "detecting; rules: %d, demands booked before the start: %d",
+                len(self._detector.file.rules),
+                len(booked),
             )
         observations = [self._observations.popleft() for _ in range(len(self._observations))]
         # if the clock was set since the last step, the detector's times are moved with it
@@ -341,10 +327,10 @@ class DetectorNode(Node):  # type: ignore[misc]
         jumped = min(passed, 0.0) if is_simulated else passed - (look - self._last_look)
         self._last_now, self._last_look = now, look
         if abs(jumped) > _SET_CLOCK_S:
-            self._log("warning", f"the clock has jumped by {jumped:.1f} s")
+            log.warning("the clock has jumped by %.1f s", jumped)
             self._detector.set_clock(jumped)
         for event, want in self._detector.step(observations, now):
-            self._log("info", f"rule {event.rule}: {event.why}")
+            log.info("rule %s: %s", event.rule, event.why)
             self._sender.want([want])
 
     def _reload_if_changed(self) -> None:
@@ -367,13 +353,13 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._sender.want(self._detector.replace_rules(file, self._now(), self._settle_s))
         self._topics.close()
         self._topics = self._subscribe(file)
-        self._log("info", f"the file has changed; rules: {len(file.rules)}")
+        log.info("the file has changed; rules: %d", len(file.rules))
 
     def _keep_rules(self, error: InvalidInput) -> None:
         problems = tuple(map(str, error.faults))
         if problems != self._problems:
             for problem in problems:
-                self._log("warning", f"{problem}; the last valid rules stay in effect")
+                log.warning("%s; the last valid rules stay in effect", one_line(problem))
         self._problems = problems
 
     def _report(self) -> None:
