@@ -22,7 +22,6 @@ from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDe
 from demandops.detect.observations import Key, MessageReader, Observation, Unreadable
 from demandops.detect.rule_file import Goal, RuleFile, read
 from demandops_interfaces.msg import Bookkeeping
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
@@ -32,7 +31,7 @@ from demandops_ros.actions import DemandError, GoalSender
 from demandops_ros.client import DemandClient
 from demandops_ros.detector import detect_command
 from demandops_ros.messages import fill_message
-from demandops_ros.node import LATCHED, status
+from demandops_ros.node import LATCHED, Diagnostics
 
 log = logging.getLogger("demandops")
 
@@ -254,7 +253,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         # a reload replaces the subscriptions, so this timer is not bound to those of now
         self.create_timer(_DISCOVERY_S, lambda: self._topics.refresh())  # noqa: PLW0108
         self.create_timer(_RELOAD_S, self._reload_if_changed)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._diagnostics = Diagnostics(self, "demandops_detector", self._rules)
         self._problems: tuple[str, ...] = ()
         self.create_timer(1.0, self._report)
 
@@ -363,43 +362,32 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._problems = problems
 
     def _report(self) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        statuses, rules, detector = [], self._rules, self._detector
-
-        level, text = DiagnosticStatus.OK, "valid"
-        if self._problems:
-            level = DiagnosticStatus.WARN
-            text = "the file cannot be read or is invalid; the last valid rules are in effect"
+        detector, add = self._detector, self._diagnostics.add
+        invalid = "the file cannot be read or is invalid; the last valid rules are in effect"
         values = {"rules": str(len(detector.file.rules))}
         values |= {f"problem {at}": problem for at, problem in enumerate(self._problems, start=1)}
-        statuses.append(status("demandops_detector: rules", rules, level, text, values))
+        add("rules", "valid", values, warning=invalid if self._problems else "")
 
-        level, text = DiagnosticStatus.OK, "detecting"
-        if not self._is_started:
-            level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping or /clock"
+        missing = "" if self._is_started else "waiting for the bookkeeping or /clock"
         values = {
             "topics": str(self._topics.topics),
             "entities": str(detector.entities),
             "messages": str(self._topics.messages),
             "messages left out": str(self._topics.unreadable),
         }
-        statuses.append(status("demandops_detector: data", rules, level, text, values))
+        add("data", "detecting", values, warning=missing)
 
         _, unanswered, refusals = self._sender.summary()
-        level, text = DiagnosticStatus.OK, "every demand is answered"
+        text, failed = "every demand is answered", ""
         if unanswered:
             text = f"{unanswered} demands have no answer yet"
         if refusals:
-            level = DiagnosticStatus.WARN
-            text = f"{len(refusals)} demands failed and are tried again"
+            failed = f"{len(refusals)} demands failed and are tried again"
         values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
         for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
             values[" ".join((rule, *subjects))] = why
-        statuses.append(status("demandops_detector: demands", rules, level, text, values))
-
-        message.status = statuses
-        self._diagnostics.publish(message)
+        add("demands", text, values, warning=failed)
+        self._diagnostics.publish()
 
 
 def _read_rules(path: Path) -> tuple[RuleFile, str]:
