@@ -88,7 +88,6 @@ class Generator:
             snapshot,
             self._demands,
             Approvals(repository, snapshot.state, self._demands, with_targets, token_file),
-            with_targets,
             fetch_interval,
             heartbeat,
         )

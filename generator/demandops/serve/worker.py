@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
 
@@ -81,37 +81,6 @@ class RemoteMonitor:
         self.status = replace(self.status, push_denied=reason)
 
 
-# ---- the log of the state repo's problems: each once, until it is mended ----
-
-
-class FaultLog:
-    def __init__(self, repository: StateRepository) -> None:
-        self._repository = repository
-        self._logged: frozenset[errors.Fault] = frozenset()
-        self._warned_of_signers = False
-
-    def log_changes(self, problems: Iterable[errors.Fault]) -> None:
-        current = list(dict.fromkeys(problems))
-        for problem in current:
-            if problem not in self._logged:
-                log.error("%s (its last valid version, if any, stays in effect)", problem)
-        for file in sorted({old.file for old in self._logged} - {new.file for new in current}):
-            log.info("%s is valid again", file or "the state repo")
-        self._logged = frozenset(current)
-
-    def warn_if_unsigned(self, snapshot: Snapshot) -> None:
-        if self._repository.signer is not None or self._warned_of_signers:
-            return
-        if signing.are_listed(self._repository.objects, snapshot.commit):
-            self._warned_of_signers = True
-            log.warning(
-                "%s lists who may sign, but this generator has no key, so `verify` will refuse its "
-                "commits, and generators will treat them as commits by a person; start the "
-                "generator with --signing-key",
-                signing.ALLOWED_SIGNERS,
-            )
-
-
 # ---- the worker ----
 #
 # The worker runs in one thread, the only one that writes to the state repo. Demands go first, so a
@@ -135,7 +104,6 @@ class Worker:
         snapshot: Snapshot,
         demands: Demands,
         approvals: Approvals,
-        with_targets: bool,
         fetch_interval: float,
         heartbeat: timers.Heartbeat,
     ) -> None:
@@ -145,7 +113,7 @@ class Worker:
         self._repository, self._demands, self._approvals = repository, demands, approvals
         self._runtime = repository.runtime
         self._heartbeat = repository.while_waiting = heartbeat
-        self._evaluator = Evaluator(repository, demands, approvals, with_targets)
+        self._evaluator = Evaluator(repository, demands, approvals)
         self._timer = PollTimer(fetch_interval, repository.runtime, local=repository.always_current)
         self._lease_expiry = LeaseExpiry(repository.runtime)
         self._own_work = OwnWork(repository.runtime)
@@ -153,10 +121,11 @@ class Worker:
         self._batch_limit = timers.LIMIT_LOCAL if repository.always_current else timers.LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
-        self._log = FaultLog(repository)
+        self._logged: list[errors.Fault] = []
+        self._warned_of_signers = False
         self._ends_soon = self._runtime.event()
         self._rest = timers.Rest(repository.runtime)
-        self._log.warn_if_unsigned(snapshot)
+        self._warn_if_unsigned()
 
     # ---- from any thread ----
 
@@ -440,14 +409,20 @@ class Worker:
     def _new_commit_batch(self) -> CommitBatch:
         # its first commits render people's changes, and do the own work that is due
         tip = self._repository.tip()
-        before = self.snapshot
-        if tip == before.commit and not before.problems and before.is_rendered:
-            commits = CommitBatch(self._repository, before)
+        newest = self.snapshot
+        if tip == newest.commit and not newest.problems and newest.is_rendered:
+            commits = CommitBatch(self._repository, newest)
         else:
-            advance = self._ahead.advance(self._repository.objects, before, tip)
+            advance = self._ahead.advance(self._repository.objects, newest, tip)
             commits = CommitBatch(self._repository, advance.snapshot)
-            commits.follow(advance, before, self._runtime.now())
-            self._log.log_changes(commits.head.problems)
+            commits.follow(advance, newest, self._runtime.now())
+            # each problem of the state repo is logged once, until it is mended
+            before, self._logged = {*self._logged}, list(dict.fromkeys(commits.head.problems))
+            for problem in self._logged:
+                if problem not in before:
+                    log.error("%s (its last valid version, if any, stays in effect)", problem)
+            for file in sorted({old.file for old in before} - {new.file for new in self._logged}):
+                log.info("%s is valid again", file or "the state repo")
         self._own_work.commit_due(commits)
         return commits
 
@@ -458,9 +433,21 @@ class Worker:
         # also true after a person's merge that needs no commit of the generator
         if self.snapshot.commit != before.commit:
             self._packs_since_tidy += 1
-            self._log.warn_if_unsigned(self.snapshot)
+            self._warn_if_unsigned()
             for listener in self.listeners:
                 listener(self.snapshot.state.config)
+
+    def _warn_if_unsigned(self) -> None:
+        if self._repository.signer is not None or self._warned_of_signers:
+            return
+        if signing.are_listed(self._repository.objects, self.snapshot.commit):
+            self._warned_of_signers = True
+            log.warning(
+                "%s lists who may sign, but this generator has no key, so `verify` will refuse its "
+                "commits, and generators will treat them as commits by a person; start the "
+                "generator with --signing-key",
+                signing.ALLOWED_SIGNERS,
+            )
 
     def _record_reached(self, *, pushed: bool) -> None:
         self._demands.blocked = ""

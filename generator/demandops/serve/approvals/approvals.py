@@ -292,9 +292,12 @@ class Approvals:
         # a person merged the demand, but a later commit changed its files
         if isinstance(decision, InvalidInput) or decision.files:
             return Receipt(ticket.operation, ticket.name, "booked", commit)
-        before = snapshot.state
+        receipt = self.receipt(ticket, decision, commit, snapshot.state)
+        return replace(receipt, outcome="booked")
+
+    def receipt(self, ticket: Ticket, decision: Decision, commit: str, before: State) -> Receipt:
         targets = targets_of_decision(before, decision) if self._with_targets else ()
-        return replace(receipt_of(ticket, decision, commit, targets), outcome="booked")
+        return receipt_of(ticket, decision, commit, targets)
 
     # ---- the branch and its pull request ----
 
