@@ -79,6 +79,12 @@ def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no
     return client.CustomObjectsApi(client.ApiClient(settings))
 
 
+def reason_of(error: Exception) -> str:
+    # of an error of the library
+    reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
+    return reason.splitlines()[0][:300]
+
+
 class AccessFile(FileModel):
     """The operator's file: the access to each cluster, by the cluster's name."""
 

@@ -254,7 +254,7 @@ class Flux(HealthReader):
         source = self._source(domain, objects) or {}
         fetched = condition(source.get("status") or {}, "Ready")
         if fetched.get("status") == "False":
-            at = f"GitRepository {domain.namespace}/{_source_name(kustomization)}"
+            at = name_of(("GitRepository", domain.namespace, _source_name(kustomization)))
             return Health("waiting", str(fetched.get("message", "")), at, failing=True)
         return Health("waiting", "has not applied the commit yet", name)
 

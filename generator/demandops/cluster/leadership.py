@@ -17,7 +17,7 @@ from typing import Any
 from demandops.base.errors import InvalidInput, Unsound
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL, Runtime
-from demandops.cluster.clusters_file import own_cluster_api
+from demandops.cluster.clusters_file import own_cluster_api, reason_of
 
 log = logging.getLogger("demandops")
 
@@ -77,7 +77,7 @@ class Leadership:
             try:
                 self._write(self._read(), "")
             except Exception as error:  # the Lease expires on its own
-                log.warning("the Lease %s could not be released: %s", self._lease, _reason(error))
+                log.warning("the Lease %s could not be released: %s", self._lease, reason_of(error))
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -86,7 +86,7 @@ class Leadership:
             except Unsound:
                 raise
             except Exception as error:  # the library raises errors of many kinds
-                problem = f"cannot be read or written: {_reason(error)}"
+                problem = f"cannot be read or written: {reason_of(error)}"
                 self._tell(logging.WARNING, f"the Lease {self._lease} {problem}")
             self._require_renewed()
             self._closed.wait(_PAUSE_S)
@@ -159,8 +159,3 @@ class Leadership:
             f"the Lease {self._lease} {why}; another process may be the leader now, so this one "
             "must start again"
         )
-
-
-def _reason(error: Exception) -> str:
-    reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
-    return reason.splitlines()[0][:300]

@@ -21,7 +21,7 @@ from demandops.base.runtime import REAL, Runtime
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cluster.clusters_file import ClusterAccess, NoAccess
 from demandops.cluster.health import REQUESTED_AT, ClusterDomain, Flux, ObjectSelector
-from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.object_cache import object_caches
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain
 from demandops.render.gitops import domain_folder, domains_in_use, project_of
@@ -152,11 +152,7 @@ class ReconcileTrigger:
         self._pushed = False
         self._changed = runtime.event()
         self._ends = inf
-        self._caches = {
-            name: ObjectCache(name, access, self._changed.set, runtime)
-            for name, access in self._clusters.items()
-            if access.kubeconfig
-        }
+        self._caches = object_caches(self._clusters, self._changed.set, runtime)
         self._thread = runtime.keep_running("wake", self._run)
 
     def __call__(self, config: Config) -> None:

@@ -23,7 +23,7 @@ from demandops.cluster.health import (
     why_unavailable,
     worst,
 )
-from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.object_cache import object_caches
 from demandops.decide.decision import Decision
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import plan
@@ -61,21 +61,14 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
 
 
 def targets_of_state(state: State) -> list[tuple[Release, Target]]:
-    releases = []
-    for key in all_keys(state):
-        release = plan(state, key)
-        if release is not None:
-            target = target_of(release, state.config.repo_settings)
-            releases.append((release, target))
+    planned = [release for key in all_keys(state) if (release := plan(state, key))]
+    releases = [(release, target_of(release, state.config.repo_settings)) for release in planned]
     return sorted(releases, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
 
 
 def domains_of_state(state: State) -> list[ClusterDomain]:
-    settings = state.config.repo_settings
-    return [
-        cluster_domain(cluster, domain, settings)
-        for cluster, domain in domains_in_use(state.config)
-    ]
+    in_use, settings = domains_in_use(state.config), state.config.repo_settings
+    return [cluster_domain(cluster, domain, settings) for cluster, domain in in_use]
 
 
 def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
@@ -129,11 +122,7 @@ class RolloutWatcher:
         self._closed = False
         self._lock = runtime.lock()
         self._open: list[_Rollout] = []
-        self._caches = {
-            name: ObjectCache(name, access, self._changed.set, runtime)
-            for name, access in clusters.items()
-            if access.kubeconfig
-        }
+        self._caches = object_caches(clusters, self._changed.set, runtime)
         self._thread = runtime.keep_running("status", self._run)
 
     def why_unreachable(self, domains: Iterable[ClusterDomain]) -> str:

@@ -15,7 +15,7 @@ from demandops.base.runtime import REAL, Runtime
 from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import ClusterDomain, health_reader
-from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.object_cache import object_caches
 from demandops.cluster.release_status import old_bootstraps, orphans, statuses
 from demandops.repo.git.repository import reading
 from demandops.repo.history.commit_log import LogEntry
@@ -37,11 +37,7 @@ class ClusterWatch:
         self, clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None], runtime: Runtime
     ) -> None:
         self._runtime = runtime
-        self._caches = {
-            name: ObjectCache(name, access, on_change, runtime)
-            for name, access in clusters.items()
-            if access.kubeconfig
-        }
+        self._caches = object_caches(clusters, on_change, runtime)
         self.clusters = frozenset(self._caches)
         self._domains = set[ClusterDomain]()
         self._states: dict[str, str] = {}
