@@ -174,9 +174,9 @@ def create_override(
         _carry_out(repo, edit, entry, options)
 
 
-def override_text(name: str, fields: dict[str, Any]) -> str:
+def override_text(name: str, fields: dict[str, Any], note: str = "") -> str:
     given = {key: value for key, value in fields.items() if value is not None}
-    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
+    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given, note)
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:

@@ -11,10 +11,11 @@ import click
 
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import data_folder
+from demandops.cli.actions.override import override_text
 from demandops.cli.json_output import Command, output_option, show
 from demandops.cli.output import busy
 from demandops.cli.repo import scaffold
-from demandops.cli.repo.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan, document
+from demandops.cli.repo.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
 from demandops.decide.state import State, try_configuration
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.model.config.load import load
@@ -193,18 +194,16 @@ def override(  # noqa: PLR0913 - as many as options
     if not select:
         raise click.UsageError("say what the override selects: --service, --application or --node")
     flags = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
-    options = {**flags, "replicas": replicas}
-    does = {effect: value for effect, value in options.items() if value is not None}
-    if len(does) != 1:
+    effects = {**flags, "replicas": replicas}
+    if sum(value is not None for value in effects.values()) != 1:
         raise click.UsageError("give exactly one effect: --hold, --deny, --keep or --replicas")
     existing, config = _read_configuration(directory)
     if name in config.overrides:
         raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
-    path = f"overrides/{name}.yaml"
-    fields = {"reason": reason, "owner": owner, "select": [select], **does}
+    fields = {"reason": reason, "owner": owner, "select": [select], **effects}
     note = "overrides/README.md lists all effects and selectors of overrides, and when they end."
-    text = document(path, "override", "Override", fields, note)
-    _lay_down(directory, existing, {path: text}, output, [])
+    files = {f"overrides/{name}.yaml": override_text(name, fields, note)}
+    _lay_down(directory, existing, files, output, [])
 
 
 @new.command()
