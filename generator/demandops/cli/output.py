@@ -30,7 +30,6 @@ Progress = Callable[[int, int], None]
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a console for stdout or stderr."""
     from rich.console import Console  # noqa: PLC0415
 
     class QuotingConsole(Console):
@@ -129,10 +128,8 @@ def show_slow(text: str) -> None:  # an empty text clears the line
 
 @contextmanager
 def busy(title: str) -> Iterator[Callable[[str], None]]:
-    """Show the title and the elapsed seconds on a terminal if the block takes a second or longer.
-
-    The function that it yields replaces the title.
-    """
+    # on a terminal, the title and the elapsed seconds, if the block takes a second or longer; the
+    # function that it yields replaces the title
 
     def say(text: str) -> None:
         nonlocal title
@@ -162,7 +159,7 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield a function that updates a progress bar on a terminal if the work takes long."""
+    # a progress bar on a terminal, if the work takes long
     start = REAL.monotonic()
     bar: Bar | None = None
     task: Any = None

@@ -28,12 +28,8 @@ CellOf = Callable[..., Cell]
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table.
-
-    Columns get room in the order of ``rank``. One that does not fit is left out, even if a narrower
-    one of a higher rank fits. A column of rank 0 is never left out.
-    """
-
+    # Columns get room in the order of ``rank``. One that does not fit is left out, even if a
+    # narrower one of a higher rank fits. A column of rank 0 is never left out.
     title: str
     rank: int = 0
     wraps: bool = False
@@ -51,10 +47,8 @@ class Table:
     whole: bool = False
 
     def lines(self, width: int | None, style: Callable[[str, str], str] | None = None) -> list[str]:
-        """Return the table as lines; without a ``width``, one for each row, however long.
-
-        ``style`` returns a text in a style (``bold``, ``dim`` or a color); None is plain text.
-        """
+        # Without a ``width``, one for each row, however long. ``style`` returns a text in a style
+        # (``bold``, ``dim`` or a color); None is plain text.
         width = None if self.whole else width
         paint = style or (lambda text, _: text)
         title = [paint(self.title, "bold")] if self.title else []

@@ -261,8 +261,6 @@ Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
 
 def names_of(*kinds: str) -> Complete:
-    """Return a completer for names of these kinds."""
-
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         try:
             with ctx.scope(cleanup=False):

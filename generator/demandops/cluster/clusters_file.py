@@ -60,11 +60,8 @@ class ClusterAccess(FrozenModel):
 
 
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
-    """Return the API of the cluster in which this process runs as a pod.
-
-    Its calls have the rights of the pod's service account. ``wanted_by`` is the option or command
-    that needs the API: InvalidInput names it if this process is no pod with a token.
-    """
+    # Of the cluster in which this process runs as a pod, whose service account has the rights.
+    # ``wanted_by`` is the option or command that needs it: InvalidInput names it if this is no pod.
     from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
 
     settings = client.Configuration()

@@ -68,8 +68,6 @@ Objects = Mapping[Key, Object]
 
 
 class History(Protocol):
-    """Queries on the state repo's commits."""
-
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or a descendant of ``other``."""
 
@@ -273,11 +271,8 @@ class Flux(HealthReader):
         return _handled(self._source(domain, objects) or {})
 
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
-        """Return whether Flux has finished all work of a domain's last fetch.
-
-        ``before`` is what :meth:`handled_request` returned before the last fetch request was made,
-        if one was.
-        """
+        # whether Flux has finished all work of a domain's last fetch; ``before`` is what
+        # `handled_request` returned before the last fetch request was made, if one was
         kustomization, source = objects.get(self.follower(domain)), self._source(domain, objects)
         # what does not exist or is suspended never fetches, and must not hold up the next request
         if kustomization is None or source is None:

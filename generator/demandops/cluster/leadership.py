@@ -41,11 +41,8 @@ class Leadership:
         api: Any = None,  # noqa: ANN401 - the library has no types
         runtime: Runtime = REAL,
     ) -> None:
-        """Start to compete for the Lease ``NAMESPACE/NAME``, which must exist.
-
-        A leader that cannot renew the Lease, or has lost it, raises :class:`Unsound` in its thread.
-        Without ``api``, this process must be a pod.
-        """
+        # It competes for the Lease ``NAMESPACE/NAME``, which must exist. A leader that cannot renew
+        # it, or has lost it, raises Unsound in its thread. Without ``api``, this must be a pod.
         name = _NAME.fullmatch(lease)
         if name is None:
             message = f"{quoted(lease)} names no Lease; write NAMESPACE/NAME"

@@ -137,11 +137,8 @@ class RolloutWatcher:
         timeout: float,
         on_progress: OnProgress = lambda state, text: None,
     ) -> Future[Health]:
-        """Follow releases of a published commit; return at once.
-
-        :meth:`why_unreachable` must be empty for their domains. The future has the health when it
-        reaches ``level``, or when the time is over or this watcher is closed; it then says why.
-        """
+        # `why_unreachable` must be empty for their domains. The future has the health when it
+        # reaches ``level``, or when the time is over or this watcher is closed; it then says why.
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))
         deadline = self._runtime.monotonic() + timeout

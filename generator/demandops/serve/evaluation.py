@@ -71,11 +71,8 @@ class Evaluator:
         self._rate_limit = RateLimit()
 
     def evaluate(self, commits: CommitBatch, ticket: Ticket) -> Receipt | DemandOpsError | Decision:
-        """Decide a demand, commit it on the commit batch and return its result.
-
-        A demand that needs approval gets no commit; its result is the decision. A receipt is true
-        only once the batch is published. Errors that concern all demands are raised.
-        """
+        # A demand that needs approval gets no commit; its result is the decision. A receipt is true
+        # only once the batch is published. Errors that concern all demands are raised.
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
         try:

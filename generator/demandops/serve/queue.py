@@ -206,11 +206,9 @@ class FairQueue:
             self._barriers.append(queued)
 
     def put_back(self, tickets: Sequence[Ticket], served: Iterable[Ticket] = ()) -> None:
-        """Put demands back, in the order in which they left, each before others of its requester.
-
-        The requesters of these demands get the next turns. But a requester of ``served``, demands
-        that left with them and do not come back, had its turn and comes after all others.
-        """
+        # In the order in which they left, each before others of its requester. Their requesters get
+        # the next turns. But a requester of ``served``, demands that left with them and do not come
+        # back, had its turn and comes after all others.
         first = min((queued.number for queued in self._queued.values()), default=1) - len(tickets)
         again = {
             ticket: _Queued(number, ticket, subjects_of(ticket.goal))

@@ -212,10 +212,8 @@ class Worker:
     # ---- publishing demands ----
 
     def _publish(self, batch: list[Ticket]) -> None:
-        """Publish a batch, the demands that arrive during retries, and the ends of leases.
-
-        The batch is empty afterwards, unless an error is raised.
-        """
+        # also the demands that arrive during retries, and the ends of leases; the batch is empty
+        # afterwards, unless an error is raised
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
         while batch or self._ended_leases(self.snapshot):

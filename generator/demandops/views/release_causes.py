@@ -186,7 +186,7 @@ def is_released_by_demand_id(claim: Claim) -> bool:
 
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
-    """Return (file, entry, what it decides) for all that shapes a release but overrides."""
+    # (file, entry, what it decides) for all that shapes a release but overrides
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
         images = {name: release.version.image(name, image) for name, image in images.items()}

@@ -116,10 +116,8 @@ def _box(
 def by_place(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], float]:
-    """Return the placed cards by node id, and the height of the map.
-
-    At least one node must have a position. The nodes without one follow in rows below the others.
-    """
+    # The placed cards by node id, and the height of the map. At least one node must have a
+    # position. The nodes without one follow in rows below the others.
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
     widest = max(cards[id].width for id in spots)
@@ -201,11 +199,8 @@ class Picture:
 
 
 def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
-    """Return the map of a situation; services, connections and nodes that match are lit.
-
-    A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a position.
-    If no drawn node has a position, nodes are drawn by cluster.
-    """
+    # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
+    # position. If no drawn node has a position, nodes are drawn by cluster.
     config = now.commit_state.config
     nodes = list(config.nodes.values())
     rows = rows_of(now, "services") if wanted else []

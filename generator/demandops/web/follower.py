@@ -122,11 +122,8 @@ class Follower:
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Read the newest state and follow the state repo; :meth:`close` closes ``reader``.
-
-        ``interval`` has the seconds between fetches from a remote. With 0, the follower fetches
-        only after :meth:`wake` or a change on a cluster.
-        """
+        # `close` closes ``reader``. ``interval`` has the seconds between fetches from a remote; at
+        # 0, the follower fetches only after `wake` or a change on a cluster.
         self._reader, self._runtime = reader, runtime
         self._interval = _LOOK_S if reader.repository.always_current else interval or None
         self._wake, self.closed = runtime.event(), runtime.event()

@@ -52,11 +52,8 @@ _CRASH = re.compile(r"CrashLoop|exit code|OOMKilled|RunContainerError", re.I)
 def remedy_of(
     kind: Kind, release: Release, config: Config, object: str, reason: str, last_change: LastChange
 ) -> Remedy:
-    """Return who can probably fix a release, and how.
-
-    ``object`` names what is not ready: an object, such as ``Deployment perception/od-edge``, or a
-    cluster that cannot be read.
-    """
+    # ``object`` names what is not ready: an object, such as ``Deployment perception/od-edge``, or a
+    # cluster that cannot be read.
     cluster, (word, _, name) = release.node.cluster, object.partition(" ")
     namespace, _, short = name.partition("/")
     describe = ["kubectl", "-n", namespace, "describe", word.lower(), short]

@@ -79,10 +79,8 @@ class ViewRequest:
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
 
     def to(self, path: str | None = None, **changes: str | int) -> str:
-        """Return the address of a view, with the chosen commit or time and the filter.
-
-        Without ``path``, it is this view with all its parameters. An empty value removes one.
-        """
+        # The address of a view, with the chosen commit or time and the filter. Without ``path``, it
+        # is this view with all its parameters. An empty value removes one.
         kept = {name: value for name, value in self.params.items() if path is None or name in _KEPT}
         params = {name: value for name, value in {**kept, **changes}.items() if value != ""}
         query = f"?{urlencode(params)}" if params else ""

@@ -109,10 +109,8 @@ class CommitState:
         return without_suspended(self.state)
 
     def take_over(self, before: CommitState) -> None:
-        """Take the releases and rows of an earlier commit state; plan anew what may differ.
-
-        Call this before any other method, because computed attributes are kept.
-        """
+        # Its releases and rows are kept, and what may differ is planned anew. To be called before
+        # any other method, because computed attributes are kept.
         old, new = before.state, self.state
         # another configuration, or another override, may change every release
         if (old.config, old.overrides) != (new.config, new.overrides):
@@ -181,11 +179,8 @@ class CommitState:
 
     @property
     def planned(self) -> dict[ReleaseKey, Planned | None]:
-        """The planned releases by key.
-
-        The value is None if the release is denied, if all claims that need it are suspended, or if
-        the client of a connection carries no topic.
-        """
+        # None if the release is denied, if all claims that need it are suspended, or if the client
+        # of a connection carries no topic
         if self._planned is None:
             self._planned = {key: self._plan(key) for key in release_keys.all_keys(self.state)}
         return self._planned

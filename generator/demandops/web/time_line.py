@@ -127,11 +127,8 @@ def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
 def strip(
     events: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
 ) -> Strip:
-    """Return the picture of the time line that ends at ``now``, for events that are newest first.
-
-    If ``span`` is no key of ``SPANS``, it is the shortest that has enough events. ``chosen`` is the
-    time and the id of the chosen commit.
-    """
+    # It ends at ``now``; the events are newest first. If ``span`` is no key of ``SPANS``, it is the
+    # shortest that has enough events. ``chosen`` is the time and the id of the chosen commit.
     if span not in SPANS:
         # enough events are 20, or three quarters of all events, whichever is less
         last = min(_FEW, 3 * len(events) // 4) - 1
@@ -213,10 +210,7 @@ _RELEASED = {"shutdown", "release", "expire", "decommission"}
 def plots(
     commits: Sequence[Commit], health: Sequence[HealthChange], now: datetime, span: str
 ) -> list[Plot]:
-    """Return the plots of a span of time that ends at ``now``.
-
-    A ``span`` that is no key of ``SPANS`` means the time since the oldest of ``commits``.
-    """
+    # A ``span`` that is no key of ``SPANS`` means the time since the oldest of ``commits``.
     seconds = SPANS.get(span, 0)
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
     start = now - timedelta(seconds=seconds) if seconds else oldest

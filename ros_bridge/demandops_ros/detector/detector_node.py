@@ -136,7 +136,6 @@ class DemandSender:
         ]
 
     def close(self) -> None:
-        """Stop sending; demands that are booked stay booked."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()

@@ -47,10 +47,7 @@ _URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A
 def image_files(
     name: str, repository: str, state_repo: str, texts: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the container file and the pipelines, as a map from path to text.
-
-    ``texts`` has the files in ``templates/scaffold/image`` by name.
-    """
+    # by path; ``texts`` has the files in ``templates/scaffold/image`` by name
     url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
     if not _IMAGE_NAME.fullmatch(name):
         message = (
@@ -117,11 +114,8 @@ def refuse_name(name: str, config: Config) -> None:
 def application_files(
     plan: ApplicationPlan, config: Config, library: Mapping[str, str], texts: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the files of a new application, as a map from path to text.
-
-    They include those of the library chart, ``library``, if the state repo lacks it. ``texts`` has
-    the files in ``templates/scaffold/application`` by name.
-    """
+    # by path, with those of the library chart, ``library``, if the state repo lacks it; ``texts``
+    # has the files in ``templates/scaffold/application`` by name
     refuse_name(plan.name, config)
     has_library = f"{LIBRARY_FOLDER}/Chart.yaml" in config.files
     shared = config.files if has_library else library

@@ -35,10 +35,7 @@ _COMMON = {
 
 
 def describe(schema: dict[str, Any], root: str) -> None:
-    """Add descriptions and examples from ``templates/schemas/properties.yaml`` to a schema.
-
-    ``root`` is the name of the model whose JSON Schema is changed.
-    """
+    # by ``templates/schemas/properties.yaml``; ``root`` is the name of the model of the schema
     properties = _properties()
     for model, part in {root: schema, **schema.get("$defs", {})}.items():
         for name, field in part.get("properties", {}).items():

@@ -54,10 +54,7 @@ class Match:
 
 
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
-    """Return the object that a name or path identifies; ``kind`` limits the search to one kind.
-
-    Only the history up to the commit of ``snapshot`` counts.
-    """
+    # of a name or a path; only the history up to the commit of ``snapshot`` counts
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     world = snapshot.state

@@ -201,10 +201,8 @@ class Approvals:
         return self._branches.heads()
 
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
-        """Answer the demands that are decided or withdrawn, and update the other proposals.
-
-        ``snapshot`` is of main, at ``heads.main`` or later. After an error, the next check goes on.
-        """
+        # It answers the demands that are decided or withdrawn, and updates the other proposals.
+        # ``snapshot`` is of main, at ``heads.main`` or later. After an error, the next one goes on.
         while self._changed:
             if changed := self._proposals.get(self._changed.popleft()):
                 changed.checked_at = ""

@@ -49,11 +49,8 @@ class Backoff:
         self._turn = self._away = FIRST_PAUSE_S
 
     def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
-        """Return the seconds to wait if another writer published first; adjust ``max_demands``.
-
-        ``size`` counts the demands of the attempt, which took ``evaluating_s`` to decide and commit
-        them, and ``pushing_s`` from then to the rejection.
-        """
+        # The seconds to wait, as another writer published first. ``size`` counts the demands of the
+        # attempt, which took ``evaluating_s`` to commit them, and ``pushing_s`` from then on.
         # a writer that evaluates for longer than its push takes always loses to faster writers
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
         wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
@@ -217,11 +214,8 @@ class RateLimit:
     def faults(
         self, request: DemandRequest, config: Config, operation: str, received: datetime
     ) -> Iterator[Fault]:
-        """Count a demand, and yield a fault for each quota that a requester exceeds with it.
-
-        A demand counts even if it is refused afterwards. A request that adds no claims is not
-        limited.
-        """
+        # A demand counts even if it is refused afterwards. A request that adds no claims is not
+        # limited.
         if not request.adds_claims:
             return
         homes = (config.domain_of.get(demanded.held.home) for demanded in request.demanded)
