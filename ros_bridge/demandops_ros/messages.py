@@ -19,8 +19,7 @@ from demandops_interfaces.action import Demand as DemandMessage
 
 def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
     # in the form that its YAML text has, so that a goal over ROS 2 equals the same goal in a file
-    fields = getattr(message, "get_fields_and_field_types", None)
-    if fields is not None:
+    if (fields := getattr(message, "get_fields_and_field_types", None)) is not None:
         return {name: message_to_data(getattr(message, name)) for name in fields()}
     if isinstance(message, str | bool | int | float):
         return message

@@ -102,8 +102,7 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
 
 def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     for name, host in values.items():
-        match = _BROKER.fullmatch(name)
-        if match is None:
+        if (match := _BROKER.fullmatch(name)) is None:
             continue
         port, node = values.get(f"{name.removesuffix('host')}port"), match["node"]
         # the host in the inventory may end in the namespace, as in broker.c-its

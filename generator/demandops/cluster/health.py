@@ -348,8 +348,7 @@ class ArgoCd(HealthReader):
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
         name = name_of(self.follower(domain))
-        app = objects.get(self.follower(domain))
-        if app is None:
+        if (app := objects.get(self.follower(domain))) is None:
             missing = f"does not exist; apply {bootstrap_path(domain.cluster)} to the cluster"
             return Health("waiting", missing, name)
         if any(history.includes(revision, commit) for revision in _applied_commits(app)):

@@ -43,8 +43,7 @@ class Leadership:
     ) -> None:
         # It competes for the Lease ``NAMESPACE/NAME``, which must exist. A leader that cannot renew
         # it, or has lost it, raises Unsound in its thread. Without ``api``, this must be a pod.
-        name = _NAME.fullmatch(lease)
-        if name is None:
+        if (name := _NAME.fullmatch(lease)) is None:
             message = f"{quoted(lease)} names no Lease; write NAMESPACE/NAME"
             raise InvalidInput.at("--leader-lease", message)
         self._request = {

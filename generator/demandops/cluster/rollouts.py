@@ -229,8 +229,7 @@ class RolloutWatcher:
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
         # The reason is to be as exact as possible: while a controller retries, its object no longer
         # says why the last attempt failed, and a Deployment never says why its pods do not run.
-        failed = rollout.failed
-        if failed and not health.failing and failed.object == health.object:
+        if (failed := rollout.failed) and not health.failing and failed.object == health.object:
             health = replace(health, reason=f"{health.reason}; before: {failed.reason}")
         kind, _, name = health.object.partition(" ")
         if kind == "Deployment":
@@ -239,8 +238,7 @@ class RolloutWatcher:
                 for domain in rollout.domains:
                     if domain.namespace == namespace:
                         cache = self._caches[domain.cluster]
-                        reason = why_unavailable(cache.pods(namespace, deployment))
-                        if reason:
+                        if reason := why_unavailable(cache.pods(namespace, deployment)):
                             health = replace(health, reason=f"{health.reason}; {reason}")
                             break
         self._resolve(rollout, health)

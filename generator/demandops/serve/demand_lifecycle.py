@@ -174,8 +174,7 @@ class Demands:
         with self._changed:
             for _ in range(len(self._arrived)):
                 ticket = self._arrived.popleft()
-                error = self._why_refused(ticket, len(taken))
-                if error is not None:
+                if (error := self._why_refused(ticket, len(taken))) is not None:
                     refused.append((ticket, error))
                     continue
                 self._of_requester[queue.requester_of(ticket.goal)] += 1
@@ -219,8 +218,7 @@ class Demands:
             message = "is the operation id of another demand; choose a new one"
             return errors.Refused([errors.fault("", f"'{ticket.operation}' {message}")])
         who = queue.requester_of(ticket.goal)
-        limit = self._requester_limit
-        if limit is not None and self._of_requester[who] >= limit:
+        if (limit := self._requester_limit) is not None and self._of_requester[who] >= limit:
             whose = f"of {quoted(who)}" if who else "without a requester"
             return QueueFull(
                 f"{limit} demands {whose} have no answer yet; send the demand again "

@@ -141,8 +141,7 @@ class Evaluator:
         histories = [(base, operations_since(objects, tip, base)) for base in bases]
         # all bases are ancestors of the tip, so the most outcomes are those since the oldest base
         since, recorded = max(histories, key=lambda history: len(history[1]), default=("", {}))
-        published = [operation for operation in reversed(recorded) if operation in sought]
-        if published:
+        if published := [operation for operation in reversed(recorded) if operation in sought]:
             # after a failed fsync only files that are written anew are sure to be on the disk
             self._repository.write_anew(since)
         for operation in sought.keys() - published:

@@ -43,8 +43,7 @@ def override_report(world: World, now: datetime) -> list[Entry]:
         return []
     releases = defaultdict[str, list[Release]](list)
     for key in all_keys(world):
-        release = plan(world, key)
-        if release is not None:
+        if (release := plan(world, key)) is not None:
             for override, _ in release.shaping.by:
                 releases[override.name].append(release)
         elif denied := denied_release(world, key):

@@ -65,8 +65,7 @@ class Cell:
     @property
     def rank(self) -> tuple[bool, float, str]:
         # in ascending order, empty cells come last
-        order = self.order
-        if order is None:
+        if (order := self.order) is None:
             order = self.time.timestamp() if self.time else self.parts[0].text if self.parts else ""
         if isinstance(order, str):
             return order == "", 0.0, order.casefold()

@@ -136,8 +136,7 @@ class CommitState:
         planned = before.planned | dict(self._with_other_claims(before, subjects))
         for key in keys:
             planned.pop(key, None)
-            release = self._plan(key)
-            if release or denied_release(new, key):
+            if (release := self._plan(key)) or denied_release(new, key):
                 planned[key] = release
         self._planned = planned
         self.rows = {name: replace(rows, statuses=None) for name, rows in before.rows.items()}
@@ -171,8 +170,7 @@ class CommitState:
                 yield key, replace(planned, claims=release_causes.by_booking([*kept, *needing]))
 
     def _plan(self, key: ReleaseKey) -> Planned | None:
-        release = plan(self.state, key)
-        if release is None:
+        if (release := plan(self.state, key)) is None:
             return None
         target = rollouts.target_of(release, self.config.repo_settings)
         return Planned(release, target, release_causes.claims_behind(self.active.ledger, release))

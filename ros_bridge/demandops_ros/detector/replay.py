@@ -47,8 +47,7 @@ class RecordedBag:
         self.left_out: dict[tuple[str, str], int] = {}
         for connection in self._reader.connections:
             for name, source in file.sources.items():
-                entity = entity_in(source.topic, connection.topic)
-                if entity is None:
+                if (entity := entity_in(source.topic, connection.topic)) is None:
                     continue
                 if connection.msgtype == source.type:
                     self._sources.setdefault(connection.id, []).append((name, entity))

@@ -152,8 +152,7 @@ def create_override(
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
         if not options.reason:
             raise click.UsageError("give the reason: -m TEXT")
-        chosen = selector(selected)
-        if not chosen:
+        if not (chosen := selector(selected)):
             raise click.UsageError("select what the override applies to, for example --node edge")
         owner = more.get("owner")
         if not owner:

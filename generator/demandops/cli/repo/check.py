@@ -125,8 +125,7 @@ def _findings(checked: CheckResult) -> Iterator[str]:
 
 
 def _consequence(checked: CheckResult) -> Iterator[str]:
-    consequence = checked.preview
-    if consequence is None:
+    if (consequence := checked.preview) is None:
         yield "\nFix the errors to see what merging would do.\n"
         return
     if not consequence.files and not checked.bookkeeping:
@@ -134,8 +133,7 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
         return
     yield "\n### Desired state\n"
     kinds = [release.change for release in consequence.releases]
-    counts = [f"{kinds.count(kind)} to {kind}" for kind in CHANGE_ORDER if kind in kinds]
-    if counts:
+    if counts := [f"{kinds.count(kind)} to {kind}" for kind in CHANGE_ORDER if kind in kinds]:
         yield f"\nReleases: {', '.join(counts)}.\n"
     else:
         yield "\nNo release starts, changes or stops.\n"
@@ -298,8 +296,7 @@ def _lines(checked: CheckResult) -> Iterator[str]:
             f"\nthe merge target has {commits} that this checkout lacks: git rebase --autostash "
             f"{checked.target}"
         )
-    consequence = checked.preview
-    if consequence is None:
+    if (consequence := checked.preview) is None:
         if checked.suggestions:
             yield "\nfix the errors to see what merging would do"
         return

@@ -248,8 +248,7 @@ def _asked(question: str, check: Callable[[str], object], most: int | None) -> t
     """Ask until the answer is at most ``most`` valid words; ``check`` raises for another word."""
 
     def valid(answer: str) -> tuple[str, ...]:
-        words = tuple(answer.split())
-        if not words:
+        if not (words := tuple(answer.split())):
             raise click.UsageError(
                 "an answer is needed; Ctrl-C ends the command, and nothing is written"
             )
@@ -265,8 +264,7 @@ def _asked(question: str, check: Callable[[str], object], most: int | None) -> t
 
 
 def _input(text: str) -> tuple[str, str]:
-    match = _INPUT.fullmatch(text)
-    if not match:
+    if not (match := _INPUT.fullmatch(text)):
         raise click.BadParameter(
             f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
             param_hint="--input",
@@ -281,8 +279,7 @@ def _input(text: str) -> tuple[str, str]:
 
 
 def _service(text: str) -> ServicePlan:
-    match = _SERVICE.fullmatch(text)
-    if not match:
+    if not (match := _SERVICE.fullmatch(text)):
         raise click.BadParameter(
             f"'{text}' is not NAME=PACKAGE/FILE; write it like "
             "detector=my_package/detector.launch.py",
@@ -292,8 +289,7 @@ def _service(text: str) -> ServicePlan:
 
 
 def _image(text: str) -> Image:
-    match = _IMAGE.fullmatch(text)
-    if not match or not (match["tag"] or match["digest"]):
+    if not (match := _IMAGE.fullmatch(text)) or not (match["tag"] or match["digest"]):
         raise click.BadParameter(
             f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
         )

@@ -42,8 +42,7 @@ def describe(schema: dict[str, Any], root: str) -> None:
             # for the model in this schema, else for the model, else for the one it inherits from
             places = (f"{root}/{model}", model, properties[_INHERITS].get(model, ""))
             models = (*(properties.get(place) or {} for place in places), _COMMON)
-            entry = next((each[name] for each in models if name in each), None)
-            if entry:
+            if entry := next((each[name] for each in models if name in each), None):
                 description, *example = entry
                 field["description"] = description
                 only = (

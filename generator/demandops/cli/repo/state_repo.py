@@ -322,8 +322,7 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     verified = sum(verdict.holds for verdict in verdicts) - skipped
     note = f", {skipped} skipped" if skipped else ""
     lines.append(f"{verified} of {len(verdicts)} commits are verified{note}")
-    signed = sum(verdict.signed for verdict in verdicts)
-    if signed:
+    if signed := sum(verdict.signed for verdict in verdicts):
         good = sum(bool(verdict.signer) for verdict in verdicts)
         listed = f", {good} by keys that policy/allowed-signers lists" if good else ""
         lines.append(f"{signed} of {len(verdicts)} are signed{listed}")

@@ -80,8 +80,7 @@ def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
 
 
 def _lease_text(item: Json, now: datetime) -> str:
-    lease = item["lease"]
-    if lease is None:
+    if (lease := item["lease"]) is None:
         return ""
     if not lease["until"]:
         return "not started"

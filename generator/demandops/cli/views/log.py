@@ -129,8 +129,7 @@ def log(
             )
 
         with busy("looking through the commits"):
-            entries = list(islice(filter(matches, commits), max_count))
-            if not entries:
+            if not (entries := list(islice(filter(matches, commits), max_count))):
                 _refuse_unknown(repo, given)
     rows = [commit_data(entry) for entry in entries]
     table = log_table(rows, REAL.now(), wide=output == "wide")
@@ -151,8 +150,7 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
         for name, values in names.items()
         if given[name] not in values
     ]
-    node = given["node"]
-    if node is not None:
+    if (node := given["node"]) is not None:
         # no commit needs to have changed a node that the inventory has
         nodes = {*repo.last_valid_snapshot(repo.commit()).state.config.nodes}
         if node not in nodes and not any(

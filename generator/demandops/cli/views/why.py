@@ -128,8 +128,7 @@ def _by_looser_match(
             yield Match("release", release.name, path_of(release), release)
             return
     if kind in (None, "demand"):
-        ids = sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(name))
-        if ids:
+        if ids := sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(name)):
             yield Match("demand", _the_only_name(name, ids, "demand ids begin with {}"))
             return
         if demand_commits(repo, snapshot, name):
@@ -162,8 +161,7 @@ def demand_commits(repo: Reader, snapshot: Snapshot, id: str) -> list[LogEntry]:
 def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
     path = path.rstrip("/")
     text = repo.file_reader(str(snapshot.commit))(path)
-    key = ledger_files.key_of(path, snapshot.state.ledger)
-    if key is not None:
+    if (key := ledger_files.key_of(path, snapshot.state.ledger)) is not None:
         return Match("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
     release = release_causes.release_named(snapshot.state, name)
@@ -412,8 +410,7 @@ def _described(world: World, match: Match) -> Json:
         }
     if match.kind == "release":  # it does not run; perhaps an override denies it
         file_name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
-        denied = release_causes.denied_release_named(world, file_name)
-        if denied is None:
+        if (denied := release_causes.denied_release_named(world, file_name)) is None:
             return {"runs": False}
         release, override = denied
         return {
@@ -498,8 +495,7 @@ def _claims(claims: list[Claim], world: World) -> Json:
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> Json:
     history = PathHistory(None, (), 0, None)
     if match.kind == "demand":
-        about = demand_commits(repo, snapshot, match.name)
-        if about:  # else the history was made anew
+        if about := demand_commits(repo, snapshot, match.name):  # else the history was made anew
             *newer, first = about
             held = ("demand", match.name) in snapshot.state.ledger.index
             stopped = None if held or not newer else newer.pop(0)

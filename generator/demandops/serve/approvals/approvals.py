@@ -105,8 +105,7 @@ class Approvals:
         # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
         # merged it earlier, the batch is evaluated on a tip that includes the merge.
         for ticket in batch if self._proposals else ():
-            request = _release_request(ticket, state)
-            if request is None:
+            if (request := _release_request(ticket, state)) is None:
                 continue
             for proposal in self._proposals.values():
                 if not releases(request, proposal.requests):
@@ -303,8 +302,7 @@ class Approvals:
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
         # false if a demand was withdrawn meanwhile, so that the proposal must be checked again
-        head = heads.branches.get(proposal.branch)
-        if head and head not in proposal.record.commits:
+        if (head := heads.branches.get(proposal.branch)) and head not in proposal.record.commits:
             # a rebuild would throw away what a person has written
             if not proposal.edited:
                 log.info("%s has commits by a person and stays unchanged", proposal.branch)

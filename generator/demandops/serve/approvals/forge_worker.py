@@ -139,8 +139,7 @@ class ForgeWorker:
                 task = self._tasks.popleft()
                 pull_request = self._pull_requests.get(task.branch)
                 try:
-                    forge = forge_for(task.forge, self._token_file)
-                    if forge is None:
+                    if (forge := forge_for(task.forge, self._token_file)) is None:
                         continue
                     pull_request = self._handle(task, forge, pull_request)
                 except ForgeError as error:

@@ -105,8 +105,7 @@ class WaitingTurns:
         while self.left:
             demand = self.left.pop(0)
             state, now = commits.head.state, self._runtime.now()
-            waiting = state.ledger.waiting.get(demand)
-            if waiting is None:  # it was released meanwhile
+            if (waiting := state.ledger.waiting.get(demand)) is None:  # it was released meanwhile
                 continue
             checkpoint = within(state.config.repo_settings.limits, self._runtime)
             try:

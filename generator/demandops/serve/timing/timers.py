@@ -235,8 +235,7 @@ class RateLimit:
         # forget requesters that sent nothing for a minute, because vehicles come and go
         while self._seen:
             idlest = next(iter(self._seen))
-            times = self._seen[idlest]
-            if times and abs(received - times[-1][0]) <= _WINDOW:
+            if (times := self._seen[idlest]) and abs(received - times[-1][0]) <= _WINDOW:
                 break
             del self._seen[idlest]
         seen = self._seen.pop(key, None) or deque()
