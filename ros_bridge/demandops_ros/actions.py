@@ -44,9 +44,7 @@ _CODES: tuple[tuple[type[BaseException], str], ...] = (
 class DeploymentRequestAdapter:
     # of the reference's action, whose results and feedback are plain text
     action: Any = DeploymentRequest
-
-    def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-        return message_to_data(goal)
+    to_data: Callable[[Any], Any] = staticmethod(message_to_data)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         return str(goal.id)
@@ -63,9 +61,7 @@ class DeploymentRequestAdapter:
 
 class DemandAdapter(DeploymentRequestAdapter):
     action = Demand
-
-    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
-        return demand_goal_to_data(goal)
+    to_data = staticmethod(demand_goal_to_data)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         return str(goal.demand_id)

@@ -87,20 +87,6 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
             f"to {registry} in {config.place_of(IMAGES_FILE)}, and give the images the "
             "names that they have in that registry (docs/migration.md)"
         )
-    yield from _brokers(values, config)
-    topics = values.get("connections.init_comm_topics") or ()
-    bridged = {
-        topic for node in config.nodes.values() for to in node.bridged.values() for topic in to
-    }
-    if missing := [topic for topic in topics if topic not in bridged]:
-        yield (
-            "parameter connections.init_comm_topics of the reference is not used: add "
-            f"{', '.join(missing)} to the field 'bridged' of the source node in "
-            f"{config.place_of(NODES_FILE)}"
-        )
-
-
-def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     for name, host in values.items():
         if (match := _BROKER.fullmatch(name)) is None:
             continue
@@ -118,11 +104,22 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
                 f"parameter {name} of the reference is not used: the broker {place}at "
                 f"{address} is not in {config.place_of(BROKERS_FILE)}; add it there"
             )
+    topics = values.get("connections.init_comm_topics") or ()
+    bridged = {
+        topic for node in config.nodes.values() for to in node.bridged.values() for topic in to
+    }
+    if missing := [topic for topic in topics if topic not in bridged]:
+        yield (
+            "parameter connections.init_comm_topics of the reference is not used: add "
+            f"{', '.join(missing)} to the field 'bridged' of the source node in "
+            f"{config.place_of(NODES_FILE)}"
+        )
 
 
 # ---- the node's parameters: their defaults, descriptions and ranges ----
 
-_CHOICES = {"answer": ANSWER_LEVELS, "log_level": ("debug", "info", "warn", "error", "fatal")}
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
+_CHOICES = {"answer": ANSWER_LEVELS, "log_level": LOG_LEVELS}
 DEFAULTS: dict[str, Any] = {
     "action_name": settings.DEFAULT_ACTION_NAME,
     "demand_action_name": settings.DEFAULT_DEMAND_ACTION_NAME,

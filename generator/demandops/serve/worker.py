@@ -317,7 +317,7 @@ class Worker:
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         # those that wait get the room that this demand frees before the next demand can take it
-        self._own_work.follow(commits, before)
+        self._own_work.waiting_turns.follow(commits, before)
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:

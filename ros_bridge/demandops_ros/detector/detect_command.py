@@ -16,6 +16,8 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
+from demandops_ros.node_parameters import LOG_LEVELS
+
 # ---- the detector's parameters ----
 
 # Each parameter: its default, its description and, if it is a number, its range.
@@ -52,8 +54,6 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
         None,
     ),
 }
-
-LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
 def declare(node: Node, rules: str | None) -> dict[str, Any]:
