@@ -122,7 +122,6 @@ DEEP_QOS = QoSProfile(depth=2000)
 # responds within milliseconds.
 _UNHEARD_S = 5.0
 
-_ASK_AGAIN_S = 0.2
 
 _GOAL_KEPT_S = 10  # how long ROS keeps a goal that has ended
 _RESULT_S = 900  # how long LastingResults keeps a result that ROS has forgotten
@@ -206,7 +205,7 @@ class GoalSender:
         # answers to the client are lost.
         while not self._is_discovered and REAL.monotonic() < deadline:
             try:
-                self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)
+                self._await(ask_the_node(self._client), REAL.monotonic() + 0.2)
             except DemandError:
                 continue
             self._is_discovered = True

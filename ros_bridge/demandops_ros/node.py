@@ -45,14 +45,12 @@ def _commit_and_json(snapshot: Snapshot) -> tuple[str, str]:
 
 # A node that starts later gets the last message too.
 LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-_SHORTEST_PAUSE_S = 1.0
 # The larger the ledger, the longer it takes to compute the bookkeeping. So this takes at most a
 # 20th of the time, and changes during a pause share one message.
 _PAUSE_FACTOR = 20
 
 # ---- the node's status on ``/diagnostics``, for ROS 2's own tools ----
 
-_PERIOD_S = 1.0
 _MOST_PROBLEMS = 20
 
 
@@ -164,7 +162,7 @@ class DemandNode(Node):  # type: ignore[misc]
         REAL.keep_running("bookkeeping-topic", self._publish_bookkeeping)
         self._others = actions.OtherServers(self, (action_name, demand_action_name))
         self._diagnostics = Diagnostics(self, "demandops", generator.address)
-        self.create_timer(_PERIOD_S, self._report)
+        self.create_timer(1.0, self._report)
 
     def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> LastingResults:
         return LastingResults(
@@ -237,7 +235,7 @@ class DemandNode(Node):  # type: ignore[misc]
 
             self._in_executor(publish)
             took = REAL.monotonic() - began
-            self._is_closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
+            self._is_closed.wait(max(1.0, took * _PAUSE_FACTOR))
 
     def _report(self) -> None:
         generator, add = self._generator, self._diagnostics.add

@@ -30,7 +30,6 @@ from demandops_ros.messages import ANSWER_LEVELS
 # namespaces and the image registry come from the state repo. If the file names one that the state
 # repo lacks, the node warns. The node also warns about parameters that it replaces by other means.
 
-_NODE = "application_manager"
 ACTION_NAME = "deployment_action_name"
 _RENAMES = re.compile(r".*__(node|name):=.*")
 _BROKER = re.compile(r"connections\.communication_broker(_params\.(?P<node>.+))?\.host")
@@ -54,7 +53,7 @@ def read_reference_parameters(ros_args: Sequence[str]) -> dict[str, Any]:
     }
     args = [word for at, word in enumerate(ros_args) if not {at, at + 1} & renames]
     probe = Node(
-        _NODE,
+        "application_manager",
         cli_args=args,
         use_global_arguments=False,
         start_parameter_services=False,

@@ -21,7 +21,6 @@ from demandops_ros import ros_process
 
 # ---- the text of a ROS parameter file ----
 
-_EVERY_NODE = ("/**", "**", "/*", "*")
 _SECTION = "ros__parameters"
 
 
@@ -32,7 +31,7 @@ def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
         raise InvalidInput([fault("", "must map nodes to their parameters").within(file)])
     name = node.lstrip("/")
     parameters: dict[str, Any] = {}
-    for key in (*_EVERY_NODE, f"/{name}", name):
+    for key in ("/**", "**", "/*", "*", f"/{name}", name):
         if key in data:
             section = data[key].get(_SECTION) if isinstance(data[key], dict) else None
             if not isinstance(section, dict):
@@ -56,9 +55,6 @@ def _flat(section: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, A
 #
 # A restarted node publishes its parameter events at a new endpoint, which the ROS graph shows.
 
-_LOOK_S = 0.2
-_ANSWER_S = 2.0
-_EVENTS = "/parameter_events"
 _LARGEST = 2**63 - 1  # the largest integer that ROS can transport
 
 
@@ -77,7 +73,7 @@ class ParameterSetter:
         self._call: Any = None
         self._called_at = 0.0
         self._changed = node.create_guard_condition(self._set_if_needed)
-        node.create_timer(_LOOK_S, self._set_if_needed)
+        node.create_timer(0.2, self._set_if_needed)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
         # any thread may call this; TypeError or ValueError names a value that ROS cannot carry
@@ -103,13 +99,13 @@ class ParameterSetter:
         # that was killed, so all of them are compared.
         endpoints = frozenset(
             tuple(info.endpoint_gid)
-            for info in self._node.get_publishers_info_by_topic(_EVENTS)
+            for info in self._node.get_publishers_info_by_topic("/parameter_events")
             if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._target
         )
         with self._lock:
             wanted, version = self._wanted, self._version
         if self._call is not None:
-            if REAL.monotonic() - self._called_at < _ANSWER_S:
+            if REAL.monotonic() - self._called_at < 2.0:
                 return
             self._client.remove_pending_request(self._call)  # the target ended without an answer
             self._call = None

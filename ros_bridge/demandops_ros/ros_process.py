@@ -21,9 +21,6 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-_POLL_S = 0.2
-_LAST_CALLBACK_S = 20.0
-
 
 class ExecutorThread:
     """Runs a node's callbacks in a thread, which must end before the node is destroyed."""
@@ -46,7 +43,7 @@ class ExecutorThread:
         if not self._over.is_set():
             self._over.set()
             self.call(lambda: None)  # wakes the thread
-            self._thread.join(_LAST_CALLBACK_S)
+            self._thread.join(20.0)
             self._executor.shutdown(timeout_sec=0)
 
     def _spin(self) -> None:
@@ -63,7 +60,7 @@ def stop_signals() -> Iterator[Callable[[], None]]:
     before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
 
     def wait() -> None:
-        while not over.wait(_POLL_S):  # poll, because another thread may get the signal
+        while not over.wait(0.2):  # poll, because another thread may get the signal
             pass
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)

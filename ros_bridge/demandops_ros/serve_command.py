@@ -30,9 +30,7 @@ from rclpy.logging import get_logger
 from demandops_ros import node_parameters, ros_process
 from demandops_ros.node import DemandNode
 
-_POLL_S = 0.02
 _TASK_S = 5.0
-_FLUSH_S = 0.3
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -199,12 +197,12 @@ def _run(
         status.close()  # this ends the goals that wait for a rollout
     end = REAL.monotonic() + _TASK_S
     while node.open_goals and REAL.monotonic() < end:
-        REAL.sleep(_POLL_S)
+        REAL.sleep(0.02)
     for _ in range(2):  # tasks of the executor send the results, so wait until they have run
         done = REAL.event()
         thread.call(done.set)
         done.wait(_TASK_S)
-    REAL.sleep(_FLUSH_S)  # time for clients to request the results
+    REAL.sleep(0.3)  # time for clients to request the results
     if not published:
         node.get_logger().warning(
             "the journal is not empty; its demands are resumed at the next start"

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.text import Text
 
-_WIDE = 200
-_PATIENCE_S = 0.5
 _MOST_LISTED = 3
 
 Progress = Callable[[int, int], None]
@@ -38,7 +36,7 @@ def console(stderr: bool = False) -> Console:
 
     # elsewhere than on a terminal, a program may read the lines, so they are not wrapped
     stream = sys.stderr if stderr else sys.stdout
-    width = None if stream.isatty() else _WIDE
+    width = None if stream.isatty() else 200
     # rich would take [bold] and :smile: in the texts of people for its own markup
     return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
@@ -167,7 +165,7 @@ def progress(title: str) -> Iterator[Progress]:
     def show(done: int, total: int) -> None:
         nonlocal bar, task
         if bar is None:
-            if not sys.stderr.isatty() or REAL.monotonic() - start < _PATIENCE_S or done >= total:
+            if not sys.stderr.isatty() or REAL.monotonic() - start < 0.5 or done >= total:
                 return
             from rich.progress import Progress as Bar  # noqa: PLC0415
 

@@ -20,8 +20,6 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 _GONE = "is gone; its last data stay valid"
 
-OnData = Callable[[Mapping[str, str]], object]
-
 
 class ConfigMapWatch:
     """Reads and watches a ConfigMap. It needs only the right to list and watch this object."""
@@ -30,7 +28,7 @@ class ConfigMapWatch:
         self,
         namespace: str,
         name: str,
-        on_data: OnData,
+        on_data: Callable[[Mapping[str, str]], object],
         kubeconfig: Path | None,
         runtime: Runtime = REAL,
     ) -> None:

@@ -26,7 +26,6 @@ _RENEW_WITHIN_S = 10  # a leader that has not renewed its Lease for so long ends
 # How long a call of the API may take. A renewal has two calls, and must end before the Lease does:
 # _RENEW_WITHIN_S + 2 * _CALL_S < _LEASE_S.
 _CALL_S = 2
-_PAUSE_S = 2.0
 # The API server takes no Lease with a duration of 0, so a released one is valid for a second.
 _RELEASED_S = 1
 _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-9])?)")
@@ -85,7 +84,7 @@ class Leadership:
                 problem = f"cannot be read or written: {reason_of(error)}"
                 self._tell(logging.WARNING, f"the Lease {self._lease} {problem}")
             self._require_renewed()
-            self._closed.wait(_PAUSE_S)
+            self._closed.wait(2.0)
             self._require_renewed()  # a renewal that begins now could end too late
 
     def _compete(self) -> None:

@@ -34,7 +34,6 @@ from demandops.render.gitops import domain_folder, domains_in_use, project_of
 
 _TIMEOUT_S = 5.0
 _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
-_NO_COMMIT = "0" * 40
 
 
 def call_argocd(
@@ -44,7 +43,7 @@ def call_argocd(
     # there was one. With None as ``paths``, Argo CD refreshes all Applications of the repo.
     event = {
         "ref": f"refs/heads/{MAIN_BRANCH}",
-        "before": before or _NO_COMMIT,
+        "before": before or "0" * 40,
         "after": after,
         "repository": {"html_url": web_address(repo), "default_branch": MAIN_BRANCH},
         "commits": [] if paths is None else [{"id": after, "modified": sorted(paths)}],
@@ -105,7 +104,6 @@ _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
 # So long after a push, Flux is woken even if it is not idle.
 _LONGEST_WAIT_S = 60.0
-_REFRESH = "argocd.argoproj.io/refresh"
 
 
 # Returns the newest published commit, and the paths that changed since a commit, if that is known.
@@ -283,7 +281,7 @@ class ReconcileTrigger:
                 if argocd:
                     group, version, plural = "argoproj.io", "v1alpha1", "applications"
                     namespace, object_name = argocd.namespace, project_of(domain, settings)
-                    annotation = {_REFRESH: "normal"}
+                    annotation = {"argocd.argoproj.io/refresh": "normal"}
                 else:
                     group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
                     namespace, object_name = domain.namespace, settings.source

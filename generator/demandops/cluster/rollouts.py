@@ -93,9 +93,6 @@ log = logging.getLogger("demandops")
 # Called with a state (reconciled, healthy, failing) and a text, once for each text.
 OnProgress = Callable[[str, str], None]
 
-_PAUSE_S = 0.05
-_LONGEST_WAIT_S = 1.0
-
 
 @dataclass(eq=False)
 class _Rollout:
@@ -159,10 +156,10 @@ class RolloutWatcher:
 
     def _run(self) -> None:
         while not self._closed:
-            self._changed.wait(_LONGEST_WAIT_S)
+            self._changed.wait(1.0)
             self._changed.clear()
             self._evaluate()
-            self._runtime.sleep(_PAUSE_S)  # wait, because changes come in bursts
+            self._runtime.sleep(0.05)  # wait, because changes come in bursts
         self._evaluate(last=True)
 
     def _evaluate(self, last: bool = False) -> None:

@@ -91,7 +91,6 @@ class RemoteMonitor:
 _TIDY_EVERY = 50
 # How often to carry out a change by a person while other generators, which do the same, are faster.
 _TRIES = 5
-_LONGEST_PAUSE_S = 0.05
 _NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
@@ -401,7 +400,7 @@ class Worker:
                 return not commits.is_empty
             self._repository.refresh()
             # at random, so that generators which all saw the change do not collide again
-            self._ends_soon.wait(self._runtime.uniform(0, _LONGEST_PAUSE_S))
+            self._ends_soon.wait(self._runtime.uniform(0, 0.05))
         return False  # other generators are faster, and they carry out the same changes
 
     def _new_commit_batch(self) -> CommitBatch:

@@ -68,8 +68,6 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand
 
 # ---- the view of one release ----
 
-MOST_CHANGES = 20
-
 
 @dataclass(frozen=True, slots=True)
 class DiffLine:
@@ -124,7 +122,7 @@ def explained_release(now: Situation, reader: Reader, name: str) -> Explained:
         raise StateRepoError(
             f"up to commit {commit_state.commit[:10]}, there was no release {quoted(name)}"
         )
-    history = reader.history(path, commit_state.commit, MOST_CHANGES)
+    history = reader.history(path, commit_state.commit, most=20)
     last = next(iter(history.newest), None) or history.started
     if history.stopped and not release:
         last = history.stopped

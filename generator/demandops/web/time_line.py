@@ -38,7 +38,6 @@ SPANS = {
 
 _STRIP_WIDTH = 1000
 _BINS = 60
-_FEW = 20
 # The distances between ticks that people can read off easily, from a second to 30 days.
 _STEPS_S = (1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 86400, 7 * 86400, 30 * 86400)
 _TICKS = 8
@@ -131,7 +130,7 @@ def strip(
     # shortest that has enough events. ``chosen`` is the time and the id of the chosen commit.
     if span not in SPANS:
         # enough events are 20, or three quarters of all events, whichever is less
-        last = min(_FEW, 3 * len(events) // 4) - 1
+        last = min(20, 3 * len(events) // 4) - 1
         oldest_shown = events[last].time if len(events) > 1 else now
         spans = (name for name, seconds in SPANS.items() if seconds)
         span = next(

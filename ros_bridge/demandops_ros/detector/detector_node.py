@@ -209,10 +209,6 @@ class DemandSender:
 # not end these demands.
 
 _MOST_REFUSALS = 20  # that the diagnostics list
-_DISCOVERY_S = 0.5
-_RELOAD_S = 1.0
-_PATIENCE_S = 10.0
-_MOST_OBSERVATIONS = 100_000
 # The time that ROS reports until the first message of a simulated clock arrives.
 _UNHEARD_CLOCK = 0.0
 # If the clock jumps by more, someone has set the clock or restarted the simulation.
@@ -230,7 +226,7 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._last_now, self._last_look = self._now(), REAL.monotonic()
         self._detector = Detector(file, self._last_now)
         self._is_started = False
-        self._observations: deque[Observation] = deque(maxlen=_MOST_OBSERVATIONS)
+        self._observations: deque[Observation] = deque(maxlen=100_000)
         self._sender = DemandSender(
             settings["action_name"],
             settings["demand_action_name"],
@@ -246,12 +242,12 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._bookkeeping = {}
         # by a steady clock, because a simulated one may be what is missing
         self._patience = self.create_timer(
-            _PATIENCE_S, self._say_what_is_missing, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            10.0, self._say_what_is_missing, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self.create_timer(settings["period"], self._step)
         # a reload replaces the subscriptions, so this timer is not bound to those of now
-        self.create_timer(_DISCOVERY_S, lambda: self._topics.refresh())  # noqa: PLW0108
-        self.create_timer(_RELOAD_S, self._reload_if_changed)
+        self.create_timer(0.5, lambda: self._topics.refresh())  # noqa: PLW0108
+        self.create_timer(1.0, self._reload_if_changed)
         self._diagnostics = Diagnostics(self, "demandops_detector", self._rules)
         self._problems: tuple[str, ...] = ()
         self.create_timer(1.0, self._report)

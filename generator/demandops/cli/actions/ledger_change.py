@@ -34,14 +34,12 @@ from demandops.serve.queue import Receipt
 
 # ---- booking, and printing the changes ----
 
-_LOOK_UP_S = 0.5
-
 
 def await_answer(future: Future[Any]) -> None:
     # Polled, so that Ctrl-C and SIGTERM interrupt it: a wait without a timeout could miss a signal
     # that arrives just before the wait begins, or a signal that another library handles.
     while not future.done():
-        wait([future], timeout=_LOOK_UP_S)
+        wait([future], timeout=0.5)
 
 
 def booked(generator: Generator, goal: Json) -> Receipt:

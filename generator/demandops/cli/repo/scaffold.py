@@ -81,7 +81,6 @@ def _filled(text: str, given: Mapping[str, str]) -> str:
 LIBRARY_FOLDER = f"appdefs/charts/{charts.LIBRARY}"
 _NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 _RESULT = "result"
-_REQUESTER = "operator"
 _VERSION = "0.1.0"
 
 
@@ -255,7 +254,7 @@ def _demand(plan: ApplicationPlan, config: Config) -> str:
     # The requester matches a rule that allows the application. If there is none, it matches the
     # first rule, and a person must widen the rules (`closed_domain`).
     rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
-    requester = _REQUESTER
+    requester = "operator"
     if rules:
         pattern = rules[0].requesters[0]
         matching = next((id for id in sorted(config.nodes) if matches(id, (pattern,))), "")

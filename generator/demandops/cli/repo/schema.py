@@ -27,7 +27,6 @@ from demandops.model.demand.deployment_request_goal import WireGoal
 
 # ---- a description and an example of each property, for editors and the docs ----
 
-_INHERITS = "inherits"
 _COMMON = {
     "apiVersion": ["Version of the format", API_VERSION],
     "kind": ["Type of the file's content"],
@@ -40,7 +39,7 @@ def describe(schema: dict[str, Any], root: str) -> None:
     for model, part in {root: schema, **schema.get("$defs", {})}.items():
         for name, field in part.get("properties", {}).items():
             # for the model in this schema, else for the model, else for the one it inherits from
-            places = (f"{root}/{model}", model, properties[_INHERITS].get(model, ""))
+            places = (f"{root}/{model}", model, properties["inherits"].get(model, ""))
             models = (*(properties.get(place) or {} for place in places), _COMMON)
             if entry := next((each[name] for each in models if name in each), None):
                 description, *example = entry

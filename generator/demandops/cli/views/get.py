@@ -404,8 +404,6 @@ KINDS: dict[str, Kind] = {
 # ---- the command ----
 
 FILTERS = ("node", "requester", "application", "domain")
-_POLL_S = 1.0
-_POLL_REMOTE_S = 10.0  # each look is a fetch
 _OF_NOTE = ("drained", "expired", "held back", "matches nothing", "not rendered yet", "overdue")
 _COLORS = {
     **dict.fromkeys((*_OF_NOTE, "partly suspended", "suspended", "waiting"), "yellow"),
@@ -494,7 +492,8 @@ def get(
         items = _matching(listed, items, names, wanted)
         _print_list(kind, source, items, output, watch)
         while watch:
-            REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
+            # each look at a remote is a fetch
+            REAL.sleep(1.0 if repo.repository.always_current else 10.0)
             try:
                 is_same = repo.refresh() == str(source.snapshot.commit)
             except RemoteAway as error:

@@ -34,7 +34,6 @@ from demandops.repo.git.repository import RemoteAway
 from demandops.repo.load.last_valid_config import Problem
 from demandops.repo.reader import Reader
 
-_POLL_S = 2.0
 _PATIENCE_S = 10
 
 
@@ -103,7 +102,7 @@ def status(
             if amiss != told:
                 errors.print(f"waiting: {amiss}")
                 told = amiss
-            REAL.sleep(_POLL_S)
+            REAL.sleep(2.0)
             try:
                 repo.refresh()
             except RemoteAway as error:  # then the last fetched commit is shown

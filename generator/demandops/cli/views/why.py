@@ -304,8 +304,6 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 
 # ---- the command ----
 
-_MOST_CARRIED_OUT = 5
-
 
 @click.command()
 @click.argument(
@@ -507,7 +505,7 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> Json:
     def row(entry: LogEntry | None) -> Json | None:
         if entry is None:
             return None
-        behind = repo.person_commits_behind(entry, _MOST_CARRIED_OUT)
+        behind = repo.person_commits_behind(entry, most=5)
         return commit_data(entry) | {"carries_out": [commit_data(commit) for commit in behind]}
 
     return {

@@ -98,7 +98,6 @@ class Rest:
 # ---- when to fetch from the state repo while no demand comes ----
 
 DEFAULT_INTERVAL = "30s"
-_LONGEST_BACKOFF_S = 60.0
 _SHORTEST_GAP_S = 0.5  # a Git server may report many pushes at once; they share a fetch
 # The longest interval for a repository on this disk, where a check is cheap: it reads one file.
 _LOCAL_S = 1.0
@@ -143,7 +142,7 @@ class PollTimer:
 
     def finished(self, *, reached: bool) -> None:
         """Plan the next fetch after a fetch or a push, which both tell of others' commits."""
-        longest = max(_LONGEST_BACKOFF_S, self._interval)
+        longest = max(60.0, self._interval)
         self._last = self._runtime.monotonic()
         if self._next is not None:
             self._pause = self._interval if reached else min(self._pause * 2, longest)
