@@ -29,7 +29,13 @@ class ExecutorThread:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._over = REAL.event()
-        self._thread = REAL.keep_running(name, self._spin)
+
+        def spin() -> None:
+            while not self._over.is_set() and self._executor.context.ok():
+                with suppress(ExternalShutdownException):
+                    self._executor.spin_once()
+
+        self._thread = REAL.keep_running(name, spin)
         # If no caller closes it: a thread that waits for ROS while Python exits aborts the process.
         atexit.register(self.close)
 
@@ -45,11 +51,6 @@ class ExecutorThread:
             self.call(lambda: None)  # wakes the thread
             self._thread.join(20.0)
             self._executor.shutdown(timeout_sec=0)
-
-    def _spin(self) -> None:
-        while not self._over.is_set() and self._executor.context.ok():
-            with suppress(ExternalShutdownException):
-                self._executor.spin_once()
 
 
 @contextmanager

@@ -29,6 +29,7 @@ from demandops.repo.history.commit_message import Person
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published
+from demandops.serve.approvals.proposal import merge_request
 from demandops.views.release_causes import Entry, override_report
 
 reason_option = click.option(
@@ -149,15 +150,8 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
     branch = f"override/{edit.name}"
     title, reason = harmless(one_line(edit.summary)), one_line(edit.reason)
     proposals = repo.last_valid_snapshot(repo.commit()).state.config.repo_settings.proposals
-    push_options = [
-        "merge_request.create",
-        f"merge_request.target={MAIN_BRANCH}",
-        f"merge_request.title={title}",
-        f"merge_request.description={reason}",
-        "merge_request.remove_source_branch",
-    ]
-    if proposals.forge != "gitlab":  # only GitLab opens a merge request for a push
-        push_options = []
+    # only GitLab opens a merge request for a push
+    push_options = merge_request(title, reason) if proposals.forge == "gitlab" else []
     pushed = person_commit.commit_to_branch(repo.repository, files, details, branch, push_options)
     link = pushed.link
     try:

@@ -48,6 +48,16 @@ class Document:
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
 
+    def as_release(self) -> Document:
+        goal = self.goal
+        if not isinstance(goal, dict):  # the check of goals refuses it later
+            return self
+        if not is_demand_goal(goal):
+            return replace(self, goal={**goal, "shutdown": True})
+        names = ("apiVersion", "kind", "demand", "request", "requesters")
+        given = {name: goal[name] for name in names if name in goal}
+        return replace(self, goal=given | {"operation": "release"})
+
 
 # The receipt, or the proposal that awaits approval.
 class _Answer(Future["Receipt | dict[str, str]"]):
@@ -99,7 +109,7 @@ def request(
         goals = enumerate(strict_yaml.load_all(text, name))
         documents += [Document(name, goal, text, at) for at, goal in goals if goal is not None]
     if release:
-        documents = [replace(document, goal=_release_of(document.goal)) for document in documents]
+        documents = [document.as_release() for document in documents]
     if not documents:
         raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     if any(form_faults(document.goal) for document in documents):
@@ -123,15 +133,6 @@ def request(
 def _is_unanswered(row: Json) -> bool:
     # a request that waits for room on a node has an answer: the commit that records the wait
     return row["outcome"] == "waiting" and row["commit"] is None
-
-
-def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
-    if not isinstance(goal, dict):  # the check of goals refuses it later
-        return goal
-    if not is_demand_goal(goal):
-        return {**goal, "shutdown": True}
-    names = ("apiVersion", "kind", "demand", "request", "requesters")
-    return {name: goal[name] for name in names if name in goal} | {"operation": "release"}
 
 
 def _row(index: int, request_id: str, outcome: str, **more: object) -> Json:

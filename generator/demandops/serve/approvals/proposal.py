@@ -210,13 +210,17 @@ def push_options(message: str, labels: Iterable[str]) -> list[str]:
         f"{_head(message)} {code(why)} Merging approves the demand; deleting the branch rejects "
         "the demand."
     )
+    labelled = (f"merge_request.label={label}" for label in labels)
+    return [*merge_request(title, description), *labelled]
+
+
+def merge_request(title: str, description: str) -> list[str]:
     return [
         "merge_request.create",
         f"merge_request.target={MAIN_BRANCH}",
         f"merge_request.title={title}",
         f"merge_request.description={description}",
         "merge_request.remove_source_branch",
-        *(f"merge_request.label={label}" for label in labels),
     ]
 
 
