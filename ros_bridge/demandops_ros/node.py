@@ -118,8 +118,6 @@ class _Goal:
 
 
 class DemandNode(Node):  # type: ignore[misc]
-    """Serves ``DeploymentRequest`` and ``Demand`` for one state repo."""
-
     def __init__(
         self,
         generator: Generator,

@@ -257,10 +257,8 @@ clusters_option = click.option(
 
 # ---- names from the state repo, for a shell's completion ----
 
-Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
-
-def names_of(*kinds: str) -> Complete:
+def names_of(*kinds: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         try:
             with ctx.scope(cleanup=False):

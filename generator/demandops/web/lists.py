@@ -102,8 +102,6 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One page of a filtered and sorted list."""
-
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     total: int  # of all rows of the list

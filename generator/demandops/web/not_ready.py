@@ -182,21 +182,17 @@ def applications(now: Situation, causes: Iterable[Cause], wanted: Filter) -> lis
         for application in cause.applications:
             by_application.setdefault(application, []).append(cause)
     statuses: dict[str, list[ReleaseStatus]] = {}
-    rows: dict[str, Row] = {}
+    claims_of: dict[str, list[Claim]] = {}
     for name, release in now.commit_state.releases.items():
         for application in release.applications if isinstance(release, ServiceRelease) else ():
             statuses.setdefault(application, []).append(now.status(name))
     for claim in now.commit_state.state.ledger:
         if claim.is_on_application:
-            row_before = rows.get(claim.subject.id)
-            who = {*claim.requesters, *(row_before.hidden["requester"] if row_before else ())}
-            demands = {claim.demand, *(row_before.hidden["demand"] if row_before else ())}
-            rows[claim.subject.id] = Row(
-                {"application": cell(claim.subject.id)},
-                {"requester": sorted(who), "demand": sorted(demands)},
-            )
+            claims_of.setdefault(claim.subject.id, []).append(claim)
     shown = []
-    for application, row in sorted(rows.items()):
+    for application, claims in sorted(claims_of.items()):
+        texts = {"requester": requesters_of(claims), "demand": [claim.demand for claim in claims]}
+        row = Row({"application": cell(application)}, texts)
         if wanted.matches(row):
             its_causes = tuple(by_application.get(application, ()))
             word = worst_word(statuses.get(application, ()))

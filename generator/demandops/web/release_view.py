@@ -40,7 +40,6 @@ class ExplainedDemand:
 
 
 def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand:
-    """Return a demand and what would change without it; refuse one that holds nothing."""
     if not (claims := now.commit_state.claims_of_demands.get(id)):
         waiting = now.commit_state.state.ledger.waiting.values()
         is_waiting = any(demand.demand == id for demand in waiting)

@@ -78,8 +78,6 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class ReusableRows:
-    """The rows of a list, kept for the next time that the page shows the list."""
-
     # The status of each release when the rows were made; None if they are of an earlier commit.
     statuses: object
     rows: Mapping[str, tuple[tuple[Any, ...], Any]]  # the values and the row of each entry
@@ -97,7 +95,6 @@ class CommitState:
         # The rows of each list that was shown, by the list's name.
         self.rows: dict[str, ReusableRows] = {}
         self._entries: list[Entry] | None = None
-        self._planned: dict[ReleaseKey, Planned | None] | None = None
         # The newest commit that changed a path; None if none did. Paths are looked up when asked
         # for, because each look-up walks through the history.
         self.last_changes: dict[str, LogEntry | None] = {}
@@ -138,7 +135,7 @@ class CommitState:
             planned.pop(key, None)
             if (release := self._plan(key)) or denied_release(new, key):
                 planned[key] = release
-        self._planned = planned
+        self.planned = planned
         self.rows = {name: replace(rows, statuses=None) for name, rows in before.rows.items()}
 
     def _with_other_claims(
@@ -175,13 +172,11 @@ class CommitState:
         target = rollouts.target_of(release, self.config.repo_settings)
         return Planned(release, target, release_causes.claims_behind(self.active.ledger, release))
 
-    @property
+    @cached_property
     def planned(self) -> dict[ReleaseKey, Planned | None]:
         # None if the release is denied, if all claims that need it are suspended, or if the client
         # of a connection carries no topic
-        if self._planned is None:
-            self._planned = {key: self._plan(key) for key in release_keys.all_keys(self.state)}
-        return self._planned
+        return {key: self._plan(key) for key in release_keys.all_keys(self.state)}
 
     @cached_property
     def _sorted(self) -> list[Planned]:

@@ -65,9 +65,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """Events of one lane that are close together."""
-
-    lane: str
+    lane: str  # of the events, which are close together
     x: float
     radius: float
     count: int

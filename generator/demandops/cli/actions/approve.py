@@ -75,7 +75,7 @@ def _proposal(repo: Reader, name: str, commit: str, output: str) -> PendingPropo
 @output_option
 def approve(
     name: str,
-    reason: str | None,
+    reason: str,
     commit: str,
     yes: bool,
     state_repo: str,
@@ -115,8 +115,7 @@ def approve(
                 errors.print(f"  {one_line(line)}")
         person_change.confirm("Approve it?", yes, output)
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
-        why = " ".join((reason or "").split())
-        details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, why)
+        details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
         merged = person_commit.merge(repo.repository, proposal, details)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
     show(output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"])

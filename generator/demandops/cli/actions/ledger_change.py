@@ -123,7 +123,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     name: str,
     state_repo: str,
     kinds: str | None,
-    reason: str | None,
+    reason: str,
     dry_run: bool,
     yes: bool,
     signing_key: Path | None,
@@ -146,9 +146,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     """
     chosen = frozenset([kinds] if kinds else ["node", "requester"])
     by = commit_message.operator()
-    goal = Decommission(
-        name, kinds=chosen, by=str(by), reason=" ".join((reason or "").split())
-    ).goal()
+    goal = Decommission(name, kinds=chosen, by=str(by), reason=reason).goal()
     if dry_run or person_change.is_asked(yes, output):
         row = _dry_run_decommission(goal, state_repo, output)
         show(output, row, _decommission_lines(row, True))
@@ -235,7 +233,7 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     revision: str,
     state_repo: str,
-    reason: str | None,
+    reason: str,
     drop_newer: bool,
     dry_run: bool,
     yes: bool,
@@ -256,12 +254,12 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
       demandops rollback 14:00 -m "The station sent nonsense"
       demandops rollback 2h -m "A wrong test" --drop-newer --yes
     """
-    if not (dry_run or (reason and reason.strip())):
+    if not (dry_run or reason):
         raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo, only_read=dry_run) as repo:
         to, base = repo.commit(revision), repo.commit()
         who = repo.operator() if dry_run else person_change.warned_if_unnamed(repo.operator())
-        goal = evaluation.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)
+        goal = evaluation.goal(to, drop_newer=drop_newer, reason=reason, who=who)
         result: Json = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
         result |= {**_consequences(None), "configuration_since": since, "faults": []}

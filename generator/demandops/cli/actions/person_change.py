@@ -36,6 +36,7 @@ reason_option = click.option(
     "-m",
     "--reason",
     metavar="TEXT",
+    callback=lambda ctx, param, text: " ".join((text or "").split()),
     help="The reason. It is written to the commit message and to the file of a new override.",
 )
 yes_option = click.option("-y", "--yes", is_flag=True, help="Do not ask for confirmation.")
@@ -92,7 +93,6 @@ def editing(command: target.Command) -> target.Command:
 
     @wraps(command)
     def run(**given: Any) -> Any:  # noqa: ANN401
-        given["reason"] = " ".join((given["reason"] or "").split())
         options = EditOptions(
             **{field.name: given.pop(field.name) for field in fields(EditOptions)}
         )

@@ -37,7 +37,6 @@ _ROOM_FOR_NOTE = 200
 
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
-    """Return the result of a check as Markdown, with at most ``longest`` characters."""
     parts = [f"{MARK}\n", *_findings(checked), *_consequence(checked)]
     room = longest - _ROOM_FOR_NOTE
     taken, left_out = list[str](), 0
