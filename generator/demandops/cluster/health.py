@@ -28,11 +28,9 @@ class ObjectName(NamedTuple):
 
 
 class ObjectSelector(NamedTuple):
-    """Selects objects of a kind in a namespace, or only the one of a name."""
-
     kind: str
     namespace: str
-    name: str = ""
+    name: str = ""  # all of the namespace, if it is empty
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,8 +31,6 @@ class ServiceMark:
 
 @dataclass(frozen=True, slots=True)
 class NodeCard:
-    """A node as it is drawn; on a small card, ``services`` is empty and ``more`` is 0."""
-
     id: str
     type: str
     x: float
@@ -45,7 +43,7 @@ class NodeCard:
     count: int  # of all services on the node
     label: str
     title: str
-    services: tuple[ServiceMark, ...] = ()
+    services: tuple[ServiceMark, ...] = ()  # none on a small card
     more: int = 0  # how many services the card has no room for
 
     def curve_to(self, target: NodeCard) -> str:

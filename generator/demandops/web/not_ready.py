@@ -120,8 +120,6 @@ _MOST_LISTED = 3
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Something that keeps applications from being ready, or that needs attention."""
-
     kind: Kind
     what: Part
     why: str

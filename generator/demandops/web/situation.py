@@ -84,8 +84,6 @@ class ReusableRows:
 
 
 class CommitState:
-    """The state at one commit, with all that the page derives from it at its first use."""
-
     def __init__(
         self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
     ) -> None:
@@ -227,11 +225,7 @@ class CommitState:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """The state at a commit, with the health of releases and the open proposals.
-
-    For an earlier commit, all that the clusters report is empty.
-    """
-
+    # for an earlier commit, all that the clusters report is empty
     commit_state: CommitState
     now: datetime
     is_newest: bool = True

@@ -115,11 +115,9 @@ def editing(command: target.Command) -> target.Command:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A person's edit of one override, and the summary and reason of its commit."""
-
-    name: str
+    name: str  # of the override
     text: str | None  # None removes the file
-    summary: str
+    summary: str  # of the commit
     reason: str
 
     @property

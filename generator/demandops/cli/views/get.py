@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
@@ -59,16 +58,12 @@ class Source:
     not_rendered: Collection[str] = ()  # files that a generator has yet to write or remove
 
 
-class Kind(ABC):
-    """A kind of thing: its items, each with a ``name``, and how they are shown."""
-
+class Kind:
+    items: Callable[[Source], list[Json]]  # each with a ``name``
     columns: Sequence[tuple[Column, CellOf]]
     wide: Sequence[tuple[Column, CellOf]]  # further columns for `-o wide`
     # An item is listed if the option matches one of the values that its filter returns.
     filters: ClassVar[Mapping[str, Values]]
-
-    @abstractmethod
-    def items(self, source: Source) -> list[Json]: ...
 
     def table(self, items: Iterable[Json], now: datetime, *, wide: bool = False) -> Table:
         shown = [*self.columns, *(self.wide if wide else ())]

@@ -24,8 +24,6 @@ _PAUSE_FACTOR = 9
 
 
 class CheckTimer:
-    """Decides when the next check is due. A failed check is retried when the interval is over."""
-
     def __init__(self, runtime: Runtime, *, local: bool) -> None:
         self._runtime = runtime
         self._interval = CHECK_LOCAL_S if local else CHECK_REMOTE_S

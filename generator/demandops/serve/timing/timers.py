@@ -71,8 +71,6 @@ FIRST_S, LONGEST_S = 1.0, 60.0
 
 
 class Rest:
-    """A pause after an error; each further error doubles it until a success."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._next, self._until = FIRST_S, runtime.monotonic()
@@ -111,13 +109,9 @@ def parse_interval(text: str) -> float:
 
 
 class PollTimer:
-    """Decides when to fetch: on request, and at an interval that grows while fetches fail.
-
-    Any thread may call :meth:`request`. Only one thread may call the other methods.
-    """
-
+    # any thread may call `request`, but only one thread may call the other methods
     def __init__(self, interval: float, runtime: Runtime, *, local: bool = False) -> None:
-        """Start the timer. With an interval of 0, only :meth:`request` makes a fetch due."""
+        # the interval grows while fetches fail; if it is 0, only `request` makes a fetch due
         self._interval = min(interval, _LOCAL_S) if local else interval
         self._runtime = runtime
         self._pause = self._interval
