@@ -76,11 +76,8 @@ def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
 
 
 def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    """Return the ``Demand.Goal`` for a document of the kind ``Demand``.
-
-    ValueError is raised for an unknown field or word, or a lease that is no duration. A value that
-    the message cannot carry raises TypeError, AssertionError, AttributeError or OverflowError.
-    """
+    # An unknown field or word, or a lease that is no duration, raises ValueError. A value that the
+    # message cannot carry raises TypeError, AssertionError, AttributeError or OverflowError.
     more = {"apiVersion", "kind", "lease", "operation", "answer"}
     more |= {"applications", "connections", "positions"}
     goal = _message(DemandMessage.Goal, **_fields(data, _DEMAND, more, "a demand"))

@@ -217,13 +217,9 @@ class _Signals:
 
     def __init__(self) -> None:
         self.stopping = False
-        # The kernel may deliver a signal to any thread, so Python writes each signal to a pipe that
-        # the main thread reads.
-        self._read, self._write = os.pipe()
-        os.set_blocking(self._write, False)
+        self._woken = REAL.event()
 
     def __enter__(self) -> _Signals:
-        self._wakeup = signal.set_wakeup_fd(self._write)
         numbers = (signal.SIGINT, signal.SIGTERM)
         self._before = {number: signal.signal(number, self._handle) for number in numbers}
         REAL.when_unsound = self.wake
@@ -232,18 +228,18 @@ class _Signals:
     def __exit__(self, *error: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
-        signal.set_wakeup_fd(self._wakeup)
 
     def wait(self, until: Callable[[], bool] = lambda: False) -> None:
         """Wait until a signal comes or ``until()`` is true, which each :meth:`wake` checks."""
         while not (self.stopping or until() or REAL.unsound):
-            os.read(self._read, 1)
+            self._woken.wait(0.2)  # poll, because another thread may get the signal
+            self._woken.clear()
         if REAL.unsound is not None:
             errors.print(f"error: {REAL.unsound}")
             os._exit(ExitCode.PROGRAM_ERROR)  # an orderly exit could answer goals
 
     def wake(self) -> None:
-        os.write(self._write, b"\0")  # any thread may call this
+        self._woken.set()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.stopping:

@@ -112,8 +112,7 @@ ChangesSince = Callable[[str], tuple[str, list[str] | None]]
 
 @dataclass(eq=False)
 class _Wake:
-    """A planned call that makes the controller of access domains fetch; in monotonic seconds."""
-
+    # a planned call that makes the controller of access domains fetch; in monotonic seconds
     cluster: str
     domains: tuple[AccessDomain, ...]
     pushed: float | None = None  # the oldest push that still needs a call
@@ -132,8 +131,7 @@ class _Wake:
 
 
 class ReconcileTrigger:
-    """Wakes clusters from its own thread; pushes that come before a call is due share it."""
-
+    # in a thread of its own; pushes that come before a call is due share it
     def __init__(
         self,
         clusters: Mapping[str, ClusterAccess],

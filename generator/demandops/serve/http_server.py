@@ -80,12 +80,9 @@ class HttpServer:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection that is closed if its client takes too long or sends in too small pieces.
-
-    The client must complete a request within 10 to 20 seconds, and has as long to read each part of
-    an answer. While the server computes an answer, no time counts. So a stream of events stays open
-    while the client reads the events.
-    """
+    # The client must complete a request within 10 to 20 seconds, and has as long to read each part
+    # of an answer. While the server computes an answer, no time counts. So a stream of events stays
+    # open while the client reads the events.
 
     most: int  # of the connections that may be open
 

@@ -31,8 +31,7 @@ _KEPT = 2_000
 
 
 class ClusterWatch:
-    """Only one thread at a time may use a watch, but any thread may read :attr:`changes`."""
-
+    # only one thread at a time may use a watch, but any thread may read `changes`
     def __init__(
         self, clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None]
     ) -> None:

@@ -76,8 +76,6 @@ class DiffLine:
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """A release that runs, that an override denies, or that ran before."""
-
     name: str
     path: str
     release: Release | None  # None if it does not run

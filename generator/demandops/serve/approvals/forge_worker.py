@@ -74,8 +74,7 @@ class _Task:
 
 
 class ForgeWorker:
-    """Opens, watches and closes pull requests; only the worker thread calls its public methods."""
-
+    # only the worker thread calls its public methods
     def __init__(
         self, token_file: Path | None, on_update: Callable[[str], None], runtime: Runtime
     ) -> None:
