@@ -59,9 +59,43 @@ class Document:
         return replace(self, goal=given | {"operation": "release"})
 
 
-# The receipt, or the proposal that awaits approval.
 class _Answer(Future["Receipt | dict[str, str]"]):
-    pass
+    # the receipt, or the proposal that awaits approval
+
+    def of(self, generator: Generator, document: Document, wait: bool) -> _Answer:
+        def listen(stage: str, text: str) -> None:
+            if stage != "proposed":
+                return
+            if wait:
+                errors.print(f"{document.file}: request '{document.request_id}' {text}")
+            elif not self.done():
+                self.set_result(parse_waiting_text(text))
+
+        def finish(future: Future[Receipt]) -> None:
+            if self.done():  # the proposal was the answer
+                return
+            if (error := future.exception()) is not None:
+                self.set_exception(error)
+            else:
+                self.set_result(future.result())
+
+        generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
+        return self
+
+    def row(self, index: int, document: Document) -> Json:
+        try:
+            result = self.result(timeout=0)
+        except (ShuttingDown, TimeoutError):  # the command was interrupted
+            return _row(index, document.request_id, "waiting")
+        except Unsound:  # it is not known whether the request was booked
+            raise
+        except DemandOpsError as error:
+            return _refused(index, document, error)
+        if not isinstance(result, Receipt):
+            return _row(index, document.request_id, "proposed", proposal=result)
+        names = ("commit", "warnings", "not_held", "placed")
+        more = {name: getattr(result, name) for name in names}
+        return _row(index, result.request_id, result.outcome, **more)
 
 
 @click.command()
@@ -180,7 +214,7 @@ def _book(
     try:
         with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
             for document in documents:
-                answers.append(_submitted(generator, document, wait))
+                answers.append(_Answer().of(generator, document, wait))
             for done, answer in enumerate(answers, start=1):
                 ledger_change.await_answer(answer)
                 report(done, len(documents))
@@ -194,45 +228,7 @@ def _book(
         unsent.set_exception(Withdrawn("was not sent, because of the interrupt; send it again"))
         answers.append(unsent)
     pairs = enumerate(zip(documents, answers, strict=True))
-    return [_answered(index, document, answer) for index, (document, answer) in pairs]
-
-
-def _answered(index: int, document: Document, answer: _Answer) -> Json:
-    try:
-        result = answer.result(timeout=0)
-    except (ShuttingDown, TimeoutError):  # the command was interrupted
-        return _row(index, document.request_id, "waiting")
-    except Unsound:  # it is not known whether the request was booked
-        raise
-    except DemandOpsError as error:
-        return _refused(index, document, error)
-    if not isinstance(result, Receipt):
-        return _row(index, document.request_id, "proposed", proposal=result)
-    more = {name: getattr(result, name) for name in ("commit", "warnings", "not_held", "placed")}
-    return _row(index, result.request_id, result.outcome, **more)
-
-
-def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
-    answer = _Answer()
-
-    def listen(stage: str, text: str) -> None:
-        if stage != "proposed":
-            return
-        if wait:
-            errors.print(f"{document.file}: request '{document.request_id}' {text}")
-        elif not answer.done():
-            answer.set_result(parse_waiting_text(text))
-
-    def finish(future: Future[Receipt]) -> None:
-        if answer.done():  # the proposal was the answer
-            return
-        if (error := future.exception()) is not None:
-            answer.set_exception(error)
-        else:
-            answer.set_result(future.result())
-
-    generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
-    return answer
+    return [answer.row(index, document) for index, (document, answer) in pairs]
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Json]:

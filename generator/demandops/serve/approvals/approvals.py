@@ -81,7 +81,12 @@ class Approvals:
         self._demands = demands
         self._with_targets = with_targets
         self._branches = ProposalBranches(repository)
-        self._forge = ForgeWorker(token_file, self._on_forge_update, repository.runtime)
+
+        def on_update(branch: str) -> None:
+            self._changed.append(branch)  # in the forge's thread; a deque needs no lock for it
+            demands.wake()
+
+        self._forge = ForgeWorker(token_file, on_update, repository.runtime)
         self._timer = CheckTimer(repository.runtime, local=repository.always_current)
         self._proposals: dict[str, Proposal] = {}  # by branch
         self._changed: deque[str] = deque()
@@ -387,10 +392,6 @@ class Approvals:
     def _forget(self, proposal: Proposal, closed_as: str) -> None:
         self._proposals.pop(proposal.branch, None)
         self._forge.forget(proposal.branch, code(closed_as) if closed_as else "")
-
-    def _on_forge_update(self, branch: str) -> None:
-        self._changed.append(branch)  # in the forge's thread; appending to a deque needs no lock
-        self._demands.wake()
 
     def suspend(self) -> None:
         error = errors.ShuttingDown("the demand awaits approval, and is resumed at the next start")
