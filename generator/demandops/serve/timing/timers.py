@@ -51,6 +51,7 @@ class Backoff:
     def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
         # The seconds to wait, as another writer published first. ``size`` counts the demands of the
         # attempt, which took ``evaluating_s`` to commit them, and ``pushing_s`` from then on.
+
         # a writer that evaluates for longer than its push takes always loses to faster writers
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
         wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
