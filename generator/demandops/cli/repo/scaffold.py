@@ -150,12 +150,12 @@ def application_files(
     chart = f"{root}/charts/{plan.name}"
     files = {
         f"{root}/appdef.yaml": _appdef(plan, config),
-        f"{root}/README.md": _filled(texts["readme.md"], given),
+        f"{root}/README.md": _filled(texts["readme"], given),
         f"{root}/demand.yaml": _demand(plan, config),
         f"{chart}/Chart.yaml": _filled(texts["chart.yaml"], given),
         f"{chart}/values.yaml": values,
         f"{chart}/values.schema.json": json.dumps(schema, indent=2, ensure_ascii=False) + "\n",
-        f"{chart}/README.md": _filled(texts["chart-readme.md"], given),
+        f"{chart}/README.md": _filled(texts["chart-readme"], given),
         f"{chart}/templates/service.yaml": _filled(texts["service.yaml"], given),
     }
     for service, inputs in _chain(plan):
