@@ -17,6 +17,7 @@ from demandops.decide.changeset import CHANGE_ORDER, FileChange, MergePreview
 from demandops.repo.pull_request import merge_check
 from demandops.repo.pull_request.merge_check import CheckResult
 from demandops.repo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
+from demandops.serve.approvals.proposal import backticks
 from demandops.templating.evaluator import processor_time
 from demandops.views.bookkeeping import EntryChange
 
@@ -80,7 +81,7 @@ def code(text: str) -> str:
     text = one_line(text, _LONGEST_SPAN)
     if not text.strip():
         return "(empty)"
-    marks = _longer_than_any(text, least=1)
+    marks = backticks(text, least=1)
     # Markdown needs a space between a backtick of the text and those that enclose it
     edge = " " if text.startswith("`") or text.endswith("`") else ""
     return f"{marks}{edge}{text}{edge}{marks}"
@@ -88,13 +89,8 @@ def code(text: str) -> str:
 
 def fence(text: str, language: str) -> str:
     text = lines(text)
-    marks = _longer_than_any(text, least=3)
+    marks = backticks(text, least=3)
     return f"{marks}{language}\n{text.rstrip()}\n{marks}\n"
-
-
-def _longer_than_any(text: str, least: int) -> str:
-    longest = max((len(run) for run in re.findall("`+", text)), default=0)
-    return "`" * max(least, longest + 1)
 
 
 def _findings(checked: CheckResult) -> Iterator[str]:
