@@ -11,14 +11,8 @@ import rclpy
 from action_msgs.msg import GoalStatus
 from application_manager_interfaces.action import DeploymentRequest
 from builtin_interfaces.msg import Duration
-from demandops.base.errors import (
-    DemandOpsError,
-    InvalidInput,
-    NotReached,
-    ShuttingDown,
-    TurnedDown,
-    Withdrawn,
-)
+from demandops.base import errors
+from demandops.base.errors import DemandOpsError, InvalidInput, Withdrawn
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.cluster.health import Level
@@ -40,8 +34,8 @@ from demandops_ros.ros_process import ExecutorThread
 # The first kind that fits counts.
 _CODES: tuple[tuple[type[BaseException], str], ...] = (
     (Withdrawn, "withdrawn"),
-    (TurnedDown, "turned-down"),
-    (ShuttingDown, "shutting-down"),
+    (errors.TurnedDown, "turned-down"),
+    (errors.ShuttingDown, "shutting-down"),
     (DemandOpsError, "state-repo"),
     (BaseException, "fault"),
 )
@@ -50,9 +44,7 @@ _CODES: tuple[tuple[type[BaseException], str], ...] = (
 class DeploymentRequestAdapter:
     # of the reference's action, whose results and feedback are plain text
     action: Any = DeploymentRequest
-
-    def to_data(self, goal: Any) -> Any:  # noqa: ANN401 - messages are generated classes
-        return message_to_data(goal)
+    to_data: Callable[[Any], Any] = staticmethod(message_to_data)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         return str(goal.id)
@@ -69,9 +61,7 @@ class DeploymentRequestAdapter:
 
 class DemandAdapter(DeploymentRequestAdapter):
     action = Demand
-
-    def to_data(self, goal: Any) -> Any:  # noqa: ANN401
-        return demand_goal_to_data(goal)
+    to_data = staticmethod(demand_goal_to_data)
 
     def name(self, goal: Any) -> str:  # noqa: ANN401
         return str(goal.demand_id)
@@ -117,7 +107,7 @@ def _code(outcome: Receipt | BaseException) -> str:
         return "ok"
     if isinstance(outcome, InvalidInput):
         return outcome.faults[0].code
-    if isinstance(outcome, NotReached):
+    if isinstance(outcome, errors.NotReached):
         return f"not-{outcome.level}"
     return next(code for kind, code in _CODES if isinstance(outcome, kind))
 
@@ -132,7 +122,6 @@ DEEP_QOS = QoSProfile(depth=2000)
 # responds within milliseconds.
 _UNHEARD_S = 5.0
 
-_ASK_AGAIN_S = 0.2
 
 _GOAL_KEPT_S = 10  # how long ROS keeps a goal that has ended
 _RESULT_S = 900  # how long LastingResults keeps a result that ROS has forgotten
@@ -216,7 +205,7 @@ class GoalSender:
         # answers to the client are lost.
         while not self._is_discovered and REAL.monotonic() < deadline:
             try:
-                self._await(ask_the_node(self._client), REAL.monotonic() + _ASK_AGAIN_S)
+                self._await(ask_the_node(self._client), REAL.monotonic() + 0.2)
             except DemandError:
                 continue
             self._is_discovered = True

@@ -205,8 +205,7 @@ class HeldDemand:
 
         The errors are those of :meth:`DemandClient.put`.
         """
-        lease_s = self._put_and_remember().lease_s
-        if lease_s:
+        if lease_s := self._put_and_remember().lease_s:
             self._renewer = REAL.keep_running("lease", partial(self._renew_until_over, lease_s))
         return self
 

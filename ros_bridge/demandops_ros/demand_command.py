@@ -11,8 +11,8 @@ from demandops.base.errors import InvalidInput, fault
 from demandops.base.runtime import REAL
 from demandops.base.settings import DEFAULT_DEMAND_ACTION_NAME
 from demandops.base.strict_yaml import read_input
-from demandops.cli.json_output import output_option, print_json
-from demandops.cli.output import console, errors
+from demandops.cli.json_output import output_option, show
+from demandops.cli.output import errors
 from demandops.model.config.base_model import duration_text
 
 from demandops_ros.client import Answer, DemandClient, DemandError, HeldDemand
@@ -87,22 +87,18 @@ def _print_stages(output: str) -> Any:  # noqa: ANN401
 
 
 def _print_answer(answer: Answer, output: str) -> None:
-    if output == "json":
-        print_json(
-            {
-                "outcome": answer.outcome,
-                "commit": answer.commit,
-                "reached": answer.reached,
-                "lease": answer.lease_s or None,
-                "faults": [],
-                "warnings": list(answer.warnings),
-            }
-        )
-        return
+    data = {
+        "outcome": answer.outcome,
+        "commit": answer.commit,
+        "reached": answer.reached,
+        "lease": answer.lease_s or None,
+        "faults": [],
+        "warnings": list(answer.warnings),
+    }
     lease = f", for {duration_text(answer.lease_s)} unless renewed" if answer.lease_s else ""
     commit = f" in {answer.commit}" if answer.commit else ""
-    console().print(f"{answer.outcome}{commit}{lease}")
-    for warning in answer.warnings:
+    show(output, data, [f"{answer.outcome}{commit}{lease}"])
+    for warning in answer.warnings if output == "text" else ():
         errors.print(f"warning: {warning}")
 
 

@@ -19,8 +19,7 @@ from demandops_interfaces.action import Demand as DemandMessage
 
 def message_to_data(message: Any) -> Any:  # noqa: ANN401 - messages are generated classes
     # in the form that its YAML text has, so that a goal over ROS 2 equals the same goal in a file
-    fields = getattr(message, "get_fields_and_field_types", None)
-    if fields is not None:
+    if (fields := getattr(message, "get_fields_and_field_types", None)) is not None:
         return {name: message_to_data(getattr(message, name)) for name in fields()}
     if isinstance(message, str | bool | int | float):
         return message
@@ -77,11 +76,8 @@ def demand_goal_to_data(goal: Any) -> dict[str, Any]:  # noqa: ANN401
 
 
 def demand_goal_from_data(data: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    """Return the ``Demand.Goal`` for a document of the kind ``Demand``.
-
-    ValueError is raised for an unknown field or word, or a lease that is no duration. A value that
-    the message cannot carry raises TypeError, AssertionError, AttributeError or OverflowError.
-    """
+    # An unknown field or word, or a lease that is no duration, raises ValueError. A value that the
+    # message cannot carry raises TypeError, AssertionError, AttributeError or OverflowError.
     more = {"apiVersion", "kind", "lease", "operation", "answer"}
     more |= {"applications", "connections", "positions"}
     goal = _message(DemandMessage.Goal, **_fields(data, _DEMAND, more, "a demand"))

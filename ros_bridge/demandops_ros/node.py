@@ -30,13 +30,8 @@ from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from rclpy.task import Future
 
-from demandops_ros.actions import (
-    DEEP_QOS,
-    DemandAdapter,
-    DeploymentRequestAdapter,
-    LastingResults,
-    OtherServers,
-)
+from demandops_ros import actions
+from demandops_ros.actions import DeploymentRequestAdapter, LastingResults
 
 # ---- the bookkeeping over ROS 2, by a ROS service and on a latched topic ----
 #
@@ -49,24 +44,40 @@ def _commit_and_json(snapshot: Snapshot) -> tuple[str, str]:
 
 
 # A node that starts later gets the last message too.
-_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-_SHORTEST_PAUSE_S = 1.0
+LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 # The larger the ledger, the longer it takes to compute the bookkeeping. So this takes at most a
 # 20th of the time, and changes during a pause share one message.
 _PAUSE_FACTOR = 20
 
 # ---- the node's status on ``/diagnostics``, for ROS 2's own tools ----
 
-_PERIOD_S = 1.0
 _MOST_PROBLEMS = 20
 
 
-def status(
-    name: str, address: str, level: bytes, text: str, values: dict[str, str]
-) -> DiagnosticStatus:
-    pairs = [KeyValue(key=one_line(key), value=one_line(value)) for key, value in values.items()]
-    text = one_line(text)
-    return DiagnosticStatus(level=level, name=name, message=text, hardware_id=address, values=pairs)
+class Diagnostics:
+    def __init__(self, node: Node, name: str, subject: str) -> None:
+        self._node, self._name, self._subject = node, name, subject
+        self._publisher = node.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        self._statuses: list[DiagnosticStatus] = []
+
+    def add(
+        self, part: str, text: str, values: dict[str, str], *, warning: str = "", error: str = ""
+    ) -> None:
+        """Add the status of a part; ``text`` says how it is if there is no warning and no error."""
+        fine = DiagnosticStatus.WARN if warning else DiagnosticStatus.OK
+        status = DiagnosticStatus(level=DiagnosticStatus.ERROR if error else fine)
+        status.name, status.hardware_id = f"{self._name}: {part}", self._subject
+        status.message = one_line(error or warning or text)
+        status.values = [
+            KeyValue(key=one_line(key), value=one_line(value)) for key, value in values.items()
+        ]
+        self._statuses.append(status)
+
+    def publish(self) -> None:
+        message = DiagnosticArray(status=self._statuses)
+        message.header.stamp = self._node.get_clock().now().to_msg()
+        self._publisher.publish(message)
+        self._statuses = []
 
 
 def _time(time: datetime | None) -> str:
@@ -107,8 +118,6 @@ class _Goal:
 
 
 class DemandNode(Node):  # type: ignore[misc]
-    """Serves ``DeploymentRequest`` and ``Demand`` for one state repo."""
-
     def __init__(
         self,
         generator: Generator,
@@ -134,7 +143,7 @@ class DemandNode(Node):  # type: ignore[misc]
         )
         self._servers = [
             self._serve(DeploymentRequestAdapter(), action_name),
-            self._serve(DemandAdapter(), demand_action_name),
+            self._serve(actions.DemandAdapter(), demand_action_name),
         ]
         self.create_service(
             GetBookkeeping,
@@ -143,15 +152,15 @@ class DemandNode(Node):  # type: ignore[misc]
             callback_group=ReentrantCallbackGroup(),
         )
         self._bookkeeping_topic = self.create_publisher(
-            BookkeepingMessage, "~/bookkeeping", _LATCHED
+            BookkeepingMessage, "~/bookkeeping", LATCHED
         )
         self._has_news, self._is_closed = REAL.event(), REAL.event()
         self._has_news.set()
         generator.on_publish(lambda config: self._has_news.set())
         REAL.keep_running("bookkeeping-topic", self._publish_bookkeeping)
-        self._others = OtherServers(self, (action_name, demand_action_name))
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
-        self.create_timer(_PERIOD_S, self._report)
+        self._others = actions.OtherServers(self, (action_name, demand_action_name))
+        self._diagnostics = Diagnostics(self, "demandops", generator.address)
+        self.create_timer(1.0, self._report)
 
     def _serve(self, adapter: DeploymentRequestAdapter, name: str) -> LastingResults:
         return LastingResults(
@@ -163,10 +172,10 @@ class DemandNode(Node):  # type: ignore[misc]
             handle_accepted_callback=self._accepted,
             cancel_callback=self._cancel,
             callback_group=ReentrantCallbackGroup(),  # goals arrive while others are journaled
-            goal_service_qos_profile=DEEP_QOS,
-            result_service_qos_profile=DEEP_QOS,
-            cancel_service_qos_profile=DEEP_QOS,
-            feedback_pub_qos_profile=DEEP_QOS,
+            goal_service_qos_profile=actions.DEEP_QOS,
+            result_service_qos_profile=actions.DEEP_QOS,
+            cancel_service_qos_profile=actions.DEEP_QOS,
+            feedback_pub_qos_profile=actions.DEEP_QOS,
         )
 
     def close(self) -> None:
@@ -224,57 +233,41 @@ class DemandNode(Node):  # type: ignore[misc]
 
             self._in_executor(publish)
             took = REAL.monotonic() - began
-            self._is_closed.wait(max(_SHORTEST_PAUSE_S, took * _PAUSE_FACTOR))
+            self._is_closed.wait(max(1.0, took * _PAUSE_FACTOR))
 
     def _report(self) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        generator, address, statuses = self._generator, self._generator.address, []
-
+        generator, add = self._generator, self._diagnostics.add
         remote, unpublished = generator.remote_status, generator.unpublished
-        level, text = DiagnosticStatus.OK, "reachable"
-        if remote.push_denied:
-            level, text = DiagnosticStatus.ERROR, remote.push_denied
-        if remote.unreachable:
-            # while no demand waits, an unreachable repo delays only people's changes
-            level = DiagnosticStatus.ERROR if unpublished else DiagnosticStatus.WARN
-            text = remote.unreachable
+        away, error = remote.unreachable, remote.push_denied
+        if away:  # while no demand waits, an unreachable repo delays only people's changes
+            error = away if unpublished else ""
         values = {
-            "reachable": str(not remote.unreachable).lower(),
+            "reachable": str(not away).lower(),
             "away since": _time(remote.unreachable_since),
             "last reached": _time(remote.last_reached),
             "last push": _time(remote.last_push),
             "unpublished demands": str(unpublished),
             "commit": str(generator.snapshot.commit),
         }
-        statuses.append(status("demandops: state repo", address, level, text, values))
+        add("state repo", "reachable", values, warning=away, error=error)
 
-        problems = generator.snapshot.problems
-        level, text = DiagnosticStatus.OK, "all files are valid"
+        problems, warning = generator.snapshot.problems, ""
         if problems:
-            level = DiagnosticStatus.WARN
-            text = f"{len(problems)} problems; the last valid version is in effect"
+            warning = f"{len(problems)} problems; the last valid version is in effect"
         values = {"problems": str(len(problems))}
         for number, problem in enumerate(problems[:_MOST_PROBLEMS], start=1):
             values[f"problem {number}"] = str(problem)
-        statuses.append(status("demandops: configuration", address, level, text, values))
+        add("configuration", "all files are valid", values, warning=warning)
 
         failures = generator.failures
-        level, text = DiagnosticStatus.OK, "all parts work"
-        if failures:
-            level, text = DiagnosticStatus.ERROR, f"failing: {', '.join(failures)}; see the log"
-        statuses.append(status("demandops: generator", address, level, text, failures))
+        error = f"failing: {', '.join(failures)}; see the log" if failures else ""
+        add("generator", "all parts work", failures, error=error)
 
-        others = self._others.find()
-        level, text = DiagnosticStatus.OK, "no other node serves these actions"
-        if any(others.values()):
-            level = DiagnosticStatus.WARN
-            text = "another node serves these actions too; see the log"
-        values = {action: ", ".join(nodes) for action, nodes in others.items()}
-        statuses.append(status("demandops: actions", address, level, text, values))
-
-        message.status = statuses
-        self._diagnostics.publish(message)
+        others = {action: ", ".join(nodes) for action, nodes in self._others.find().items()}
+        warning = "another node serves these actions too; see the log"
+        warning = warning if any(others.values()) else ""
+        add("actions", "no other node serves these actions", others, warning=warning)
+        self._diagnostics.publish()
 
     # ---- callbacks of the action server, in the executor's thread ----
 

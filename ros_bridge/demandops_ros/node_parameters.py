@@ -7,13 +7,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import click
+from demandops.base import settings
 from demandops.base.quoting import quoted
-from demandops.base.settings import (
-    DEFAULT_ACTION_NAME,
-    DEFAULT_DEMAND_ACTION_NAME,
-    QUEUE_LIMIT,
-    REQUESTER_QUEUE_LIMIT,
-)
 from demandops.model.config.config import (
     BROKERS_FILE,
     DOMAINS_FILE,
@@ -35,7 +30,6 @@ from demandops_ros.messages import ANSWER_LEVELS
 # namespaces and the image registry come from the state repo. If the file names one that the state
 # repo lacks, the node warns. The node also warns about parameters that it replaces by other means.
 
-_NODE = "application_manager"
 ACTION_NAME = "deployment_action_name"
 _RENAMES = re.compile(r".*__(node|name):=.*")
 _BROKER = re.compile(r"connections\.communication_broker(_params\.(?P<node>.+))?\.host")
@@ -59,7 +53,7 @@ def read_reference_parameters(ros_args: Sequence[str]) -> dict[str, Any]:
     }
     args = [word for at, word in enumerate(ros_args) if not {at, at + 1} & renames]
     probe = Node(
-        _NODE,
+        "application_manager",
         cli_args=args,
         use_global_arguments=False,
         start_parameter_services=False,
@@ -92,23 +86,8 @@ def warnings(values: Mapping[str, Any], config: Config) -> Iterator[str]:
             f"to {registry} in {config.place_of(IMAGES_FILE)}, and give the images the "
             "names that they have in that registry (docs/migration.md)"
         )
-    yield from _brokers(values, config)
-    topics = values.get("connections.init_comm_topics") or ()
-    bridged = {
-        topic for node in config.nodes.values() for to in node.bridged.values() for topic in to
-    }
-    if missing := [topic for topic in topics if topic not in bridged]:
-        yield (
-            "parameter connections.init_comm_topics of the reference is not used: add "
-            f"{', '.join(missing)} to the field 'bridged' of the source node in "
-            f"{config.place_of(NODES_FILE)}"
-        )
-
-
-def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
     for name, host in values.items():
-        match = _BROKER.fullmatch(name)
-        if match is None:
+        if (match := _BROKER.fullmatch(name)) is None:
             continue
         port, node = values.get(f"{name.removesuffix('host')}port"), match["node"]
         # the host in the inventory may end in the namespace, as in broker.c-its
@@ -124,19 +103,30 @@ def _brokers(values: Mapping[str, Any], config: Config) -> Iterator[str]:
                 f"parameter {name} of the reference is not used: the broker {place}at "
                 f"{address} is not in {config.place_of(BROKERS_FILE)}; add it there"
             )
+    topics = values.get("connections.init_comm_topics") or ()
+    bridged = {
+        topic for node in config.nodes.values() for to in node.bridged.values() for topic in to
+    }
+    if missing := [topic for topic in topics if topic not in bridged]:
+        yield (
+            "parameter connections.init_comm_topics of the reference is not used: add "
+            f"{', '.join(missing)} to the field 'bridged' of the source node in "
+            f"{config.place_of(NODES_FILE)}"
+        )
 
 
 # ---- the node's parameters: their defaults, descriptions and ranges ----
 
-_CHOICES = {"answer": ANSWER_LEVELS, "log_level": ("debug", "info", "warn", "error", "fatal")}
+LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
+_CHOICES = {"answer": ANSWER_LEVELS, "log_level": LOG_LEVELS}
 DEFAULTS: dict[str, Any] = {
-    "action_name": DEFAULT_ACTION_NAME,
-    "demand_action_name": DEFAULT_DEMAND_ACTION_NAME,
+    "action_name": settings.DEFAULT_ACTION_NAME,
+    "demand_action_name": settings.DEFAULT_DEMAND_ACTION_NAME,
     "answer": ANSWER_LEVELS[0],
     "answer_timeout": 120.0,
     "state_repo": "",
     "fetch_interval": DEFAULT_INTERVAL,
-    "requester_queue_limit": REQUESTER_QUEUE_LIMIT,
+    "requester_queue_limit": settings.REQUESTER_QUEUE_LIMIT,
     "log_level": "info",
 }
 _DESCRIPTIONS = {
@@ -153,7 +143,7 @@ _DESCRIPTIONS = {
 }
 
 _SECONDS = [FloatingPointRange(from_value=0.001, to_value=86_400.0)]
-_COUNT = [IntegerRange(from_value=1, to_value=QUEUE_LIMIT, step=1)]
+_COUNT = [IntegerRange(from_value=1, to_value=settings.QUEUE_LIMIT, step=1)]
 _RANGES: dict[str, Any] = {
     "answer_timeout": {"floating_point_range": _SECONDS},
     "requester_queue_limit": {"integer_range": _COUNT},

@@ -16,13 +16,11 @@ from rcl_interfaces.srv import SetParameters
 from rclpy.logging import get_logger
 from rclpy.node import Node
 from rclpy.parameter import Parameter
-from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros import ros_process
 
 # ---- the text of a ROS parameter file ----
 
-_EVERY_NODE = ("/**", "**", "/*", "*")
 _SECTION = "ros__parameters"
 
 
@@ -33,7 +31,7 @@ def parameters_of(node: str, text: str, file: str) -> dict[str, Any]:
         raise InvalidInput([fault("", "must map nodes to their parameters").within(file)])
     name = node.lstrip("/")
     parameters: dict[str, Any] = {}
-    for key in (*_EVERY_NODE, f"/{name}", name):
+    for key in ("/**", "**", "/*", "*", f"/{name}", name):
         if key in data:
             section = data[key].get(_SECTION) if isinstance(data[key], dict) else None
             if not isinstance(section, dict):
@@ -57,9 +55,6 @@ def _flat(section: Mapping[Any, Any], prefix: str = "") -> Iterator[tuple[str, A
 #
 # A restarted node publishes its parameter events at a new endpoint, which the ROS graph shows.
 
-_LOOK_S = 0.2
-_ANSWER_S = 2.0
-_EVENTS = "/parameter_events"
 _LARGEST = 2**63 - 1  # the largest integer that ROS can transport
 
 
@@ -78,11 +73,23 @@ class ParameterSetter:
         self._call: Any = None
         self._called_at = 0.0
         self._changed = node.create_guard_condition(self._set_if_needed)
-        node.create_timer(_LOOK_S, self._set_if_needed)
+        node.create_timer(0.2, self._set_if_needed)
 
     def want(self, parameters: Mapping[str, Any]) -> None:
         # any thread may call this; TypeError or ValueError names a value that ROS cannot carry
-        wanted = [_parameter(name, value).to_parameter_msg() for name, value in parameters.items()]
+        wanted = []
+        for name, value in parameters.items():
+            for number in value if isinstance(value, list) else [value]:
+                if isinstance(number, int) and not -_LARGEST - 1 <= number <= _LARGEST:
+                    raise ValueError(
+                        f"parameter {name}: {quoted(str(number))} is out of ROS's range; write a "
+                        f"number between {-_LARGEST - 1} and {_LARGEST}"
+                    )
+            try:
+                parameter = Parameter(name, value=value)
+            except (TypeError, ValueError) as error:
+                raise type(error)(f"parameter {name}: {error}") from None
+            wanted.append(parameter.to_parameter_msg())
         with self._lock:
             self._wanted, self._version = wanted, self._version + 1
         self._changed.trigger()
@@ -92,13 +99,13 @@ class ParameterSetter:
         # that was killed, so all of them are compared.
         endpoints = frozenset(
             tuple(info.endpoint_gid)
-            for info in self._node.get_publishers_info_by_topic(_EVENTS)
+            for info in self._node.get_publishers_info_by_topic("/parameter_events")
             if f"{info.node_namespace.rstrip('/')}/{info.node_name}" == self._target
         )
         with self._lock:
             wanted, version = self._wanted, self._version
         if self._call is not None:
-            if REAL.monotonic() - self._called_at < _ANSWER_S:
+            if REAL.monotonic() - self._called_at < 2.0:
                 return
             self._client.remove_pending_request(self._call)  # the target ended without an answer
             self._call = None
@@ -124,19 +131,6 @@ class ParameterSetter:
             self._changed.trigger()  # other parameters may be wanted by now
 
         self._call.add_done_callback(take_answer)
-
-
-def _parameter(name: str, value: Any) -> Parameter:  # noqa: ANN401
-    for number in value if isinstance(value, list) else [value]:
-        if isinstance(number, int) and not -_LARGEST - 1 <= number <= _LARGEST:
-            raise ValueError(
-                f"parameter {name}: {quoted(str(number))} is out of ROS's range; write a number "
-                f"between {-_LARGEST - 1} and {_LARGEST}"
-            )
-    try:
-        return Parameter(name, value=value)
-    except (TypeError, ValueError) as error:
-        raise type(error)(f"parameter {name}: {error}") from None
 
 
 # ---- the command ----
@@ -174,10 +168,7 @@ def parameter_sync(ctx: click.Context, kubeconfig: Path | None) -> None:
     Examples:
       demandops parameter-sync --ros-args --params-file fusion.yaml
     """
-    with (
-        ros_process.stop_signals() as wait_for_signal,
-        ros_process.started(ctx.args, SignalHandlerOptions.NO),
-    ):
+    with ros_process.stop_signals() as wait_for_signal, ros_process.started(ctx.args):
         node = Node("parameter_sync")
         ros_process.log_to(get_logger("demandops"), "info")
         given: dict[str, str] = {

@@ -21,9 +21,6 @@ from rclpy.logging import LoggingSeverity, set_logger_level
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
-_POLL_S = 0.2
-_LAST_CALLBACK_S = 20.0
-
 
 class ExecutorThread:
     """Runs a node's callbacks in a thread, which must end before the node is destroyed."""
@@ -32,7 +29,13 @@ class ExecutorThread:
         self._executor = SingleThreadedExecutor(context=node.context)
         self._executor.add_node(node)
         self._over = REAL.event()
-        self._thread = REAL.keep_running(name, self._spin)
+
+        def spin() -> None:
+            while not self._over.is_set() and self._executor.context.ok():
+                with suppress(ExternalShutdownException):
+                    self._executor.spin_once()
+
+        self._thread = REAL.keep_running(name, spin)
         # If no caller closes it: a thread that waits for ROS while Python exits aborts the process.
         atexit.register(self.close)
 
@@ -46,13 +49,8 @@ class ExecutorThread:
         if not self._over.is_set():
             self._over.set()
             self.call(lambda: None)  # wakes the thread
-            self._thread.join(_LAST_CALLBACK_S)
+            self._thread.join(20.0)
             self._executor.shutdown(timeout_sec=0)
-
-    def _spin(self) -> None:
-        while not self._over.is_set() and self._executor.context.ok():
-            with suppress(ExternalShutdownException):
-                self._executor.spin_once()
 
 
 @contextmanager
@@ -63,7 +61,7 @@ def stop_signals() -> Iterator[Callable[[], None]]:
     before = {number: signal.signal(number, lambda *_: over.set()) for number in numbers}
 
     def wait() -> None:
-        while not over.wait(_POLL_S):  # poll, because another thread may get the signal
+        while not over.wait(0.2):  # poll, because another thread may get the signal
             pass
         for number in numbers:
             signal.signal(number, signal.SIG_DFL)
@@ -94,9 +92,8 @@ class RosLogHandler(logging.Handler):
 
 
 @contextmanager
-def started(
-    arguments: Sequence[str], signals: SignalHandlerOptions = SignalHandlerOptions.ALL
-) -> Iterator[list[str]]:
+def started(arguments: Sequence[str]) -> Iterator[list[str]]:
+    # without ROS's signal handlers, because each command handles the signals
     ros_args = list(arguments)
     if ros_args and ros_args[0] != "--ros-args":
         raise click.UsageError(
@@ -106,7 +103,8 @@ def started(
         # ROS's log library does not start in a container without a home folder
         os.environ["ROS_LOG_DIR"] = str(Path(tempfile.gettempdir()) / "ros-log")
     try:
-        rclpy.init(args=["demandops", *ros_args], signal_handler_options=signals)
+        no_signals = SignalHandlerOptions.NO
+        rclpy.init(args=["demandops", *ros_args], signal_handler_options=no_signals)
     except Exception as error:  # rclpy raises errors of many kinds
         if not ros_args:
             raise

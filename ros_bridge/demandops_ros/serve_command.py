@@ -26,14 +26,11 @@ from demandops.serve.timing.timers import DEFAULT_INTERVAL, parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from rclpy.logging import get_logger
-from rclpy.signals import SignalHandlerOptions
 
 from demandops_ros import node_parameters, ros_process
 from demandops_ros.node import DemandNode
 
-_POLL_S = 0.02
 _TASK_S = 5.0
-_FLUSH_S = 0.3
 
 
 @click.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
@@ -112,7 +109,7 @@ def serve(  # noqa: PLR0913, PLR0917 - one for each option
       demandops serve --state-repo fleet.git
       demandops serve --state-repo https://git.example/fleet.git --clusters c.yaml
     """
-    with ros_process.started(ctx.args, SignalHandlerOptions.NO) as ros_args, ExitStack() as parts:
+    with ros_process.started(ctx.args) as ros_args, ExitStack() as parts:
         of_reference = node_parameters.read_reference_parameters(ros_args)
         settings = node_parameters.read_node_parameters(
             {
@@ -200,12 +197,12 @@ def _run(
         status.close()  # this ends the goals that wait for a rollout
     end = REAL.monotonic() + _TASK_S
     while node.open_goals and REAL.monotonic() < end:
-        REAL.sleep(_POLL_S)
+        REAL.sleep(0.02)
     for _ in range(2):  # tasks of the executor send the results, so wait until they have run
         done = REAL.event()
         thread.call(done.set)
         done.wait(_TASK_S)
-    REAL.sleep(_FLUSH_S)  # time for clients to request the results
+    REAL.sleep(0.3)  # time for clients to request the results
     if not published:
         node.get_logger().warning(
             "the journal is not empty; its demands are resumed at the next start"
@@ -220,13 +217,9 @@ class _Signals:
 
     def __init__(self) -> None:
         self.stopping = False
-        # The kernel may deliver a signal to any thread, so Python writes each signal to a pipe that
-        # the main thread reads.
-        self._read, self._write = os.pipe()
-        os.set_blocking(self._write, False)
+        self._woken = REAL.event()
 
     def __enter__(self) -> _Signals:
-        self._wakeup = signal.set_wakeup_fd(self._write)
         numbers = (signal.SIGINT, signal.SIGTERM)
         self._before = {number: signal.signal(number, self._handle) for number in numbers}
         REAL.when_unsound = self.wake
@@ -235,18 +228,18 @@ class _Signals:
     def __exit__(self, *error: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
-        signal.set_wakeup_fd(self._wakeup)
 
     def wait(self, until: Callable[[], bool] = lambda: False) -> None:
         """Wait until a signal comes or ``until()`` is true, which each :meth:`wake` checks."""
         while not (self.stopping or until() or REAL.unsound):
-            os.read(self._read, 1)
+            self._woken.wait(0.2)  # poll, because another thread may get the signal
+            self._woken.clear()
         if REAL.unsound is not None:
             errors.print(f"error: {REAL.unsound}")
             os._exit(ExitCode.PROGRAM_ERROR)  # an orderly exit could answer goals
 
     def wake(self) -> None:
-        os.write(self._write, b"\0")  # any thread may call this
+        self._woken.set()
 
     def _handle(self, number: int, frame: FrameType | None) -> None:
         if self.stopping:

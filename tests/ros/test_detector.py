@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import signal
 import time
 from collections import Counter
@@ -262,17 +263,18 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
 @pytest.mark.parametrize(
     "text", ["", "null", "[]", "{", "[" * 100_000, '{"demands": []}', '{"demands": {"a": 1}}']
 )
-def test_bookkeeping_that_cannot_be_read_is_told_and_the_next_one_is_used(text: str) -> None:
-    told: list[tuple[str, str]] = []
+def test_bookkeeping_that_cannot_be_read_is_told_and_the_next_one_is_used(
+    text: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(logging.getLogger("demandops"), "propagate", True)
     node = SimpleNamespace(
         _detector=SimpleNamespace(file=read(rules_of(), "rules.yaml")),
         _bookkeeping=None,
-        _log=lambda level, line: told.append((level, line)),
     )
     DetectorNode._hear_books(node, SimpleNamespace(bookkeeping_json=text))
     assert node._bookkeeping is None
-    [(level, line)] = told
-    assert level == "warning"
-    assert line.startswith("the bookkeeping cannot be read (")
+    [record] = caplog.records
+    assert record.levelname == "WARNING"
+    assert record.getMessage().startswith("the bookkeeping cannot be read (")
     DetectorNode._hear_books(node, SimpleNamespace(bookkeeping_json='{"demands": {}}'))
     assert node._bookkeeping == {"demands": {}}

@@ -31,10 +31,7 @@ Command = Callable[..., Any]
 
 
 def output_formats(*formats: str) -> Callable[[Command], Command]:
-    """Return a decorator that adds the option ``--output`` with these formats to a command.
-
-    With ``--output json``, a command that raises DemandOpsError also prints the faults as JSON.
-    """
+    # with ``--output json``, a command that raises DemandOpsError also prints the faults as JSON
     description = "The output format."
     if "markdown" in formats:
         description = "The output format; markdown is for a comment on a pull request."

@@ -22,15 +22,12 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.text import Text
 
-_WIDE = 200
-_PATIENCE_S = 0.5
 _MOST_LISTED = 3
 
 Progress = Callable[[int, int], None]
 
 
 def console(stderr: bool = False) -> Console:
-    """Return a console for stdout or stderr."""
     from rich.console import Console  # noqa: PLC0415
 
     class QuotingConsole(Console):
@@ -39,7 +36,7 @@ def console(stderr: bool = False) -> Console:
 
     # elsewhere than on a terminal, a program may read the lines, so they are not wrapped
     stream = sys.stderr if stderr else sys.stdout
-    width = None if stream.isatty() else _WIDE
+    width = None if stream.isatty() else 200
     # rich would take [bold] and :smile: in the texts of people for its own markup
     return QuotingConsole(stderr=stderr, width=width, highlight=False, markup=False, emoji=False)
 
@@ -129,10 +126,8 @@ def show_slow(text: str) -> None:  # an empty text clears the line
 
 @contextmanager
 def busy(title: str) -> Iterator[Callable[[str], None]]:
-    """Show the title and the elapsed seconds on a terminal if the block takes a second or longer.
-
-    The function that it yields replaces the title.
-    """
+    # on a terminal, the title and the elapsed seconds, if the block takes a second or longer; the
+    # function that it yields replaces the title
 
     def say(text: str) -> None:
         nonlocal title
@@ -162,7 +157,7 @@ def busy(title: str) -> Iterator[Callable[[str], None]]:
 
 @contextmanager
 def progress(title: str) -> Iterator[Progress]:
-    """Yield a function that updates a progress bar on a terminal if the work takes long."""
+    # a progress bar on a terminal, if the work takes long
     start = REAL.monotonic()
     bar: Bar | None = None
     task: Any = None
@@ -170,7 +165,7 @@ def progress(title: str) -> Iterator[Progress]:
     def show(done: int, total: int) -> None:
         nonlocal bar, task
         if bar is None:
-            if not sys.stderr.isatty() or REAL.monotonic() - start < _PATIENCE_S or done >= total:
+            if not sys.stderr.isatty() or REAL.monotonic() - start < 0.5 or done >= total:
                 return
             from rich.progress import Progress as Bar  # noqa: PLC0415
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from rich.cells import cell_len
 
@@ -21,16 +22,14 @@ _COMFORT = 12
 
 # The text of a cell, or its lines.
 Cell = str | Sequence[str]
+# Makes a cell of an item, and of what else the cells of a table need, such as the time.
+CellOf = Callable[..., Cell]
 
 
 @dataclass(frozen=True, slots=True)
 class Column:
-    """A column of a table.
-
-    Columns get room in the order of ``rank``. One that does not fit is left out, even if a narrower
-    one of a higher rank fits. A column of rank 0 is never left out.
-    """
-
+    # Columns get room in the order of ``rank``. One that does not fit is left out, even if a
+    # narrower one of a higher rank fits. A column of rank 0 is never left out.
     title: str
     rank: int = 0
     wraps: bool = False
@@ -48,10 +47,8 @@ class Table:
     whole: bool = False
 
     def lines(self, width: int | None, style: Callable[[str, str], str] | None = None) -> list[str]:
-        """Return the table as lines; without a ``width``, one for each row, however long.
-
-        ``style`` returns a text in a style (``bold``, ``dim`` or a color); None is plain text.
-        """
+        # Without a ``width``, one for each row, however long. ``style`` returns a text in a style
+        # (``bold``, ``dim`` or a color); None is plain text.
         width = None if self.whole else width
         paint = style or (lambda text, _: text)
         title = [paint(self.title, "bold")] if self.title else []
@@ -112,6 +109,28 @@ class Table:
         # a column that wraps gets `_COMFORT`, unless its text is shorter
         words = [cell_len(word) for row in rows for line in row[at] for word in line.split()]
         return max([cell_len(self.columns[at].title), min(natural, _COMFORT), *words])
+
+
+def column(
+    title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False
+) -> tuple[Column, CellOf]:
+    """Return a column, and what makes its cells: a function, or the key of a value to show."""
+    cell_of = cell if callable(cell) else lambda item, *_: item[cell] or ""
+    return Column(title, rank, wraps), cell_of
+
+
+def joined(key: str) -> CellOf:
+    return lambda item, *_: ", ".join(item[key])
+
+
+def table_of(
+    columns: Sequence[tuple[Column, CellOf]],
+    items: Iterable[Any],
+    *given: object,
+    **more: Any,  # noqa: ANN401 - the other fields of a table
+) -> Table:
+    rows = [[cell_of(item, *given) for _, cell_of in columns] for item in items]
+    return Table([column for column, _ in columns], rows, **more)
 
 
 def _wrapped(lines: Iterable[str], width: int) -> list[str]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -122,51 +123,36 @@ _NO_STATE_REPO = (
 )
 
 
-def _chosen_context(around: Path | None) -> Context | None:
-    # clusters and signing key of a context apply only to its own state repo
-    ctx = click.get_current_context()
-    name = ctx.meta.get(_NAME)
-    content = read_contexts()
-    context: Context | None
-    if name is not None:
-        context = context_named(name, "--context")
-    elif around is not None:
-        places = {str(around), origin_of(around)}
-        same = (context for context in content.contexts.values() if context.state_repo in places)
-        context = next(same, None)
-    else:
-        context = content.contexts[content.current] if content.current else None
-    ctx.meta[_CONTEXT] = context
-    return context
-
-
 def _checkout() -> Path | None:
     # `--context` goes before the checkout around the current folder
     named = _NAME in click.get_current_context().meta
     return None if named else checkout_around(Path.cwd())
 
 
-def readable_repo() -> str | None:
-    around = _checkout()
-    context = _chosen_context(around)
-    return str(around) if around else context.state_repo if context else None
-
-
-def _writable() -> str | None:
-    around = _checkout()
-    context = _chosen_context(around)
+def _default_repo(*, writes: bool = False) -> str | None:
+    ctx, around, content = click.get_current_context(), _checkout(), read_contexts()
+    # clusters and signing key of a context apply only to its own state repo
+    context: Context | None = None
+    if _NAME in ctx.meta:
+        context = context_named(ctx.meta[_NAME], "--context")
+    elif around is not None:
+        places = {str(around), origin_of(around)}
+        same = (context for context in content.contexts.values() if context.state_repo in places)
+        context = next(same, None)
+    elif content.current:
+        context = content.contexts[content.current]
+    ctx.meta[_CONTEXT] = context
     if around is None:
         return context.state_repo if context else None
+    origin = origin_of(around) if writes else None
+    if origin is not None:
+        ctx.meta[_BEHIND] = True
     # a generator never writes to a checkout; a dry run needs no place to write to
-    origin = origin_of(around)
-    if origin is None and click.get_current_context().params.get("dry_run"):
-        return str(around)
-    if origin is None:
+    elif writes and not ctx.params.get("dry_run"):
         raise click.UsageError(
             f"the checkout {around} has no remote 'origin' to write to; give --state-repo"
         )
-    click.get_current_context().meta[_BEHIND] = True
-    return origin
+    return str(around) if origin is None else origin
 
 
 def hint_to_pull() -> list[str]:
@@ -232,11 +218,13 @@ def _state_repo(default: Callable[[], str | None], where: str) -> Callable[[Comm
 
 
 # The option `--state-repo` of a command that only reads; it may name a checkout.
-state_repo_option = _state_repo(readable_repo, "the checkout that you are in")
+state_repo_option = _state_repo(_default_repo, "the checkout that you are in")
 
 # The option `--state-repo` of a command that writes.
 # If the checkout has no remote, the default with `--dry-run` is the checkout itself.
-writable_repo_option = _state_repo(_writable, "the remote of the checkout that you are in")
+writable_repo_option = _state_repo(
+    partial(_default_repo, writes=True), "the remote of the checkout that you are in"
+)
 
 dry_run_option = click.option(
     "--dry-run",
@@ -269,16 +257,12 @@ clusters_option = click.option(
 
 # ---- names from the state repo, for a shell's completion ----
 
-Complete = Callable[[click.Context, click.Parameter, str], list[str]]
 
-
-def names_of(*kinds: str) -> Complete:
-    """Return a completer for names of these kinds."""
-
+def names_of(*kinds: str) -> Callable[[click.Context, click.Parameter, str], list[str]]:
     def complete(ctx: click.Context, param: click.Parameter, incomplete: str) -> list[str]:
         try:
             with ctx.scope(cleanup=False):
-                address = ctx.params.get("state_repo") or readable_repo()
+                address = ctx.params.get("state_repo") or _default_repo()
             if not address:
                 return []
             # offline, because a shell waits for the names while a person types

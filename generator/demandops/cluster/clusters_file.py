@@ -60,11 +60,8 @@ class ClusterAccess(FrozenModel):
 
 
 def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no types
-    """Return the API of the cluster in which this process runs as a pod.
-
-    Its calls have the rights of the pod's service account. ``wanted_by`` is the option or command
-    that needs the API: InvalidInput names it if this process is no pod with a token.
-    """
+    # Of the cluster in which this process runs as a pod, whose service account has the rights.
+    # ``wanted_by`` is the option or command that needs it: InvalidInput names it if this is no pod.
     from kubernetes import client, config  # noqa: PLC0415 - slow (half a second), so only on use
 
     settings = client.Configuration()
@@ -77,6 +74,12 @@ def own_cluster_api(wanted_by: str) -> Any:  # noqa: ANN401 - the library has no
             wanted_by, f"needs a pod with a service account's token: {error}"
         ) from None
     return client.CustomObjectsApi(client.ApiClient(settings))
+
+
+def reason_of(error: Exception) -> str:
+    # of an error of the library
+    reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
+    return reason.splitlines()[0][:300]
 
 
 class AccessFile(FileModel):

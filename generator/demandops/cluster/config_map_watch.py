@@ -9,7 +9,7 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput
 from demandops.base.quoting import one_line
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL
 from demandops.cluster.clusters_file import ClusterAccess, own_cluster_api
 
 log = logging.getLogger("demandops")
@@ -20,8 +20,6 @@ _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 15.0
 
 _GONE = "is gone; its last data stay valid"
 
-OnData = Callable[[Mapping[str, str]], object]
-
 
 class ConfigMapWatch:
     """Reads and watches a ConfigMap. It needs only the right to list and watch this object."""
@@ -30,9 +28,8 @@ class ConfigMapWatch:
         self,
         namespace: str,
         name: str,
-        on_data: OnData,
+        on_data: Callable[[Mapping[str, str]], object],
         kubeconfig: Path | None,
-        runtime: Runtime = REAL,
     ) -> None:
         # ``on_data`` is called from the thread of the watch. The ConfigMap need not exist yet.
         # Without a kubeconfig, this process must be a pod in the cluster.
@@ -48,11 +45,11 @@ class ConfigMapWatch:
                 raise InvalidInput.at("--kubeconfig", reason, file=str(kubeconfig)) from None
         self._data: dict[str, str] | None = None
         self._told = ""
-        self._closed = runtime.event()
+        self._closed = REAL.event()
         # Held while this calls on_data or the log, which both may call ROS. After `close` ROS ends,
         # and a call of it from this thread would abort the process
-        self._calling = runtime.lock()
-        runtime.keep_running("config-map", self._run)
+        self._calling = REAL.lock()
+        REAL.keep_running("config-map", self._run)
 
     def close(self) -> None:
         """Stop the watch; a call of ``on_data`` is waited for, and no other one follows."""

@@ -28,11 +28,9 @@ class ObjectName(NamedTuple):
 
 
 class ObjectSelector(NamedTuple):
-    """Selects objects of a kind in a namespace, or only the one of a name."""
-
     kind: str
     namespace: str
-    name: str = ""
+    name: str = ""  # all of the namespace, if it is empty
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +66,6 @@ Objects = Mapping[Key, Object]
 
 
 class History(Protocol):
-    """Queries on the state repo's commits."""
-
     def includes(self, commit: str, other: str) -> bool:
         """Return whether ``commit`` is ``other`` or a descendant of ``other``."""
 
@@ -254,7 +250,7 @@ class Flux(HealthReader):
         source = self._source(domain, objects) or {}
         fetched = condition(source.get("status") or {}, "Ready")
         if fetched.get("status") == "False":
-            at = f"GitRepository {domain.namespace}/{_source_name(kustomization)}"
+            at = name_of(("GitRepository", domain.namespace, _source_name(kustomization)))
             return Health("waiting", str(fetched.get("message", "")), at, failing=True)
         return Health("waiting", "has not applied the commit yet", name)
 
@@ -273,11 +269,8 @@ class Flux(HealthReader):
         return _handled(self._source(domain, objects) or {})
 
     def is_idle(self, domain: ClusterDomain, objects: Objects, before: str | None) -> bool:
-        """Return whether Flux has finished all work of a domain's last fetch.
-
-        ``before`` is what :meth:`handled_request` returned before the last fetch request was made,
-        if one was.
-        """
+        # whether Flux has finished all work of a domain's last fetch; ``before`` is what
+        # `handled_request` returned before the last fetch request was made, if one was
         kustomization, source = objects.get(self.follower(domain)), self._source(domain, objects)
         # what does not exist or is suspended never fetches, and must not hold up the next request
         if kustomization is None or source is None:
@@ -353,8 +346,7 @@ class ArgoCd(HealthReader):
         self, domain: ClusterDomain, commit: str, objects: Objects, history: History
     ) -> Health:
         name = name_of(self.follower(domain))
-        app = objects.get(self.follower(domain))
-        if app is None:
+        if (app := objects.get(self.follower(domain))) is None:
             missing = f"does not exist; apply {bootstrap_path(domain.cluster)} to the cluster"
             return Health("waiting", missing, name)
         if any(history.includes(revision, commit) for revision in _applied_commits(app)):

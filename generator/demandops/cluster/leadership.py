@@ -17,7 +17,7 @@ from typing import Any
 from demandops.base.errors import InvalidInput, Unsound
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL, Runtime
-from demandops.cluster.clusters_file import own_cluster_api
+from demandops.cluster.clusters_file import own_cluster_api, reason_of
 
 log = logging.getLogger("demandops")
 
@@ -26,7 +26,6 @@ _RENEW_WITHIN_S = 10  # a leader that has not renewed its Lease for so long ends
 # How long a call of the API may take. A renewal has two calls, and must end before the Lease does:
 # _RENEW_WITHIN_S + 2 * _CALL_S < _LEASE_S.
 _CALL_S = 2
-_PAUSE_S = 2.0
 # The API server takes no Lease with a duration of 0, so a released one is valid for a second.
 _RELEASED_S = 1
 _NAME = re.compile(r"([a-z0-9]([-a-z0-9]*[a-z0-9])?)/([a-z0-9]([-.a-z0-9]*[a-z0-9])?)")
@@ -41,13 +40,9 @@ class Leadership:
         api: Any = None,  # noqa: ANN401 - the library has no types
         runtime: Runtime = REAL,
     ) -> None:
-        """Start to compete for the Lease ``NAMESPACE/NAME``, which must exist.
-
-        A leader that cannot renew the Lease, or has lost it, raises :class:`Unsound` in its thread.
-        Without ``api``, this process must be a pod.
-        """
-        name = _NAME.fullmatch(lease)
-        if name is None:
+        # It competes for the Lease ``NAMESPACE/NAME``, which must exist. A leader that cannot renew
+        # it, or has lost it, raises Unsound in its thread. Without ``api``, this must be a pod.
+        if (name := _NAME.fullmatch(lease)) is None:
             message = f"{quoted(lease)} names no Lease; write NAMESPACE/NAME"
             raise InvalidInput.at("--leader-lease", message)
         self._request = {
@@ -77,7 +72,7 @@ class Leadership:
             try:
                 self._write(self._read(), "")
             except Exception as error:  # the Lease expires on its own
-                log.warning("the Lease %s could not be released: %s", self._lease, _reason(error))
+                log.warning("the Lease %s could not be released: %s", self._lease, reason_of(error))
 
     def _run(self) -> None:
         while not self._closed.is_set():
@@ -86,10 +81,10 @@ class Leadership:
             except Unsound:
                 raise
             except Exception as error:  # the library raises errors of many kinds
-                problem = f"cannot be read or written: {_reason(error)}"
+                problem = f"cannot be read or written: {reason_of(error)}"
                 self._tell(logging.WARNING, f"the Lease {self._lease} {problem}")
             self._require_renewed()
-            self._closed.wait(_PAUSE_S)
+            self._closed.wait(2.0)
             self._require_renewed()  # a renewal that begins now could end too late
 
     def _compete(self) -> None:
@@ -159,8 +154,3 @@ class Leadership:
             f"the Lease {self._lease} {why}; another process may be the leader now, so this one "
             "must start again"
         )
-
-
-def _reason(error: Exception) -> str:
-    reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
-    return reason.splitlines()[0][:300]

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
 from demandops.base.runtime import REAL, Runtime
-from demandops.cluster.clusters_file import ClusterAccess
+from demandops.cluster.clusters_file import ClusterAccess, reason_of
 from demandops.cluster.health import ClusterDomain, Health, Key, ObjectSelector, health_reader
 
 log = logging.getLogger("demandops")
@@ -184,6 +184,13 @@ class ObjectCache:
         self._on_change()
 
 
+def object_caches(
+    clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None], runtime: Runtime
+) -> dict[str, ObjectCache]:
+    readable = {name: access for name, access in clusters.items() if access.kubeconfig}
+    return {name: ObjectCache(name, readable[name], on_change, runtime) for name in readable}
+
+
 def _request(selector: ObjectSelector) -> dict[str, str]:
     group, version, plural = _KINDS[selector.kind]
     request = {"group": group, "version": version, "plural": plural}
@@ -203,8 +210,7 @@ def _reason(selector: ObjectSelector, error: Exception) -> str:
         plural = _KINDS[selector.kind][2]
         reason = getattr(error, "reason", None) or type(error).__name__
         return f"{plural} in {selector.namespace}: {reason}"
-    reason = f"{type(error).__name__}: {getattr(error, 'reason', None) or error}"
-    return reason.splitlines()[0][:300]
+    return reason_of(error)
 
 
 def _version(item: dict[str, Any]) -> int:

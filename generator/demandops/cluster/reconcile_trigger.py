@@ -21,7 +21,7 @@ from demandops.base.runtime import REAL, Runtime
 from demandops.base.settings import MAIN_BRANCH
 from demandops.cluster.clusters_file import ClusterAccess, NoAccess
 from demandops.cluster.health import REQUESTED_AT, ClusterDomain, Flux, ObjectSelector
-from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.object_cache import object_caches
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain
 from demandops.render.gitops import domain_folder, domains_in_use, project_of
@@ -34,7 +34,6 @@ from demandops.render.gitops import domain_folder, domains_in_use, project_of
 
 _TIMEOUT_S = 5.0
 _SCP = re.compile(r"(?:[^/@]+@)?(?P<host>[^/:@]+):(?P<path>.+)")
-_NO_COMMIT = "0" * 40
 
 
 def call_argocd(
@@ -44,7 +43,7 @@ def call_argocd(
     # there was one. With None as ``paths``, Argo CD refreshes all Applications of the repo.
     event = {
         "ref": f"refs/heads/{MAIN_BRANCH}",
-        "before": before or _NO_COMMIT,
+        "before": before or "0" * 40,
         "after": after,
         "repository": {"html_url": web_address(repo), "default_branch": MAIN_BRANCH},
         "commits": [] if paths is None else [{"id": after, "modified": sorted(paths)}],
@@ -105,7 +104,6 @@ _FIRST_RETRY_S, _LONGEST_RETRY_S = 1.0, 32.0
 _SPACING_S = 1.0
 # So long after a push, Flux is woken even if it is not idle.
 _LONGEST_WAIT_S = 60.0
-_REFRESH = "argocd.argoproj.io/refresh"
 
 
 # Returns the newest published commit, and the paths that changed since a commit, if that is known.
@@ -114,8 +112,7 @@ ChangesSince = Callable[[str], tuple[str, list[str] | None]]
 
 @dataclass(eq=False)
 class _Wake:
-    """A planned call that makes the controller of access domains fetch; in monotonic seconds."""
-
+    # a planned call that makes the controller of access domains fetch; in monotonic seconds
     cluster: str
     domains: tuple[AccessDomain, ...]
     pushed: float | None = None  # the oldest push that still needs a call
@@ -134,8 +131,7 @@ class _Wake:
 
 
 class ReconcileTrigger:
-    """Wakes clusters from its own thread; pushes that come before a call is due share it."""
-
+    # in a thread of its own; pushes that come before a call is due share it
     def __init__(
         self,
         clusters: Mapping[str, ClusterAccess],
@@ -152,11 +148,7 @@ class ReconcileTrigger:
         self._pushed = False
         self._changed = runtime.event()
         self._ends = inf
-        self._caches = {
-            name: ObjectCache(name, access, self._changed.set, runtime)
-            for name, access in self._clusters.items()
-            if access.kubeconfig
-        }
+        self._caches = object_caches(self._clusters, self._changed.set, runtime)
         self._thread = runtime.keep_running("wake", self._run)
 
     def __call__(self, config: Config) -> None:
@@ -287,7 +279,7 @@ class ReconcileTrigger:
                 if argocd:
                     group, version, plural = "argoproj.io", "v1alpha1", "applications"
                     namespace, object_name = argocd.namespace, project_of(domain, settings)
-                    annotation = {_REFRESH: "normal"}
+                    annotation = {"argocd.argoproj.io/refresh": "normal"}
                 else:
                     group, version, plural = "source.toolkit.fluxcd.io", "v1", "gitrepositories"
                     namespace, object_name = domain.namespace, settings.source

@@ -150,8 +150,7 @@ def statuses(
     results = []
     for target in targets:
         domain = target.domain
-        store = caches.get(domain.cluster)
-        if store is None:
+        if (store := caches.get(domain.cluster)) is None:
             results.append(_NO_ACCESS)
             continue
         if domain not in unread:

@@ -23,7 +23,7 @@ from demandops.cluster.health import (
     why_unavailable,
     worst,
 )
-from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.object_cache import object_caches
 from demandops.decide.decision import Decision
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import plan
@@ -61,21 +61,14 @@ def targets_of_decision(before: World, decision: Decision) -> tuple[Target, ...]
 
 
 def targets_of_state(state: State) -> list[tuple[Release, Target]]:
-    releases = []
-    for key in all_keys(state):
-        release = plan(state, key)
-        if release is not None:
-            target = target_of(release, state.config.repo_settings)
-            releases.append((release, target))
+    planned = [release for key in all_keys(state) if (release := plan(state, key))]
+    releases = [(release, target_of(release, state.config.repo_settings)) for release in planned]
     return sorted(releases, key=lambda pair: (pair[1].domain.cluster, pair[1].name))
 
 
 def domains_of_state(state: State) -> list[ClusterDomain]:
-    settings = state.config.repo_settings
-    return [
-        cluster_domain(cluster, domain, settings)
-        for cluster, domain in domains_in_use(state.config)
-    ]
+    in_use, settings = domains_in_use(state.config), state.config.repo_settings
+    return [cluster_domain(cluster, domain, settings) for cluster, domain in in_use]
 
 
 def cluster_domain(cluster: str, domain: AccessDomain, repository: RepoSettings) -> ClusterDomain:
@@ -99,9 +92,6 @@ log = logging.getLogger("demandops")
 
 # Called with a state (reconciled, healthy, failing) and a text, once for each text.
 OnProgress = Callable[[str, str], None]
-
-_PAUSE_S = 0.05
-_LONGEST_WAIT_S = 1.0
 
 
 @dataclass(eq=False)
@@ -129,11 +119,7 @@ class RolloutWatcher:
         self._closed = False
         self._lock = runtime.lock()
         self._open: list[_Rollout] = []
-        self._caches = {
-            name: ObjectCache(name, access, self._changed.set, runtime)
-            for name, access in clusters.items()
-            if access.kubeconfig
-        }
+        self._caches = object_caches(clusters, self._changed.set, runtime)
         self._thread = runtime.keep_running("status", self._run)
 
     def why_unreachable(self, domains: Iterable[ClusterDomain]) -> str:
@@ -148,11 +134,8 @@ class RolloutWatcher:
         timeout: float,
         on_progress: OnProgress = lambda state, text: None,
     ) -> Future[Health]:
-        """Follow releases of a published commit; return at once.
-
-        :meth:`why_unreachable` must be empty for their domains. The future has the health when it
-        reaches ``level``, or when the time is over or this watcher is closed; it then says why.
-        """
+        # `why_unreachable` must be empty for their domains. The future has the health when it
+        # reaches ``level``, or when the time is over or this watcher is closed; it then says why.
         targets = tuple(targets)
         domains = tuple(dict.fromkeys(target.domain for target in targets))
         deadline = self._runtime.monotonic() + timeout
@@ -173,10 +156,10 @@ class RolloutWatcher:
 
     def _run(self) -> None:
         while not self._closed:
-            self._changed.wait(_LONGEST_WAIT_S)
+            self._changed.wait(1.0)
             self._changed.clear()
             self._evaluate()
-            self._runtime.sleep(_PAUSE_S)  # wait, because changes come in bursts
+            self._runtime.sleep(0.05)  # wait, because changes come in bursts
         self._evaluate(last=True)
 
     def _evaluate(self, last: bool = False) -> None:
@@ -243,8 +226,7 @@ class RolloutWatcher:
     def _time_out(self, rollout: _Rollout, health: Health) -> None:
         # The reason is to be as exact as possible: while a controller retries, its object no longer
         # says why the last attempt failed, and a Deployment never says why its pods do not run.
-        failed = rollout.failed
-        if failed and not health.failing and failed.object == health.object:
+        if (failed := rollout.failed) and not health.failing and failed.object == health.object:
             health = replace(health, reason=f"{health.reason}; before: {failed.reason}")
         kind, _, name = health.object.partition(" ")
         if kind == "Deployment":
@@ -253,8 +235,7 @@ class RolloutWatcher:
                 for domain in rollout.domains:
                     if domain.namespace == namespace:
                         cache = self._caches[domain.cluster]
-                        reason = why_unavailable(cache.pods(namespace, deployment))
-                        if reason:
+                        if reason := why_unavailable(cache.pods(namespace, deployment)):
                             health = replace(health, reason=f"{health.reason}; {reason}")
                             break
         self._resolve(rollout, health)

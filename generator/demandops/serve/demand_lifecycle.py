@@ -23,29 +23,13 @@ from collections import Counter, deque
 from collections.abc import Collection, Iterable
 from dataclasses import replace
 
-from demandops.base.errors import (
-    DemandOpsError,
-    QueueFull,
-    Refused,
-    ShuttingDown,
-    StateRepoError,
-    Unsound,
-    Withdrawn,
-    fault,
-    internal,
-)
+from demandops.base import errors
+from demandops.base.errors import DemandOpsError, QueueFull, ShuttingDown, StateRepoError, Unsound
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
 from demandops.repo.write.journal import Journal, ProposalRecord
-from demandops.serve.queue import (
-    FairQueue,
-    Receipt,
-    State,
-    Ticket,
-    reason_of,
-    requester_of,
-    ticket_from_journal,
-)
+from demandops.serve import queue
+from demandops.serve.queue import Receipt, State, Ticket, ticket_from_journal
 
 log = logging.getLogger("demandops")
 
@@ -75,7 +59,7 @@ class Demands:
         self._arrived = deque[Ticket]()
         self._arrival = runtime.event()
         self._new: list[Ticket] = []
-        self._queue = FairQueue(in_order=requester_limit is None)
+        self._queue = queue.FairQueue(in_order=requester_limit is None)
         for ticket in resumed:
             if ticket.proposal is None:
                 self._enqueue(ticket)
@@ -190,11 +174,10 @@ class Demands:
         with self._changed:
             for _ in range(len(self._arrived)):
                 ticket = self._arrived.popleft()
-                error = self._why_refused(ticket, len(taken))
-                if error is not None:
+                if (error := self._why_refused(ticket, len(taken))) is not None:
                     refused.append((ticket, error))
                     continue
-                self._of_requester[requester_of(ticket.goal)] += 1
+                self._of_requester[queue.requester_of(ticket.goal)] += 1
                 self._tickets[ticket.operation] = ticket
                 taken.append(ticket)
             try:
@@ -204,12 +187,12 @@ class Demands:
                     why = failure
                     log.error("%s", why)
                 else:  # a bug must leave no demand without an answer
-                    why = internal(failure)
+                    why = errors.internal(failure)
                     log.exception("internal error while journaling demands")
                 self.wake()  # so that the worker ends the process if the journal is unsound
                 for ticket in taken:
                     del self._tickets[ticket.operation]
-                    self._of_requester[requester_of(ticket.goal)] -= 1
+                    self._of_requester[queue.requester_of(ticket.goal)] -= 1
                     refused.append((ticket, why))
                 taken = []
             for ticket in taken:
@@ -233,10 +216,9 @@ class Demands:
             )
         if ticket.operation in self._tickets:
             message = "is the operation id of another demand; choose a new one"
-            return Refused([fault("", f"'{ticket.operation}' {message}")])
-        who = requester_of(ticket.goal)
-        limit = self._requester_limit
-        if limit is not None and self._of_requester[who] >= limit:
+            return errors.Refused([errors.fault("", f"'{ticket.operation}' {message}")])
+        who = queue.requester_of(ticket.goal)
+        if (limit := self._requester_limit) is not None and self._of_requester[who] >= limit:
             whose = f"of {quoted(who)}" if who else "without a requester"
             return QueueFull(
                 f"{limit} demands {whose} have no answer yet; send the demand again "
@@ -308,7 +290,7 @@ class Demands:
                 return
             self._queue.remove(withdrawn)
             batch[:] = [ticket for ticket in batch if ticket not in withdrawn]
-        self.fail(withdrawn, Withdrawn(TAKEN_BACK))
+        self.fail(withdrawn, errors.Withdrawn(TAKEN_BACK))
 
     def answer(
         self, results: Iterable[tuple[Ticket, Receipt | DemandOpsError]], keep: bool = False
@@ -321,7 +303,7 @@ class Demands:
             if isinstance(result, Receipt) or ticket.state == "done":
                 continue
             if str(result) != TAKEN_BACK:  # a client that took its demand back needs no notice
-                ticket.notify("refused", reason_of(result))
+                ticket.notify("refused", queue.reason_of(result))
         with self._changed:
             results = [(ticket, result) for ticket, result in results if ticket.state != "done"]
             if not keep:
@@ -364,14 +346,14 @@ class Demands:
         self.fail(left, error, keep=True)
 
     def _enqueue(self, ticket: Ticket) -> None:
-        self._of_requester[requester_of(ticket.goal)] += 1
+        self._of_requester[queue.requester_of(ticket.goal)] += 1
         self._queue.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
         # a proposed demand left the count of its requester already
         if ticket.proposal is None:
             # this difference drops a requester at 0, so that passing vehicles leave nothing behind
-            self._of_requester -= Counter([requester_of(ticket.goal)])
+            self._of_requester -= Counter([queue.requester_of(ticket.goal)])
 
 
 def _may_become(ticket: Ticket, state: State) -> bool:

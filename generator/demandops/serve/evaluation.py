@@ -8,7 +8,6 @@ from typing import Any
 
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, Withdrawn, fault, internal
 from demandops.base.settings import API_VERSION
-from demandops.cluster.rollouts import targets_of_decision
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.decide.restoration import Restoration
 from demandops.model.demand.demand_request import Decommission
@@ -21,7 +20,7 @@ from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.approvals.approvals import Approvals, Result
 from demandops.serve.approvals.proposal import is_release
 from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
-from demandops.serve.queue import Receipt, Ticket, receipt_of
+from demandops.serve.queue import Receipt, Ticket
 from demandops.serve.timing.timers import RateLimit, within
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
@@ -67,23 +66,13 @@ log = logging.getLogger("demandops")
 
 
 class Evaluator:
-    def __init__(
-        self,
-        repository: StateRepository,
-        demands: Demands,
-        approvals: Approvals,
-        with_targets: bool,
-    ) -> None:
+    def __init__(self, repository: StateRepository, demands: Demands, approvals: Approvals) -> None:
         self._repository, self._demands, self._approvals = repository, demands, approvals
-        self._with_targets = with_targets
         self._rate_limit = RateLimit()
 
     def evaluate(self, commits: CommitBatch, ticket: Ticket) -> Receipt | DemandOpsError | Decision:
-        """Decide a demand, commit it on the commit batch and return its result.
-
-        A demand that needs approval gets no commit; its result is the decision. A receipt is true
-        only once the batch is published. Errors that concern all demands are raised.
-        """
+        # A demand that needs approval gets no commit; its result is the decision. A receipt is true
+        # only once the batch is published. Errors that concern all demands are raised.
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
         try:
@@ -116,8 +105,6 @@ class Evaluator:
             if not self._demands.commit(ticket):
                 return Withdrawn(TAKEN_BACK)
             self._approvals.withdraw_replaced(decision.request)
-            before = commits.head.state
-            targets = targets_of_decision(before, decision) if self._with_targets else ()
             if decision.outcome == "waiting":
                 ticket.notify("waiting", f"waiting for room: {'; '.join(decision.warnings)}")
             if decision.files:
@@ -128,7 +115,7 @@ class Evaluator:
                 waits = decision.outcome == "waiting"  # the demand waited already
                 commits.record_in_next_commit(ticket.operation, "waiting" if waits else "unchanged")
                 commit = str(commits.head.commit)
-            return receipt_of(ticket, decision, commit, targets)
+            return self._approvals.receipt(ticket, decision, commit, state)
         except InvalidInput as error:
             if ticket.has_released:  # the demand released a proposal, which had no claims yet
                 commits.record_in_next_commit(ticket.operation, "released")
@@ -154,8 +141,7 @@ class Evaluator:
         histories = [(base, operations_since(objects, tip, base)) for base in bases]
         # all bases are ancestors of the tip, so the most outcomes are those since the oldest base
         since, recorded = max(histories, key=lambda history: len(history[1]), default=("", {}))
-        published = [operation for operation in reversed(recorded) if operation in sought]
-        if published:
+        if published := [operation for operation in reversed(recorded) if operation in sought]:
             # after a failed fsync only files that are written anew are sure to be on the disk
             self._repository.write_anew(since)
         for operation in sought.keys() - published:

@@ -56,7 +56,6 @@ class Generator:
         progress: Progress = lambda done, total: None,
         runtime: Runtime = REAL,
     ) -> None:
-        """Open the state repo, start the worker and resume the demands in the journal."""
         heartbeat = Heartbeat(settings.alive_file())
         signer = Signer(signing_key) if signing_key else None
         try:
@@ -88,7 +87,6 @@ class Generator:
             snapshot,
             self._demands,
             Approvals(repository, snapshot.state, self._demands, with_targets, token_file),
-            with_targets,
             fetch_interval,
             heartbeat,
         )
@@ -108,10 +106,7 @@ class Generator:
         return self._worker.snapshot
 
     def snapshot_at(self, revision: str) -> Snapshot:
-        """Return the state in effect at a commit or a time, without a fetch; it may take seconds.
-
-        Raises InvalidInput or StateRepoError if there is none.
-        """
+        # at a commit or a time, without a fetch; it may take seconds
         objects = self._repository.reopened()  # as libgit2's objects belong to one thread
         tip, now = self.snapshot.commit, self._runtime.now()
         with reading(self.address, objects):

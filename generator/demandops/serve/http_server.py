@@ -37,7 +37,6 @@ _REMEDIES = {
     errno.EACCES: "choose a port above 1023",
 }
 
-_STOP_TIMEOUT_S = 1
 _STUCK_S = 10.0
 _PIECES = 2_000  # the most packets that one request may arrive in
 _BYTES_IN_A_PIECE = 256
@@ -69,7 +68,7 @@ class HttpServer:
             access_log=False,  # paths and headers may hold secrets
             proxy_headers=False,  # anyone may send such headers
             server_header=False,
-            timeout_graceful_shutdown=_STOP_TIMEOUT_S,
+            timeout_graceful_shutdown=1,
             headers=headers,
         )
         self._server = uvicorn.Server(config)
@@ -81,12 +80,9 @@ class HttpServer:
 
 
 class _BoundedConnection(H11Protocol):
-    """A connection that is closed if its client takes too long or sends in too small pieces.
-
-    The client must complete a request within 10 to 20 seconds, and has as long to read each part of
-    an answer. While the server computes an answer, no time counts. So a stream of events stays open
-    while the client reads the events.
-    """
+    # The client must complete a request within 10 to 20 seconds, and has as long to read each part
+    # of an answer. While the server computes an answer, no time counts. So a stream of events stays
+    # open while the client reads the events.
 
     most: int  # of the connections that may be open
 
@@ -179,7 +175,6 @@ def url_of(listening: socket.socket) -> str:
 log = logging.getLogger("demandops")
 
 _PATH = "/push"
-_AT_ONCE = 32
 # The largest body that GitHub sends, in bytes; a body is hashed and not stored.
 _MAX_BODY = 25 << 20
 _WARN_EVERY_S = 60.0  # anyone may send requests, and a line for each could fill the log
@@ -208,7 +203,7 @@ class PushWebhook:
         app = Starlette(routes=[Route("/", _health), Route(_PATH, self._handle, methods=["POST"])])
         app.router.redirect_slashes = False
         one_request = [("Connection", "close")]
-        self._server = HttpServer(listening, app, "webhook", _AT_ONCE, one_request)
+        self._server = HttpServer(listening, app, "webhook", at_once=32, headers=one_request)
 
     def close(self) -> None:
         self._server.close()

@@ -206,11 +206,9 @@ class FairQueue:
             self._barriers.append(queued)
 
     def put_back(self, tickets: Sequence[Ticket], served: Iterable[Ticket] = ()) -> None:
-        """Put demands back, in the order in which they left, each before others of its requester.
-
-        The requesters of these demands get the next turns. But a requester of ``served``, demands
-        that left with them and do not come back, had its turn and comes after all others.
-        """
+        # In the order in which they left, each before others of its requester. Their requesters get
+        # the next turns. But a requester of ``served``, demands that left with them and do not come
+        # back, had its turn and comes after all others.
         first = min((queued.number for queued in self._queued.values()), default=1) - len(tickets)
         again = {
             ticket: _Queued(number, ticket, subjects_of(ticket.goal))
@@ -231,16 +229,14 @@ class FairQueue:
 
     def remove(self, tickets: Collection[Ticket]) -> None:
         for ticket in tickets:
-            queued = self._queued.pop(ticket, None)
-            if queued is not None:
+            if (queued := self._queued.pop(ticket, None)) is not None:
                 queued.has_left = True
 
     def popleft(self) -> Ticket:
         while True:
             requester = next(iter(self._lanes))
             lane = self._lanes.pop(requester)
-            first = _next_in(lane)
-            if first is not None:
+            if (first := _next_in(lane)) is not None:
                 self._lanes[requester] = lane  # at the end, so that the other requesters come first
                 break
         # whoever has the turn, related demands leave in the order in which they came
@@ -256,15 +252,13 @@ class FairQueue:
         return "" if self._in_order else requester_of(ticket.goal)
 
     def _predecessor(self, queued: _Queued) -> _Queued | None:
-        barrier = _next_in(self._barriers)
-        if barrier is not None and barrier.number < queued.number:
+        if (barrier := _next_in(self._barriers)) is not None and barrier.number < queued.number:
             return barrier
         if queued.subjects is None:
             oldest = next(iter(self._queued.values()))
             return oldest if oldest is not queued else None
         for subject in queued.subjects:
-            first = _next_in(self._subjects[subject])
-            if first is not None and first is not queued:
+            if (first := _next_in(self._subjects[subject])) is not None and first is not queued:
                 return first
         return None
 

@@ -3,19 +3,12 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from datetime import datetime
 
-from demandops.base.errors import (
-    DemandOpsError,
-    Fault,
-    ShuttingDown,
-    StateRepoError,
-    Unsound,
-    Withdrawn,
-    internal,
-)
+from demandops.base import errors
+from demandops.base.errors import DemandOpsError, StateRepoError, Unsound
 from demandops.base.runtime import Runtime
 from demandops.decide.decision import Decision
 from demandops.model.config.config import Config
@@ -33,18 +26,10 @@ from demandops.serve.approvals.approvals import Approvals, Result
 from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Ticket
+from demandops.serve.timing import timers
 from demandops.serve.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
 from demandops.serve.timing.own_work import OwnWork
-from demandops.serve.timing.timers import (
-    LIMIT_LOCAL,
-    LIMIT_REMOTE,
-    LONGEST_EVALUATION_S,
-    Backoff,
-    Heartbeat,
-    PollTimer,
-    Rest,
-    may_take_long,
-)
+from demandops.serve.timing.timers import LONGEST_EVALUATION_S, Backoff, PollTimer
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 # ---- whether the remote can be reached, for logs and diagnostics ----
@@ -96,37 +81,6 @@ class RemoteMonitor:
         self.status = replace(self.status, push_denied=reason)
 
 
-# ---- the log of the state repo's problems: each once, until it is mended ----
-
-
-class FaultLog:
-    def __init__(self, repository: StateRepository) -> None:
-        self._repository = repository
-        self._logged: frozenset[Fault] = frozenset()
-        self._warned_of_signers = False
-
-    def log_changes(self, problems: Iterable[Fault]) -> None:
-        current = list(dict.fromkeys(problems))
-        for problem in current:
-            if problem not in self._logged:
-                log.error("%s (its last valid version, if any, stays in effect)", problem)
-        for file in sorted({old.file for old in self._logged} - {new.file for new in current}):
-            log.info("%s is valid again", file or "the state repo")
-        self._logged = frozenset(current)
-
-    def warn_if_unsigned(self, snapshot: Snapshot) -> None:
-        if self._repository.signer is not None or self._warned_of_signers:
-            return
-        if signing.are_listed(self._repository.objects, snapshot.commit):
-            self._warned_of_signers = True
-            log.warning(
-                "%s lists who may sign, but this generator has no key, so `verify` will refuse its "
-                "commits, and generators will treat them as commits by a person; start the "
-                "generator with --signing-key",
-                signing.ALLOWED_SIGNERS,
-            )
-
-
 # ---- the worker ----
 #
 # The worker runs in one thread, the only one that writes to the state repo. Demands go first, so a
@@ -137,7 +91,6 @@ class FaultLog:
 _TIDY_EVERY = 50
 # How often to carry out a change by a person while other generators, which do the same, are faster.
 _TRIES = 5
-_LONGEST_PAUSE_S = 0.05
 _NAME = "writer"  # the thread's name, under which a health check reports its failure
 
 
@@ -150,9 +103,8 @@ class Worker:
         snapshot: Snapshot,
         demands: Demands,
         approvals: Approvals,
-        with_targets: bool,
         fetch_interval: float,
-        heartbeat: Heartbeat,
+        heartbeat: timers.Heartbeat,
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
@@ -160,18 +112,19 @@ class Worker:
         self._repository, self._demands, self._approvals = repository, demands, approvals
         self._runtime = repository.runtime
         self._heartbeat = repository.while_waiting = heartbeat
-        self._evaluator = Evaluator(repository, demands, approvals, with_targets)
+        self._evaluator = Evaluator(repository, demands, approvals)
         self._timer = PollTimer(fetch_interval, repository.runtime, local=repository.always_current)
         self._lease_expiry = LeaseExpiry(repository.runtime)
         self._own_work = OwnWork(repository.runtime)
         self._ahead = ReadAhead()
-        self._batch_limit = LIMIT_LOCAL if repository.always_current else LIMIT_REMOTE
+        self._batch_limit = timers.LIMIT_LOCAL if repository.always_current else timers.LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
-        self._log = FaultLog(repository)
+        self._logged: list[errors.Fault] = []
+        self._warned_of_signers = False
         self._ends_soon = self._runtime.event()
-        self._rest = Rest(repository.runtime)
-        self._log.warn_if_unsigned(snapshot)
+        self._rest = timers.Rest(repository.runtime)
+        self._warn_if_unsigned()
 
     # ---- from any thread ----
 
@@ -226,7 +179,7 @@ class Worker:
         if isinstance(error, Unsound):  # the process must end; the next one reads the journal
             self._demands.end(error)
             raise error
-        if isinstance(error, ShuttingDown):
+        if isinstance(error, errors.ShuttingDown):
             self._demands.fail(batch, error, keep=True)
             return
         # an expected error is in the answers to the demands, so only other errors are recorded
@@ -242,7 +195,7 @@ class Worker:
             self._rest.begin()
             self._timer.finished(reached=False)
         if not isinstance(error, DemandOpsError):
-            error = internal(error)
+            error = errors.internal(error)
         self._demands.fail(batch, error)
 
     def _seconds_until_due(self) -> float:
@@ -258,10 +211,8 @@ class Worker:
     # ---- publishing demands ----
 
     def _publish(self, batch: list[Ticket]) -> None:
-        """Publish a batch, the demands that arrive during retries, and the ends of leases.
-
-        The batch is empty afterwards, unless an error is raised.
-        """
+        # also the demands that arrive during retries, and the ends of leases; the batch is empty
+        # afterwards, unless an error is raised
         self._must_fetch, self._tip_is_fresh = False, self._repository.always_current
         backoff = Backoff(self._batch_limit, self._runtime)
         while batch or self._ended_leases(self.snapshot):
@@ -301,7 +252,7 @@ class Worker:
     def _require_not_ending(self) -> None:
         if self._ends_soon.is_set():
             reason = self._demands.blocked or "the generator stops"
-            raise ShuttingDown(
+            raise errors.ShuttingDown(
                 f"{reason}; the demand stays in the journal and is resumed at the next start"
             )
 
@@ -328,7 +279,7 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
-            if number and (is_late or may_take_long(ticket.goal)):
+            if number and (is_late or timers.may_take_long(ticket.goal)):
                 part, left = part[:number], part[number:] + left
                 break
             self._approvals.withdraw_released(results, ticket, commits.head.state)
@@ -365,7 +316,7 @@ class Worker:
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         # those that wait get the room that this demand frees before the next demand can take it
-        self._own_work.follow(commits, before)
+        self._own_work.waiting_turns.follow(commits, before)
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
@@ -384,7 +335,7 @@ class Worker:
         except PushDenied as error:
             # a withdrawn demand gets its answer whatever the remote says
             results[independent:] = [
-                (ticket, result if isinstance(result, Withdrawn) else error)
+                (ticket, result if isinstance(result, errors.Withdrawn) else error)
                 for ticket, result in results[independent:]
             ]
             self.remote.record_push_denied(str(error))
@@ -449,20 +400,26 @@ class Worker:
                 return not commits.is_empty
             self._repository.refresh()
             # at random, so that generators which all saw the change do not collide again
-            self._ends_soon.wait(self._runtime.uniform(0, _LONGEST_PAUSE_S))
+            self._ends_soon.wait(self._runtime.uniform(0, 0.05))
         return False  # other generators are faster, and they carry out the same changes
 
     def _new_commit_batch(self) -> CommitBatch:
         # its first commits render people's changes, and do the own work that is due
         tip = self._repository.tip()
-        before = self.snapshot
-        if tip == before.commit and not before.problems and before.is_rendered:
-            commits = CommitBatch(self._repository, before)
+        newest = self.snapshot
+        if tip == newest.commit and not newest.problems and newest.is_rendered:
+            commits = CommitBatch(self._repository, newest)
         else:
-            advance = self._ahead.advance(self._repository.objects, before, tip)
+            advance = self._ahead.advance(self._repository.objects, newest, tip)
             commits = CommitBatch(self._repository, advance.snapshot)
-            commits.follow(advance, before, self._runtime.now())
-            self._log.log_changes(commits.head.problems)
+            commits.follow(advance, newest, self._runtime.now())
+            # each problem of the state repo is logged once, until it is mended
+            before, self._logged = {*self._logged}, list(dict.fromkeys(commits.head.problems))
+            for problem in self._logged:
+                if problem not in before:
+                    log.error("%s (its last valid version, if any, stays in effect)", problem)
+            for file in sorted({old.file for old in before} - {new.file for new in self._logged}):
+                log.info("%s is valid again", file or "the state repo")
         self._own_work.commit_due(commits)
         return commits
 
@@ -473,9 +430,21 @@ class Worker:
         # also true after a person's merge that needs no commit of the generator
         if self.snapshot.commit != before.commit:
             self._packs_since_tidy += 1
-            self._log.warn_if_unsigned(self.snapshot)
+            self._warn_if_unsigned()
             for listener in self.listeners:
                 listener(self.snapshot.state.config)
+
+    def _warn_if_unsigned(self) -> None:
+        if self._repository.signer is not None or self._warned_of_signers:
+            return
+        if signing.are_listed(self._repository.objects, self.snapshot.commit):
+            self._warned_of_signers = True
+            log.warning(
+                "%s lists who may sign, but this generator has no key, so `verify` will refuse its "
+                "commits, and generators will treat them as commits by a person; start the "
+                "generator with --signing-key",
+                signing.ALLOWED_SIGNERS,
+            )
 
     def _record_reached(self, *, pushed: bool) -> None:
         self._demands.blocked = ""

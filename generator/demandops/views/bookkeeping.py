@@ -29,22 +29,16 @@ _Requesters: TypeAlias = dict[str, list[str]]
 
 @dataclass(frozen=True, slots=True)
 class ServiceEntry:
-    """One running service and its requesters.
-
-    ``inputs`` maps each input role to its topics, and each topic to its requesters. ``version`` is
-    that of the chart, ``application_version`` that in ``registry/versions.yaml``, or ``None``.
-    """
-
     applications: list[str]
     service: str
     node: str
     source: str | None
     source_topic: str | None
-    version: str
-    application_version: str | None
+    version: str  # of the chart
+    application_version: str | None  # in registry/versions.yaml
     versions_asked: dict[str, list[str]]
     parameters: dict[str, object]
-    inputs: dict[str, _Requesters]
+    inputs: dict[str, _Requesters]  # by role
     requesters: list[str]
 
 
@@ -85,27 +79,20 @@ class ResourceEntry:
 
 @dataclass(frozen=True, slots=True)
 class DemandEntry:
-    """One demand that holds claims. ``action`` is the ROS action that takes such a demand."""
-
-    action: Literal["Demand", "DeploymentRequest"]
+    action: Literal["Demand", "DeploymentRequest"]  # the ROS action that takes such a demand
     request: str
     requesters: list[str]
 
 
 @dataclass(frozen=True, slots=True)
 class Bookkeeping:
-    """The whole view: services by release name, connections and demands by id, all sorted.
-
-    ``demands`` includes demands whose claims are suspended, but no service or connection counts
-    these claims. ``nodes`` declare a capacity. ``waiting`` is in the order of the tries to book.
-    """
-
-    services: dict[str, ServiceEntry]
+    services: dict[str, ServiceEntry]  # by release name; all mappings are sorted
     connections: dict[str, ConnectionEntry]
+    # also those whose claims are suspended, but no service or connection counts these claims
     demands: dict[str, DemandEntry]
     suspended: list[SuspendedEntry]
-    nodes: dict[str, dict[str, ResourceEntry]]
-    waiting: list[WaitingEntry]
+    nodes: dict[str, dict[str, ResourceEntry]]  # that declare a capacity
+    waiting: list[WaitingEntry]  # in the order of the tries to book
 
 
 def bookkeeping(world: World) -> Bookkeeping:
@@ -216,16 +203,11 @@ def as_data(view: Bookkeeping, commit: str) -> dict[str, Any]:
 
 @dataclass(frozen=True, slots=True)
 class EntryChange:
-    """A service or connection that was added, changed or removed, and its last requesters.
-
-    If it was changed, ``lost`` has the facts that no longer hold, and ``gained`` the new facts.
-    """
-
     kind: Literal["service", "connection"]
     name: str
     change: Literal["added", "changed", "removed"]
-    requesters: list[str]
-    lost: tuple[str, ...] = ()
+    requesters: list[str]  # the last ones
+    lost: tuple[str, ...] = ()  # of one that was changed: the facts that no longer hold
     gained: tuple[str, ...] = ()
 
 

@@ -27,8 +27,6 @@ State = Literal["held", "kept", "suspended", "partly suspended", "waiting"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HeldDemand:
-    """A demand and what it holds. Of the demand's leases, ``lease`` is the first that ends."""
-
     name: str
     state: State
     requests: tuple[str, ...]
@@ -38,7 +36,7 @@ class HeldDemand:
     nodes: tuple[str, ...] = ()
     domains: tuple[str, ...] = ()
     since: datetime
-    lease: Lease | None = None
+    lease: Lease | None = None  # the first that ends
     suspended_by: tuple[str, ...] = ()
 
 

@@ -43,8 +43,7 @@ def override_report(world: World, now: datetime) -> list[Entry]:
         return []
     releases = defaultdict[str, list[Release]](list)
     for key in all_keys(world):
-        release = plan(world, key)
-        if release is not None:
+        if (release := plan(world, key)) is not None:
             for override, _ in release.shaping.by:
                 releases[override.name].append(release)
         elif denied := denied_release(world, key):
@@ -186,7 +185,7 @@ def is_released_by_demand_id(claim: Claim) -> bool:
 
 
 def shaping_files(release: Release, config: Config) -> list[tuple[str, str, str]]:
-    """Return (file, entry, what it decides) for all that shapes a release but overrides."""
+    # (file, entry, what it decides) for all that shapes a release but overrides
     images = {name: config.images[name] for name in release.images if name in config.images}
     if isinstance(release, ServiceRelease):
         images = {name: release.version.image(name, image) for name, image in images.items()}

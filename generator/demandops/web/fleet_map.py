@@ -31,8 +31,6 @@ class ServiceMark:
 
 @dataclass(frozen=True, slots=True)
 class NodeCard:
-    """A node as it is drawn; on a small card, ``services`` is empty and ``more`` is 0."""
-
     id: str
     type: str
     x: float
@@ -45,12 +43,24 @@ class NodeCard:
     count: int  # of all services on the node
     label: str
     title: str
-    services: tuple[ServiceMark, ...] = ()
+    services: tuple[ServiceMark, ...] = ()  # none on a small card
     more: int = 0  # how many services the card has no room for
 
-    @property
-    def middle(self) -> float:
-        return self.x + self.width / 2
+    def curve_to(self, target: NodeCard) -> str:
+        if self.y + self.height <= target.y:  # down
+            start, end, bend = self.y + self.height, target.y, 1.0
+        elif target.y + target.height <= self.y:  # up
+            start, end, bend = self.y, target.y + target.height, -1.0
+        else:  # between cards side by side, in an arc below both
+            start, end, bend = self.y + self.height, target.y + target.height, 0.0
+        reach = max(18.0, abs(end - start) / 2)
+        first = start + (bend or 1.0) * reach
+        second = end - bend * reach if bend else end + reach
+        own, other = self.x + self.width / 2, target.x + target.width / 2
+        return (
+            f"M{own:.1f} {start:.1f}C{own:.1f} {first:.1f} "
+            f"{other:.1f} {second:.1f} {other:.1f} {end:.1f}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,10 +126,8 @@ def _box(
 def by_place(
     cards: Mapping[str, NodeCard], nodes: Sequence[Node]
 ) -> tuple[dict[str, NodeCard], float]:
-    """Return the placed cards by node id, and the height of the map.
-
-    At least one node must have a position. The nodes without one follow in rows below the others.
-    """
+    # The placed cards by node id, and the height of the map. At least one node must have a
+    # position. The nodes without one follow in rows below the others.
     spots = {node.id: node.position for node in nodes if node.position}
     xs, ys = [spot.x for spot in spots.values()], [spot.y for spot in spots.values()]
     widest = max(cards[id].width for id in spots)
@@ -201,11 +209,8 @@ class Picture:
 
 
 def picture(now: Situation, wanted: Filter, layout: str) -> Picture:
-    """Return the map of a situation; services, connections and nodes that match are lit.
-
-    A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a position.
-    If no drawn node has a position, nodes are drawn by cluster.
-    """
+    # A ``layout`` other than ``place`` and ``cluster`` means ``place`` if most nodes have a
+    # position. If no drawn node has a position, nodes are drawn by cluster.
     config = now.commit_state.config
     nodes = list(config.nodes.values())
     rows = rows_of(now, "services") if wanted else []
@@ -331,22 +336,6 @@ def _lines(now: Situation, wanted: Filter, cards: Mapping[str, NodeCard]) -> lis
         names = ", ".join(row.cells["connection"].parts[0].text for row in rows[:3])
         title = f"{source} to {target}: {names}, {topics} topics, {worst}"
         is_lit = bool(wanted) and any(wanted.matches(row) for row in rows)
-        path = _curve(cards[source], cards[target])
+        path = cards[source].curve_to(cards[target])
         lines.append(Line(path, WORDS[worst], is_lit, source, target, title))
     return sorted(lines, key=lambda line: (line.is_lit, line.source, line.target))
-
-
-def _curve(source: NodeCard, target: NodeCard) -> str:
-    if source.y + source.height <= target.y:  # down
-        start, end, bend = source.y + source.height, target.y, 1.0
-    elif target.y + target.height <= source.y:  # up
-        start, end, bend = source.y, target.y + target.height, -1.0
-    else:  # between cards side by side, in an arc below both
-        start, end, bend = source.y + source.height, target.y + target.height, 0.0
-    reach = max(18.0, abs(end - start) / 2)
-    first = start + (bend or 1.0) * reach
-    second = end - bend * reach if bend else end + reach
-    return (
-        f"M{source.middle:.1f} {start:.1f}C{source.middle:.1f} {first:.1f} "
-        f"{target.middle:.1f} {second:.1f} {target.middle:.1f} {end:.1f}"
-    )

@@ -11,11 +11,11 @@ from itertools import islice
 
 from demandops.base.errors import DemandOpsError
 from demandops.base.quoting import one_line
-from demandops.base.runtime import REAL, Runtime
+from demandops.base.runtime import REAL
 from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
 from demandops.cluster.health import ClusterDomain, health_reader
-from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.object_cache import object_caches
 from demandops.cluster.release_status import old_bootstraps, orphans, statuses
 from demandops.repo.git.repository import reading
 from demandops.repo.history.commit_log import LogEntry
@@ -31,25 +31,16 @@ _KEPT = 2_000
 
 
 class ClusterWatch:
-    """Only one thread at a time may use a watch, but any thread may read :attr:`changes`."""
-
+    # only one thread at a time may use a watch, but any thread may read `changes`
     def __init__(
-        self, clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None], runtime: Runtime
+        self, clusters: Mapping[str, ClusterAccess], on_change: Callable[[], None]
     ) -> None:
-        self._runtime = runtime
-        self._caches = {
-            name: ObjectCache(name, access, on_change, runtime)
-            for name, access in clusters.items()
-            if access.kubeconfig
-        }
+        self._caches = object_caches(clusters, on_change, REAL)
+        self.clusters = frozenset(self._caches)
         self._domains = set[ClusterDomain]()
         self._states: dict[str, str] = {}
         self._unhealthy_from: dict[str, float] = {}
         self._changes = deque[HealthChange](maxlen=_KEPT)
-
-    @property
-    def clusters(self) -> frozenset[str]:
-        return frozenset(self._caches)
 
     @property
     def changes(self) -> tuple[HealthChange, ...]:
@@ -69,7 +60,7 @@ class ClusterWatch:
         # everything would be `waiting` for seconds after each commit.
         reported = statuses(targets, commit, caches, repository, repository.changed_paths)
         status_of = {target.name: status for target, status in zip(targets, reported, strict=True)}
-        at = self._runtime.monotonic()
+        at = REAL.monotonic()
         for name, status in status_of.items():
             before, after = self._states.get(name, ""), word_of(status)
             if before == after:
@@ -83,7 +74,7 @@ class ClusterWatch:
                 self._unhealthy_from.setdefault(name, at)
             if before:  # the first health that a cluster reports of a release is no change
                 reason = status.health.reason
-                change = HealthChange(self._runtime.now(), name, before, after, reason, lasted)
+                change = HealthChange(REAL.now(), name, before, after, reason, lasted)
                 self._changes.append(change)
         for name in self._states.keys() - status_of.keys():
             del self._states[name]
@@ -127,30 +118,26 @@ class Follower:
         interval: float,
         *,
         progress: Progress = lambda done, total: None,
-        runtime: Runtime = REAL,
     ) -> None:
-        """Read the newest state and follow the state repo; :meth:`close` closes ``reader``.
-
-        ``interval`` has the seconds between fetches from a remote. With 0, the follower fetches
-        only after :meth:`wake` or a change on a cluster.
-        """
-        self._reader, self._runtime = reader, runtime
+        # `close` closes ``reader``. ``interval`` has the seconds between fetches from a remote; at
+        # 0, the follower fetches only after `wake` or a change on a cluster.
+        self._reader = reader
         self._interval = _LOOK_S if reader.repository.always_current else interval or None
-        self._wake, self.closed = runtime.event(), runtime.event()
-        self._watch = ClusterWatch(clusters, self._wake.set, runtime)
+        self._wake, self.closed = REAL.event(), REAL.event()
+        self._watch = ClusterWatch(clusters, self._wake.set)
         self._commit_states: dict[str, CommitState] = {}
-        self._loading = runtime.lock()
+        self._loading = REAL.lock()
         # Browsers fetch the page again when this number changes.
         self.version = 0
         # The newest commits, at most `MOST_COMMITS`, newest first.
         self.history: tuple[Commit, ...] = ()
         snapshot = reader.last_valid_snapshot(reader.commit(), progress)
         self._newest = self._situation_at(_commit_state(reader, snapshot))
-        self._thread = runtime.keep_running("page", self._run)
+        self._thread = REAL.keep_running("page", self._run)
 
     @property
     def newest(self) -> Situation:
-        return replace(self._newest, now=self._runtime.now())
+        return replace(self._newest, now=REAL.now())
 
     @property
     def health_changes(self) -> tuple[HealthChange, ...]:
@@ -165,7 +152,6 @@ class Follower:
         return reading(repository.address, repository.objects)
 
     def at(self, revision: str) -> Situation:
-        """Return the situation at a commit or time; the newest if ``revision`` is empty."""
         newest = self.newest
         if not revision:
             return newest
@@ -211,7 +197,7 @@ class Follower:
         while not self.closed.is_set():
             self._wake.wait(self._interval)
             self._wake.clear()
-            began, before = self._runtime.monotonic(), self._newest
+            began, before = REAL.monotonic(), self._newest
             try:
                 commit, commit_state = self._reader.refresh(), before.commit_state
                 with self.reading():
@@ -231,7 +217,7 @@ class Follower:
                 self._newest = now
                 self.version += 1
                 # The pause keeps the load of the processor low when commits come all the time.
-                self.closed.wait(min(1.0, _PAUSE_FACTOR * (self._runtime.monotonic() - began)))
+                self.closed.wait(min(1.0, _PAUSE_FACTOR * (REAL.monotonic() - began)))
 
     def _situation_at(self, commit_state: CommitState) -> Situation:
         watch, repository, commit = self._watch, self._reader.repository, commit_state.commit
@@ -247,7 +233,7 @@ class Follower:
             self.history = (added + before)[:MOST_COMMITS]
         situation = Situation(
             commit_state,
-            self._runtime.now(),
+            REAL.now(),
             watched=watch.clusters,
             proposals=tuple(pending_proposals(repository)),
         )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -47,11 +46,9 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """A field of a row: texts, or a time; ``tone`` is its color."""
-
     parts: tuple[Part, ...] = ()
-    time: datetime | None = None
-    tone: str = ""
+    time: datetime | None = None  # instead of texts
+    tone: str = ""  # the color
     order: float | str | None = None  # by default the time or the first text
 
     @property
@@ -65,8 +62,7 @@ class Cell:
     @property
     def rank(self) -> tuple[bool, float, str]:
         # in ascending order, empty cells come last
-        order = self.order
-        if order is None:
+        if (order := self.order) is None:
             order = self.time.timestamp() if self.time else self.parts[0].text if self.parts else ""
         if isinstance(order, str):
             return order == "", 0.0, order.casefold()
@@ -81,10 +77,8 @@ class Column:
 
 @dataclass(frozen=True)
 class Row:
-    """One row of a list: ``cells`` by column, and ``hidden`` texts that only filters search."""
-
-    cells: Mapping[str, Cell]
-    hidden: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    cells: Mapping[str, Cell]  # by column
+    hidden: Mapping[str, Sequence[str]] = field(default_factory=dict)  # only filters search these
 
     @cached_property
     def texts(self) -> dict[str, tuple[str, ...]]:
@@ -103,8 +97,6 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """One page of a filtered and sorted list."""
-
     columns: tuple[Column, ...]
     rows: tuple[Row, ...]
     total: int  # of all rows of the list
@@ -177,22 +169,15 @@ def page_of(items: Sequence[Item], page: int, size: int) -> tuple[Sequence[Item]
 Values: TypeAlias = "tuple[Any, ...]"
 
 
-class ListKind(ABC):
-    """One of the lists, with its name in addresses.
-
-    ``entries`` yields the id and the values of each entry, from which ``row`` makes a row. While
-    the values stay the same, ``row`` is called again only if the configuration or the overrides
-    have changed.
-    """
-
-    name: str
+class ListKind:
+    name: str  # in addresses
     title: str
     about: str
     columns: tuple[Column, ...]
+    entries: Callable[[Situation], Iterator[tuple[str, Values]]]  # each with its id
+    # Makes a row of the values of an entry. While these stay the same, it is called again only if
+    # the configuration or the overrides have changed.
     row: Callable[..., Row]
-
-    @abstractmethod
-    def entries(self, now: Situation) -> Iterator[tuple[str, Values]]: ...
 
 
 def _release_part(name: str) -> Part:

@@ -28,13 +28,8 @@ Kind = Literal["failing", "suspended", "invalid", "unread", "decision", "waiting
 
 # The color of each kind of cause, in the order in which the view lists the kinds.
 KINDS: dict[str, str] = {
-    "unread": "bad",
-    "failing": "bad",
-    "invalid": "bad",
-    "suspended": "bad",
-    "decision": "busy",
-    "waiting": "busy",
-    "starting": "busy",
+    **dict.fromkeys(("unread", "failing", "invalid", "suspended"), "bad"),
+    **dict.fromkeys(("decision", "waiting", "starting"), "busy"),
 }
 
 # A function that returns the newest commit that changed a file or folder, or None.
@@ -57,11 +52,8 @@ _CRASH = re.compile(r"CrashLoop|exit code|OOMKilled|RunContainerError", re.I)
 def remedy_of(
     kind: Kind, release: Release, config: Config, object: str, reason: str, last_change: LastChange
 ) -> Remedy:
-    """Return who can probably fix a release, and how.
-
-    ``object`` names what is not ready: an object, such as ``Deployment perception/od-edge``, or a
-    cluster that cannot be read.
-    """
+    # ``object`` names what is not ready: an object, such as ``Deployment perception/od-edge``, or a
+    # cluster that cannot be read.
     cluster, (word, _, name) = release.node.cluster, object.partition(" ")
     namespace, _, short = name.partition("/")
     describe = ["kubectl", "-n", namespace, "describe", word.lower(), short]
@@ -128,8 +120,6 @@ _MOST_LISTED = 3
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Something that keeps applications from being ready, or that needs attention."""
-
     kind: Kind
     what: Part
     why: str
@@ -190,21 +180,17 @@ def applications(now: Situation, causes: Iterable[Cause], wanted: Filter) -> lis
         for application in cause.applications:
             by_application.setdefault(application, []).append(cause)
     statuses: dict[str, list[ReleaseStatus]] = {}
-    rows: dict[str, Row] = {}
+    claims_of: dict[str, list[Claim]] = {}
     for name, release in now.commit_state.releases.items():
         for application in release.applications if isinstance(release, ServiceRelease) else ():
             statuses.setdefault(application, []).append(now.status(name))
     for claim in now.commit_state.state.ledger:
         if claim.is_on_application:
-            row_before = rows.get(claim.subject.id)
-            who = {*claim.requesters, *(row_before.hidden["requester"] if row_before else ())}
-            demands = {claim.demand, *(row_before.hidden["demand"] if row_before else ())}
-            rows[claim.subject.id] = Row(
-                {"application": cell(claim.subject.id)},
-                {"requester": sorted(who), "demand": sorted(demands)},
-            )
+            claims_of.setdefault(claim.subject.id, []).append(claim)
     shown = []
-    for application, row in sorted(rows.items()):
+    for application, claims in sorted(claims_of.items()):
+        texts = {"requester": requesters_of(claims), "demand": [claim.demand for claim in claims]}
+        row = Row({"application": cell(application)}, texts)
         if wanted.matches(row):
             its_causes = tuple(by_application.get(application, ()))
             word = worst_word(statuses.get(application, ()))

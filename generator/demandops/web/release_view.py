@@ -13,8 +13,7 @@ from demandops.base.errors import DemandOpsError, InvalidInput, StateRepoError
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.cluster.release_status import ReleaseStatus
-from demandops.decide.changeset import ReleaseChange
-from demandops.decide.decision import decide
+from demandops.decide.decision import Decision, decide
 from demandops.model.config.override import Override
 from demandops.model.demand.claim import Claim, requesters_of
 from demandops.model.release import Release, ServiceRelease
@@ -29,30 +28,19 @@ from demandops.web.situation import WORDS, CommitState, Situation, since_of, wor
 
 
 @dataclass(frozen=True, slots=True)
-class Consequence:
-    """What would change if a demand were released, and how to release it."""
-
-    releases: tuple[ReleaseChange, ...]
-    how: str
-    # For `demandops request`, if the demand can be released by its id.
-    file: str
-    approval: tuple[str, ...] = ()  # why the release needs a person's approval
-    refused: str = ""  # why the generator would refuse it
-
-
-@dataclass(frozen=True, slots=True)
 class ExplainedDemand:
     id: str
     claims: Sequence[Claim]
     requesters: tuple[str, ...]
     releases: Sequence[str]  # the names of those that it needs
-    consequence: Consequence
+    how: str  # to release it
+    file: str  # for `demandops request`, if the demand can be released by its id
+    released: Decision | None  # what would change if it were released
+    refused: str  # why the generator would refuse that
 
 
 def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand:
-    """Return a demand and what would change without it; refuse one that holds nothing."""
-    claims = now.commit_state.claims_of_demands.get(id)
-    if not claims:
+    if not (claims := now.commit_state.claims_of_demands.get(id)):
         waiting = now.commit_state.state.ledger.waiting.values()
         is_waiting = any(demand.demand == id for demand in waiting)
         why = ", because it waits for room on a node" if is_waiting else ""
@@ -67,19 +55,17 @@ def explained_demand(now: Situation, reader: Reader, id: str) -> ExplainedDemand
     }
     how = how_to_release(claims[0])
     file = strict_yaml.dump(goal) if is_released_by_demand_id(claims[0]) else ""
+    released, refused = None, ""
     try:
         read = reader.file_reader(now.commit_state.commit)
-        decision = decide(now.commit_state.state, goal, now.now, read)
-        consequence = Consequence(decision.releases, how, file, decision.approval)
+        released = decide(now.commit_state.state, goal, now.now, read)
     except InvalidInput as error:
-        consequence = Consequence((), how, file, refused=str(error))
+        refused = str(error)
     releases = now.commit_state.releases_of_demands.get(id, [])
-    return ExplainedDemand(id, claims, requesters, releases, consequence)
+    return ExplainedDemand(id, claims, requesters, releases, how, file, released, refused)
 
 
 # ---- the view of one release ----
-
-MOST_CHANGES = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -90,8 +76,6 @@ class DiffLine:
 
 @dataclass(frozen=True, slots=True)
 class Explained:
-    """A release that runs, that an override denies, or that ran before."""
-
     name: str
     path: str
     release: Release | None  # None if it does not run
@@ -135,7 +119,7 @@ def explained_release(now: Situation, reader: Reader, name: str) -> Explained:
         raise StateRepoError(
             f"up to commit {commit_state.commit[:10]}, there was no release {quoted(name)}"
         )
-    history = reader.history(path, commit_state.commit, MOST_CHANGES)
+    history = reader.history(path, commit_state.commit, most=20)
     last = next(iter(history.newest), None) or history.started
     if history.stopped and not release:
         last = history.stopped

@@ -54,8 +54,8 @@ NAVIGATION = (
     ("rates", "Rates"),
 )
 
+
 _MOST_CAUSES = 100
-_EVENTS_ON_A_PAGE = 50
 
 Data = dict[str, Any]
 View = Callable[["ViewRequest"], tuple[str, Data]]
@@ -79,10 +79,8 @@ class ViewRequest:
         return int(text) if text.isascii() and text.isdigit() and len(text) < 7 else 1
 
     def to(self, path: str | None = None, **changes: str | int) -> str:
-        """Return the address of a view, with the chosen commit or time and the filter.
-
-        Without ``path``, it is this view with all its parameters. An empty value removes one.
-        """
+        # The address of a view, with the chosen commit or time and the filter. Without ``path``, it
+        # is this view with all its parameters. An empty value removes one.
         kept = {name: value for name, value in self.params.items() if path is None or name in _KEPT}
         params = {name: value for name, value in {**kept, **changes}.items() if value != ""}
         query = f"?{urlencode(params)}" if params else ""
@@ -129,7 +127,7 @@ def _timeline(asked: ViewRequest) -> tuple[str, Data]:
     changed: list[str] = []
     if asked.get("at"):
         changed = asked.follower.reader().files_changed_by(now.commit_state.commit)
-    shown, page, pages = lists.page_of(events, asked.page(), _EVENTS_ON_A_PAGE)
+    shown, page, pages = lists.page_of(events, asked.page(), size=50)
     return "timeline.html.j2", {
         "strip": time_line.strip(events, now.now, asked.get("span"), chosen),
         "lanes": time_line.LANES,
@@ -400,7 +398,6 @@ def _is_foreign(headers: Headers) -> bool:
 
 # How many connections may be open; at most half of them are streams of events (`Site`).
 _MOST_CONNECTIONS = 200
-_LOCAL_HOSTS = ("127.0.0.1", "localhost", "[::1]", "::1")
 
 
 class WebServer:
@@ -424,7 +421,7 @@ class WebServer:
         # With any other name in the Host header, another site could read the page through the
         # browsers of its visitors (DNS rebinding). A server that others reach may have any name,
         # for example that of a reverse proxy.
-        hosts = _LOCAL_HOSTS if is_local else ("*",)
+        hosts = ("127.0.0.1", "localhost", "[::1]", "::1") if is_local else ("*",)
         site = Site(follower, hosts, settings.documentation())
         self._server = HttpServer(listening, site.application, "web", _MOST_CONNECTIONS)
 

@@ -13,16 +13,10 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.cluster import rollouts
 from demandops.cluster.health import Health, Target
 from demandops.cluster.release_status import OldBootstrap, Orphan, ReleaseStatus
+from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import denied_release, plan
-from demandops.decide.planning.release_keys import (
-    ReleaseKey,
-    affected_keys,
-    all_keys,
-    keys_of_claims,
-)
-from demandops.decide.state import State
-from demandops.model.config.config import Config
+from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.override import Override
 from demandops.model.demand.claim import Claim
 from demandops.model.ledger.ledger import World, changes_on
@@ -84,51 +78,34 @@ class Planned:
 
 @dataclass(frozen=True, slots=True)
 class ReusableRows:
-    """The rows of a list, kept for the next time that the page shows the list."""
-
     # The status of each release when the rows were made; None if they are of an earlier commit.
     statuses: object
     rows: Mapping[str, tuple[tuple[Any, ...], Any]]  # the values and the row of each entry
 
 
 class CommitState:
-    """The state at one commit, with all that the page derives from it at its first use."""
-
     def __init__(
         self, snapshot: Snapshot, entry: LogEntry, problems: tuple[Problem | Fault, ...]
     ) -> None:
         self.snapshot, self.entry, self.problems = snapshot, entry, problems
+        self.commit, self.state = str(snapshot.commit), snapshot.state
+        self.config = snapshot.state.config
         # The rows of each list that was shown, by the list's name.
         self.rows: dict[str, ReusableRows] = {}
         self._entries: list[Entry] | None = None
-        self._planned: dict[ReleaseKey, Planned | None] | None = None
         # The newest commit that changed a path; None if none did. Paths are looked up when asked
         # for, because each look-up walks through the history.
         self.last_changes: dict[str, LogEntry | None] = {}
         # The files that a generator must still write or remove; None until they are looked up.
         self.not_rendered: frozenset[str] | None = None
 
-    @property
-    def commit(self) -> str:
-        return str(self.snapshot.commit)
-
-    @property
-    def state(self) -> State:
-        return self.snapshot.state
-
-    @property
-    def config(self) -> Config:
-        return self.state.config
-
     @cached_property
     def active(self) -> World:
         return without_suspended(self.state)
 
     def take_over(self, before: CommitState) -> None:
-        """Take the releases and rows of an earlier commit state; plan anew what may differ.
-
-        Call this before any other method, because computed attributes are kept.
-        """
+        # Its releases and rows are kept, and what may differ is planned anew. To be called before
+        # any other method, because computed attributes are kept.
         old, new = before.state, self.state
         # another configuration, or another override, may change every release
         if (old.config, old.overrides) != (new.config, new.overrides):
@@ -139,7 +116,7 @@ class CommitState:
         differing = subject_before.keys() ^ subject_now.keys()
         subjects = [*dict.fromkeys(subject_before.get(id) or subject_now[id] for id in differing)]
         changes = changes_on(old.ledger, new.ledger, subjects)
-        keys: set[ReleaseKey] = {*affected_keys(old, new, changes)}
+        keys: set[ReleaseKey] = {*release_keys.affected_keys(old, new, changes)}
         kept_before, kept_now = old.ledger.kept.steps, new.ledger.kept.steps
         keys |= {
             ServiceKey.of(instance)
@@ -150,14 +127,13 @@ class CommitState:
             # the page shows requesters, but `affected_keys` omits a release whose file stays the
             # same although its requesters changed
             if was and now and (was.requesters, was.partial) != (now.requesters, now.partial):
-                keys.update(keys_of_claims(self.active, [now]))
+                keys.update(release_keys.keys_of_claims(self.active, [now]))
         planned = before.planned | dict(self._with_other_claims(before, subjects))
         for key in keys:
             planned.pop(key, None)
-            release = self._plan(key)
-            if release or denied_release(new, key):
+            if (release := self._plan(key)) or denied_release(new, key):
                 planned[key] = release
-        self._planned = planned
+        self.planned = planned
         self.rows = {name: replace(rows, statuses=None) for name, rows in before.rows.items()}
 
     def _with_other_claims(
@@ -189,22 +165,16 @@ class CommitState:
                 yield key, replace(planned, claims=release_causes.by_booking([*kept, *needing]))
 
     def _plan(self, key: ReleaseKey) -> Planned | None:
-        release = plan(self.state, key)
-        if release is None:
+        if (release := plan(self.state, key)) is None:
             return None
         target = rollouts.target_of(release, self.config.repo_settings)
         return Planned(release, target, release_causes.claims_behind(self.active.ledger, release))
 
-    @property
+    @cached_property
     def planned(self) -> dict[ReleaseKey, Planned | None]:
-        """The planned releases by key.
-
-        The value is None if the release is denied, if all claims that need it are suspended, or if
-        the client of a connection carries no topic.
-        """
-        if self._planned is None:
-            self._planned = {key: self._plan(key) for key in all_keys(self.state)}
-        return self._planned
+        # None if the release is denied, if all claims that need it are suspended, or if the client
+        # of a connection carries no topic
+        return {key: self._plan(key) for key in release_keys.all_keys(self.state)}
 
     @cached_property
     def _sorted(self) -> list[Planned]:
@@ -255,11 +225,7 @@ class CommitState:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """The state at a commit, with the health of releases and the open proposals.
-
-    For an earlier commit, all that the clusters report is empty.
-    """
-
+    # for an earlier commit, all that the clusters report is empty
     commit_state: CommitState
     now: datetime
     is_newest: bool = True

@@ -38,7 +38,6 @@ SPANS = {
 
 _STRIP_WIDTH = 1000
 _BINS = 60
-_FEW = 20
 # The distances between ticks that people can read off easily, from a second to 30 days.
 _STEPS_S = (1, 5, 15, 60, 300, 900, 3600, 4 * 3600, 86400, 7 * 86400, 30 * 86400)
 _TICKS = 8
@@ -66,9 +65,7 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class Dot:
-    """Events of one lane that are close together."""
-
-    lane: str
+    lane: str  # of the events, which are close together
     x: float
     radius: float
     count: int
@@ -127,14 +124,11 @@ def matching(events: Iterable[Event], wanted: Filter, lane: str) -> list[Event]:
 def strip(
     events: Sequence[Event], now: datetime, span: str, chosen: tuple[datetime, str] | None
 ) -> Strip:
-    """Return the picture of the time line that ends at ``now``, for events that are newest first.
-
-    If ``span`` is no key of ``SPANS``, it is the shortest that has enough events. ``chosen`` is the
-    time and the id of the chosen commit.
-    """
+    # It ends at ``now``; the events are newest first. If ``span`` is no key of ``SPANS``, it is the
+    # shortest that has enough events. ``chosen`` is the time and the id of the chosen commit.
     if span not in SPANS:
         # enough events are 20, or three quarters of all events, whichever is less
-        last = min(_FEW, 3 * len(events) // 4) - 1
+        last = min(20, 3 * len(events) // 4) - 1
         oldest_shown = events[last].time if len(events) > 1 else now
         spans = (name for name, seconds in SPANS.items() if seconds)
         span = next(
@@ -213,10 +207,7 @@ _RELEASED = {"shutdown", "release", "expire", "decommission"}
 def plots(
     commits: Sequence[Commit], health: Sequence[HealthChange], now: datetime, span: str
 ) -> list[Plot]:
-    """Return the plots of a span of time that ends at ``now``.
-
-    A ``span`` that is no key of ``SPANS`` means the time since the oldest of ``commits``.
-    """
+    # A ``span`` that is no key of ``SPANS`` means the time since the oldest of ``commits``.
     seconds = SPANS.get(span, 0)
     oldest = commits[-1].entry.time if commits else now - timedelta(hours=1)
     start = now - timedelta(seconds=seconds) if seconds else oldest

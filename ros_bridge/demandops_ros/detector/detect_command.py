@@ -16,6 +16,8 @@ from rcl_interfaces.msg import FloatingPointRange, ParameterDescriptor
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 
+from demandops_ros.node_parameters import LOG_LEVELS
+
 # ---- the detector's parameters ----
 
 # Each parameter: its default, its description and, if it is a number, its range.
@@ -52,8 +54,6 @@ PARAMETERS: dict[str, tuple[Any, str, tuple[float, float] | None]] = {
         None,
     ),
 }
-
-LOG_LEVELS = ("debug", "info", "warn", "error", "fatal")
 
 
 def declare(node: Node, rules: str | None) -> dict[str, Any]:
@@ -126,15 +126,10 @@ def detect(
     for option, given in (("--plot", plot is not None), ("--output", output != "text")):
         if given:
             raise click.UsageError(f"{option} needs --replay; add --replay, or leave {option} out")
-    from rclpy.signals import SignalHandlerOptions  # noqa: PLC0415 - a replay needs no ROS
-
-    from demandops_ros import ros_process  # noqa: PLC0415
+    from demandops_ros import ros_process  # noqa: PLC0415 - a replay needs no ROS
     from demandops_ros.detector.detector_node import DetectorNode  # noqa: PLC0415
 
-    with (
-        ros_process.stop_signals() as wait_for_signal,
-        ros_process.started(ros_args, SignalHandlerOptions.NO),
-    ):
+    with ros_process.stop_signals() as wait_for_signal, ros_process.started(ros_args):
         node = DetectorNode(rules)
         thread = ros_process.ExecutorThread(node)
         wait_for_signal()

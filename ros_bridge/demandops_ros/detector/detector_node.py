@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
@@ -21,17 +22,18 @@ from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDe
 from demandops.detect.observations import Key, MessageReader, Observation, Unreadable
 from demandops.detect.rule_file import Goal, RuleFile, read
 from demandops_interfaces.msg import Bookkeeping
-from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 
 from demandops_ros import ros_process
 from demandops_ros.actions import DemandError, GoalSender
 from demandops_ros.client import DemandClient
 from demandops_ros.detector import detect_command
 from demandops_ros.messages import fill_message
-from demandops_ros.node import status
+from demandops_ros.node import LATCHED, Diagnostics
+
+log = logging.getLogger("demandops")
 
 # ---- subscriptions to the topics that match the sources of rules ----
 #
@@ -115,14 +117,9 @@ class SourceSubscriptions:
 _THREADS = 8
 _LONGEST_WAIT_S = 60.0
 
-Log = Callable[[str, str], None]  # of a level, `info` or `warning`, and a text
-
 
 class DemandSender:
-    def __init__(
-        self, action_name: str, demand_action_name: str, timeout_s: float, log: Log
-    ) -> None:
-        self._log = log
+    def __init__(self, action_name: str, demand_action_name: str, timeout_s: float) -> None:
         self._wanted = WantedDemands()
         self._changed = REAL.condition()
         self._is_closed = False
@@ -139,7 +136,6 @@ class DemandSender:
         ]
 
     def close(self) -> None:
-        """Stop sending; demands that are booked stay booked."""
         with self._changed:
             self._is_closed = True
             self._changed.notify_all()
@@ -173,9 +169,9 @@ class DemandSender:
             if subjects:
                 what += f" for {', '.join(subjects)}"
             if told:
-                self._log("warning", f"rule {rule}: {what} failed and will be tried again: {told}")
+                log.warning("rule %s: %s failed and will be tried again: %s", rule, what, told)
             elif not outcome.code and sending.purpose != "renew":
-                self._log("info", f"rule {rule}: {what}: {outcome.message}")
+                log.info("rule %s: %s: %s", rule, what, outcome.message)
 
     def _take(self) -> Sending | None:
         with self._changed:
@@ -213,15 +209,10 @@ class DemandSender:
 # not end these demands.
 
 _MOST_REFUSALS = 20  # that the diagnostics list
-_DISCOVERY_S = 0.5
-_RELOAD_S = 1.0
-_PATIENCE_S = 10.0
-_MOST_OBSERVATIONS = 100_000
 # The time that ROS reports until the first message of a simulated clock arrives.
 _UNHEARD_CLOCK = 0.0
 # If the clock jumps by more, someone has set the clock or restarted the simulation.
 _SET_CLOCK_S = 1.0
-_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class DetectorNode(Node):  # type: ignore[misc]
@@ -235,43 +226,35 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._last_now, self._last_look = self._now(), REAL.monotonic()
         self._detector = Detector(file, self._last_now)
         self._is_started = False
-        self._observations: deque[Observation] = deque(maxlen=_MOST_OBSERVATIONS)
+        self._observations: deque[Observation] = deque(maxlen=100_000)
         self._sender = DemandSender(
             settings["action_name"],
             settings["demand_action_name"],
             settings["answer_timeout"],
-            self._log,
         )
         self._topics = self._subscribe(file)
         self._bookkeeping: Mapping[str, Any] | None = None
         self._books: Any = None
         if settings["bookkeeping_topic"]:
-            self._books = self.create_subscription(
-                Bookkeeping, settings["bookkeeping_topic"], self._hear_books, _LATCHED
-            )
+            topic = settings["bookkeeping_topic"]
+            self._books = self.create_subscription(Bookkeeping, topic, self._hear_books, LATCHED)
         else:
             self._bookkeeping = {}
         # by a steady clock, because a simulated one may be what is missing
         self._patience = self.create_timer(
-            _PATIENCE_S, self._say_what_is_missing, clock=Clock(clock_type=ClockType.STEADY_TIME)
+            10.0, self._say_what_is_missing, clock=Clock(clock_type=ClockType.STEADY_TIME)
         )
         self.create_timer(settings["period"], self._step)
-        self.create_timer(_DISCOVERY_S, self._refresh)
-        self.create_timer(_RELOAD_S, self._reload_if_changed)
-        self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
+        # a reload replaces the subscriptions, so this timer is not bound to those of now
+        self.create_timer(0.5, lambda: self._topics.refresh())  # noqa: PLW0108
+        self.create_timer(1.0, self._reload_if_changed)
+        self._diagnostics = Diagnostics(self, "demandops_detector", self._rules)
         self._problems: tuple[str, ...] = ()
         self.create_timer(1.0, self._report)
 
     def close(self) -> None:
         self._topics.close()
         self._sender.close()
-
-    def _log(self, level: str, text: str) -> None:
-        logger = self.get_logger()  # in rclpy, a line of code can log at one level only
-        if level == "warning":
-            logger.warning(one_line(text))
-        else:
-            logger.info(one_line(text))
 
     def _now(self) -> float:
         return float(self.get_clock().now().nanoseconds) / 1e9
@@ -292,10 +275,10 @@ class DetectorNode(Node):  # type: ignore[misc]
             bookkeeping = json.loads(message.bookkeeping_json)
             booked_events(self._detector.file, bookkeeping)
         except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-            self._log(
-                "warning",
-                f"the bookkeeping cannot be read ({error!r}); check who publishes it; the next one "
-                "is waited for",
+            log.warning(
+                "the bookkeeping cannot be read (%r); check who publishes it; the next one is "
+                "waited for",
+                error,
             )
             return
         self._bookkeeping = bookkeeping
@@ -310,12 +293,9 @@ class DetectorNode(Node):  # type: ignore[misc]
         else:
             missing = "no bookkeeping has come, so nothing is demanded; start demandops serve, or "
             missing += "set the parameter bookkeeping_topic to the topic of the bookkeeping"
-        self.get_logger().warning(missing)
+        log.warning("%s", missing)
 
     # ---- periodic work ----
-
-    def _refresh(self) -> None:
-        self._topics.refresh()  # of the rules in effect: a reload replaces this object
 
     def _step(self) -> None:
         now = self._now()
@@ -328,10 +308,10 @@ class DetectorNode(Node):  # type: ignore[misc]
             self._last_now, self._last_look = now, REAL.monotonic()
             if self._books is not None:
                 self.destroy_subscription(self._books)
-            self._log(
-                "info",
-                f"detecting; rules: {len(self._detector.file.rules)}, demands booked before "
-                f"the start: {len(booked)}",
+            log.info(
+                "detecting; rules: %d, demands booked before the start: %d",
+                len(self._detector.file.rules),
+                len(booked),
             )
         observations = [self._observations.popleft() for _ in range(len(self._observations))]
         # if the clock was set since the last step, the detector's times are moved with it
@@ -341,10 +321,10 @@ class DetectorNode(Node):  # type: ignore[misc]
         jumped = min(passed, 0.0) if is_simulated else passed - (look - self._last_look)
         self._last_now, self._last_look = now, look
         if abs(jumped) > _SET_CLOCK_S:
-            self._log("warning", f"the clock has jumped by {jumped:.1f} s")
+            log.warning("the clock has jumped by %.1f s", jumped)
             self._detector.set_clock(jumped)
         for event, want in self._detector.step(observations, now):
-            self._log("info", f"rule {event.rule}: {event.why}")
+            log.info("rule %s: %s", event.rule, event.why)
             self._sender.want([want])
 
     def _reload_if_changed(self) -> None:
@@ -367,53 +347,42 @@ class DetectorNode(Node):  # type: ignore[misc]
         self._sender.want(self._detector.replace_rules(file, self._now(), self._settle_s))
         self._topics.close()
         self._topics = self._subscribe(file)
-        self._log("info", f"the file has changed; rules: {len(file.rules)}")
+        log.info("the file has changed; rules: %d", len(file.rules))
 
     def _keep_rules(self, error: InvalidInput) -> None:
         problems = tuple(map(str, error.faults))
         if problems != self._problems:
             for problem in problems:
-                self._log("warning", f"{problem}; the last valid rules stay in effect")
+                log.warning("%s; the last valid rules stay in effect", one_line(problem))
         self._problems = problems
 
     def _report(self) -> None:
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        statuses, rules, detector = [], self._rules, self._detector
-
-        level, text = DiagnosticStatus.OK, "valid"
-        if self._problems:
-            level = DiagnosticStatus.WARN
-            text = "the file cannot be read or is invalid; the last valid rules are in effect"
+        detector, add = self._detector, self._diagnostics.add
+        invalid = "the file cannot be read or is invalid; the last valid rules are in effect"
         values = {"rules": str(len(detector.file.rules))}
         values |= {f"problem {at}": problem for at, problem in enumerate(self._problems, start=1)}
-        statuses.append(status("demandops_detector: rules", rules, level, text, values))
+        add("rules", "valid", values, warning=invalid if self._problems else "")
 
-        level, text = DiagnosticStatus.OK, "detecting"
-        if not self._is_started:
-            level, text = DiagnosticStatus.WARN, "waiting for the bookkeeping or /clock"
+        missing = "" if self._is_started else "waiting for the bookkeeping or /clock"
         values = {
             "topics": str(self._topics.topics),
             "entities": str(detector.entities),
             "messages": str(self._topics.messages),
             "messages left out": str(self._topics.unreadable),
         }
-        statuses.append(status("demandops_detector: data", rules, level, text, values))
+        add("data", "detecting", values, warning=missing)
 
         _, unanswered, refusals = self._sender.summary()
-        level, text = DiagnosticStatus.OK, "every demand is answered"
+        text, failed = "every demand is answered", ""
         if unanswered:
             text = f"{unanswered} demands have no answer yet"
         if refusals:
-            level = DiagnosticStatus.WARN
-            text = f"{len(refusals)} demands failed and are tried again"
+            failed = f"{len(refusals)} demands failed and are tried again"
         values = {"events": str(len(detector.lasting)), "unanswered": str(unanswered)}
         for (rule, subjects), why in refusals[:_MOST_REFUSALS]:
             values[" ".join((rule, *subjects))] = why
-        statuses.append(status("demandops_detector: demands", rules, level, text, values))
-
-        message.status = statuses
-        self._diagnostics.publish(message)
+        add("demands", text, values, warning=failed)
+        self._diagnostics.publish()
 
 
 def _read_rules(path: Path) -> tuple[RuleFile, str]:

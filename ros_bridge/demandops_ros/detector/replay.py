@@ -47,8 +47,7 @@ class RecordedBag:
         self.left_out: dict[tuple[str, str], int] = {}
         for connection in self._reader.connections:
             for name, source in file.sources.items():
-                entity = entity_in(source.topic, connection.topic)
-                if entity is None:
+                if (entity := entity_in(source.topic, connection.topic)) is None:
                     continue
                 if connection.msgtype == source.type:
                     self._sources.setdefault(connection.id, []).append((name, entity))
@@ -106,8 +105,6 @@ class RecordedBag:
 
 _WIDTH, _MAP, _ROW, _LEFT, _RIGHT, _EDGE = 1000, 600, 22, 300, 30, 30
 _COLORS = ("#0b6e99", "#c2410c", "#15803d", "#7e22ce", "#b91c1c", "#4d7c0f", "#be185d", "#1d4ed8")
-_MOST_ROWS = 200
-_STYLE = "font-family:sans-serif;font-size:12px"
 
 Span = tuple[float, float]
 
@@ -119,7 +116,7 @@ def svg(replay: Replay) -> str:
             spans.setdefault(event.key, []).append((event.at, inf))
         else:
             spans[event.key][-1] = spans[event.key][-1][0], event.at
-    rows = [*spans.items()][:_MOST_ROWS]
+    rows = [*spans.items()][:200]
     height = _MAP + _ROW * (len(rows) + 3)
     colors: dict[str, str] = {}
 
@@ -128,7 +125,8 @@ def svg(replay: Replay) -> str:
 
     parts = [*_map(replay, color_of), *_times(replay, rows, color_of)]
     return (
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" style="{_STYLE}">'
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {_WIDTH} {height}" '
+        'style="font-family:sans-serif;font-size:12px">'
         f'<rect width="{_WIDTH}" height="{height}" fill="white"/>\n{"".join(parts)}</svg>\n'
     )
 

@@ -9,14 +9,8 @@ import click
 from demandops.base.errors import InvalidInput, suggestion
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
-from demandops.cli.actions.person_change import (
-    confirm,
-    is_asked,
-    reason_option,
-    warned_if_unnamed,
-    writable,
-    yes_option,
-)
+from demandops.cli.actions import person_change
+from demandops.cli.actions.person_change import warned_if_unnamed
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import errors
 from demandops.cli.target import names_of, signing_option, writable_repo_option
@@ -73,15 +67,15 @@ def _proposal(repo: Reader, name: str, commit: str, output: str) -> PendingPropo
 
 @click.command()
 @click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
-@reason_option
+@person_change.reason_option
 @commit_option
-@yes_option
+@person_change.yes_option
 @writable_repo_option
 @signing_option
 @output_option
 def approve(
     name: str,
-    reason: str | None,
+    reason: str,
     commit: str,
     yes: bool,
     state_repo: str,
@@ -102,11 +96,11 @@ def approve(
       demandops approve visit -m "Agreed with the control room"
       demandops approve visit --commit 5d41402abc4b2a76b9719d911017c592e81f9d3a
     """
-    if not (commit or is_asked(yes, output)):
+    if not (commit or person_change.is_asked(yes, output)):
         raise click.UsageError(
             "name the commit that you looked at: --commit ID; `demandops get proposals` lists it"
         )
-    with writable(state_repo, signing_key) as repo:
+    with person_change.writable(state_repo, signing_key) as repo:
         proposal = _proposal(repo, name, commit, output)
         if output == "text":
             base = repo.base_of(proposal.commit)
@@ -119,10 +113,9 @@ def approve(
                 *(f"~ file {path}" for path in by_hand),
             ):
                 errors.print(f"  {one_line(line)}")
-        confirm("Approve it?", yes, output)
+        person_change.confirm("Approve it?", yes, output)
         summary = f"Approve {', '.join(proposal.demands) or proposal.branch}: {proposal.summary}"
-        why = " ".join((reason or "").split())
-        details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, why)
+        details = CommitDetails(warned_if_unnamed(repo.operator()), REAL.now(), summary, reason)
         merged = person_commit.merge(repo.repository, proposal, details)
     data = {"outcome": "approved", "branch": proposal.branch, "commit": merged.commit}
     show(output, data, [f"approved: {proposal.branch} is merged in {merged.commit}"])
@@ -134,7 +127,7 @@ def approve(
 @click.command()
 @click.argument("name", metavar="BRANCH|DEMAND", shell_complete=names_of("proposals"))
 @commit_option
-@yes_option
+@person_change.yes_option
 @writable_repo_option
 @output_option
 def reject(name: str, commit: str, yes: bool, state_repo: str, output: str) -> None:
@@ -148,9 +141,9 @@ def reject(name: str, commit: str, yes: bool, state_repo: str, output: str) -> N
       demandops reject demand/visit-3f2a9c1b04de
       demandops reject visit --yes
     """
-    with writable(state_repo, None) as repo:
+    with person_change.writable(state_repo, None) as repo:
         proposal = _proposal(repo, name, commit, output)
-        confirm("Turn it down?", yes, output)
+        person_change.confirm("Turn it down?", yes, output)
         ProposalBranches(repo.repository).remove(proposal.branch, proposal.commit)
     data = {"outcome": "rejected", "branch": proposal.branch, "commit": proposal.commit}
     show(output, data, [f"turned down: {proposal.branch} is deleted"])

@@ -14,13 +14,7 @@ import click
 
 from demandops.base.errors import Fault, InvalidInput, Refused
 from demandops.base.runtime import REAL
-from demandops.cli.actions.person_change import (
-    confirm,
-    is_asked,
-    reason_option,
-    warned_if_unnamed,
-    yes_option,
-)
+from demandops.cli.actions import person_change
 from demandops.cli.json_output import Json, claim_data, faults_of, output_option, show
 from demandops.cli.output import busy, console, errors, progress
 from demandops.cli.target import dry_run_option, names_of, signing_option, writable_repo_option
@@ -40,14 +34,12 @@ from demandops.serve.queue import Receipt
 
 # ---- booking, and printing the changes ----
 
-_LOOK_UP_S = 0.5
-
 
 def await_answer(future: Future[Any]) -> None:
     # Polled, so that Ctrl-C and SIGTERM interrupt it: a wait without a timeout could miss a signal
     # that arrives just before the wait begins, or a signal that another library handles.
     while not future.done():
-        wait([future], timeout=_LOOK_UP_S)
+        wait([future], timeout=0.5)
 
 
 def booked(generator: Generator, goal: Json) -> Receipt:
@@ -122,16 +114,16 @@ def claim_text(claim: Json) -> str:
     flag_value="requester",
     help="Decommission only the requester NAME, not a node of the same name.",
 )
-@reason_option
+@person_change.reason_option
 @dry_run_option
-@yes_option
+@person_change.yes_option
 @signing_option
 @output_option
 def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     name: str,
     state_repo: str,
     kinds: str | None,
-    reason: str | None,
+    reason: str,
     dry_run: bool,
     yes: bool,
     signing_key: Path | None,
@@ -154,18 +146,16 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     """
     chosen = frozenset([kinds] if kinds else ["node", "requester"])
     by = commit_message.operator()
-    goal = Decommission(
-        name, kinds=chosen, by=str(by), reason=" ".join((reason or "").split())
-    ).goal()
-    if dry_run or is_asked(yes, output):
+    goal = Decommission(name, kinds=chosen, by=str(by), reason=reason).goal()
+    if dry_run or person_change.is_asked(yes, output):
         row = _dry_run_decommission(goal, state_repo, output)
         show(output, row, _decommission_lines(row, True))
         if dry_run or row["outcome"] == "unchanged":
             return
-        confirm("Continue?", yes, output)
+        person_change.confirm("Continue?", yes, output)
     # through the journal, like a demand, so it may run beside other generators
     with started_generator(state_repo, signing_key) as generator:
-        warned_if_unnamed(by)
+        person_change.warned_if_unnamed(by)
         try:
             receipt = booked(generator, goal)
             row = _row(goal, receipt.outcome, receipt.commit, receipt.changes)
@@ -229,7 +219,7 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
 @click.command()
 @click.argument("revision", metavar="REV|TIME")
 @writable_repo_option
-@reason_option
+@person_change.reason_option
 @click.option(
     "--drop-newer",
     is_flag=True,
@@ -237,13 +227,13 @@ _SIGN = {"restored": "+", "changed_back": "~", "dropped": "-"}
     "prevent the rollback.",
 )
 @dry_run_option
-@yes_option
+@person_change.yes_option
 @signing_option
 @output_option
 def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     revision: str,
     state_repo: str,
-    reason: str | None,
+    reason: str,
     drop_newer: bool,
     dry_run: bool,
     yes: bool,
@@ -264,12 +254,12 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
       demandops rollback 14:00 -m "The station sent nonsense"
       demandops rollback 2h -m "A wrong test" --drop-newer --yes
     """
-    if not (dry_run or (reason and reason.strip())):
+    if not (dry_run or reason):
         raise click.UsageError("give the reason: -m TEXT")
     with reader.opened(state_repo, only_read=dry_run) as repo:
         to, base = repo.commit(revision), repo.commit()
-        who = repo.operator() if dry_run else warned_if_unnamed(repo.operator())
-        goal = evaluation.goal(to, drop_newer=drop_newer, reason=reason or "", who=who)
+        who = repo.operator() if dry_run else person_change.warned_if_unnamed(repo.operator())
+        goal = evaluation.goal(to, drop_newer=drop_newer, reason=reason, who=who)
         result: Json = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
         result |= {**_consequences(None), "configuration_since": since, "faults": []}
@@ -278,9 +268,9 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
         except InvalidInput as error:
             result["faults"] = faults_of(error)
     if not dry_run and not result["faults"]:
-        if is_asked(yes, output) and result["outcome"] != "unchanged":
+        if person_change.is_asked(yes, output) and result["outcome"] != "unchanged":
             show(output, None, _rollback_lines(result, True))
-            confirm("Continue?", yes, output)
+            person_change.confirm("Continue?", yes, output)
         result |= _roll_back(state_repo, goal, signing_key, base)
     if result["faults"] and output == "text":
         print_refusal(f"the rollback to {to[:10]} is refused:", result["faults"])

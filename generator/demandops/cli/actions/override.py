@@ -13,18 +13,8 @@ from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
-from demandops.cli.actions.person_change import (
-    Edit,
-    EditOptions,
-    carry_out,
-    confirm,
-    consequence,
-    editing,
-    print_edit,
-    selecting,
-    selector,
-    writable,
-)
+from demandops.cli.actions import person_change
+from demandops.cli.actions.person_change import Edit, EditOptions, selector, writable
 from demandops.cli.output import errors
 from demandops.cli.repo.scaffold import document
 from demandops.cli.target import names_of
@@ -60,7 +50,7 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
 
 @override.command()
 @click.argument("name", metavar="NAME", callback=_new_name)
-@selecting
+@person_change.selecting
 @click.option("--hold", is_flag=True, help="Keep the rendered files as they are.")
 @click.option("--deny", is_flag=True, help="Refuse demands, and suspend existing claims.")
 @click.option("--keep", is_flag=True, help="Keep services running after their last demand ends.")
@@ -87,7 +77,7 @@ def _new_name(ctx: click.Context, param: click.Parameter, name: str) -> str:
     help="When the override ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
 )
 @click.option("--owner", metavar="NAME", help="Who is responsible. Default: your name in git.")
-@editing
+@person_change.editing
 def create(  # noqa: PLR0913, PLR0917 - each is an option
     name: str,
     hold: bool,
@@ -137,7 +127,7 @@ def create(  # noqa: PLR0913, PLR0917 - each is an option
 
 @override.command()
 @click.argument("name", metavar="NAME", shell_complete=names_of("overrides"))
-@editing
+@person_change.editing
 def end(name: str, options: EditOptions) -> None:
     """End an override: remove its file.
 
@@ -162,8 +152,7 @@ def create_override(
     with writable(options.state_repo, options.signing_key, dry_run=options.dry_run) as repo:
         if not options.reason:
             raise click.UsageError("give the reason: -m TEXT")
-        chosen = selector(selected)
-        if not chosen:
+        if not (chosen := selector(selected)):
             raise click.UsageError("select what the override applies to, for example --node edge")
         owner = more.get("owner")
         if not owner:
@@ -176,7 +165,7 @@ def create_override(
         if repo.file_reader()(edit.path) is not None:
             message = "exists already; end it first, or choose another name"
             raise InvalidInput.at("", message, file=edit.path)
-        entry = consequence(repo, edit)
+        entry = person_change.consequence(repo, edit)
         if entry.state == "matches nothing":
             errors.print(f"warning: {edit.path} has no effect on anything that is demanded now")
         elif entry.state in ("held back", "expired"):
@@ -184,9 +173,9 @@ def create_override(
         _carry_out(repo, edit, entry, options)
 
 
-def override_text(name: str, fields: dict[str, Any]) -> str:
+def override_text(name: str, fields: dict[str, Any], note: str = "") -> str:
     given = {key: value for key, value in fields.items() if value is not None}
-    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given)
+    return document(f"{OVERRIDES_ROOT}/{name}.yaml", "override", "Override", given, note)
 
 
 def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
@@ -197,7 +186,7 @@ def end_override(repo: Reader, edit: Edit, options: EditOptions) -> None:
     if edit.name not in overrides:
         message = f"there is no override '{edit.name}'{suggestion(edit.name, overrides)}"
         raise InvalidInput.at("", message)
-    _carry_out(repo, edit, consequence(repo, edit), options)
+    _carry_out(repo, edit, person_change.consequence(repo, edit), options)
 
 
 def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> None:
@@ -210,9 +199,9 @@ def _carry_out(repo: Reader, edit: Edit, entry: Entry, options: EditOptions) -> 
             errors.print(line)
     published = None
     if not options.dry_run:
-        confirm("Continue?", options.yes, options.output)
-        published = carry_out(repo, edit, options.propose)
-    print_edit(edit, entry, published, options.output)
+        person_change.confirm("Continue?", options.yes, options.output)
+        published = person_change.carry_out(repo, edit, options.propose)
+    person_change.print_edit(edit, entry, published, options.output)
 
 
 def ends_at(text: str | None) -> str | None:
@@ -250,13 +239,13 @@ def selects(override: Override, selected: dict[str, tuple[str, ...]]) -> bool:
 
 
 @click.command()
-@selecting
+@person_change.selecting
 @click.option(
     "--expires",
     metavar="TIME",
     help="When the suspension ends: 2h, 3d, or a time like 2027-01-31T18:00:00Z.",
 )
-@editing
+@person_change.editing
 def suspend(expires: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Stop applications and connections; their claims stay booked.
 
@@ -288,8 +277,8 @@ def described(selected: dict[str, tuple[str, ...]]) -> str:
 
 @click.command()
 @click.argument("name", required=False, metavar="[NAME]", shell_complete=names_of("overrides"))
-@selecting
-@editing
+@person_change.selecting
+@person_change.editing
 def resume(name: str | None, options: EditOptions, **selected: tuple[str, ...]) -> None:
     """Run suspended applications and connections again.
 

@@ -16,23 +16,9 @@ from demandops.base import settings
 from demandops.base.quoting import harmless, one_line
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
-from demandops.cli.json_output import (
-    Json,
-    claim_data,
-    output_option,
-    override_data,
-    release_data,
-    show,
-)
+from demandops.cli import json_output, target
+from demandops.cli.json_output import Json
 from demandops.cli.output import errors, progress
-from demandops.cli.target import (
-    Command,
-    dry_run_option,
-    hint_to_pull,
-    name_options,
-    signing_option,
-    writable_repo_option,
-)
 from demandops.model.config.base_model import parse_file
 from demandops.model.config.override import Override, OverrideFile
 from demandops.model.ledger.ledger import World
@@ -43,12 +29,14 @@ from demandops.repo.history.commit_message import Person
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails, Published
+from demandops.serve.approvals.proposal import merge_request
 from demandops.views.release_causes import Entry, override_report
 
 reason_option = click.option(
     "-m",
     "--reason",
     metavar="TEXT",
+    callback=lambda ctx, param, text: " ".join((text or "").split()),
     help="The reason. It is written to the commit message and to the file of a new override.",
 )
 yes_option = click.option("-y", "--yes", is_flag=True, help="Do not ask for confirmation.")
@@ -100,12 +88,11 @@ class EditOptions:
     output: str
 
 
-def editing(command: Command) -> Command:
+def editing(command: target.Command) -> target.Command:
     # the command gets the values of these options as `options`
 
     @wraps(command)
     def run(**given: Any) -> Any:  # noqa: ANN401
-        given["reason"] = " ".join((given["reason"] or "").split())
         options = EditOptions(
             **{field.name: given.pop(field.name) for field in fields(EditOptions)}
         )
@@ -114,13 +101,13 @@ def editing(command: Command) -> Command:
     options = (
         reason_option,
         propose_option,
-        dry_run_option,
+        target.dry_run_option,
         yes_option,
-        writable_repo_option,
-        signing_option,
-        output_option,
+        target.writable_repo_option,
+        target.signing_option,
+        json_output.output_option,
     )
-    added: Command = run
+    added: target.Command = run
     for option in reversed(options):
         added = option(added)
     return added
@@ -128,11 +115,9 @@ def editing(command: Command) -> Command:
 
 @dataclass(frozen=True, slots=True)
 class Edit:
-    """A person's edit of one override, and the summary and reason of its commit."""
-
-    name: str
+    name: str  # of the override
     text: str | None  # None removes the file
-    summary: str
+    summary: str  # of the commit
     reason: str
 
     @property
@@ -163,15 +148,8 @@ def carry_out(repo: Reader, edit: Edit, propose: bool) -> Published:
     branch = f"override/{edit.name}"
     title, reason = harmless(one_line(edit.summary)), one_line(edit.reason)
     proposals = repo.last_valid_snapshot(repo.commit()).state.config.repo_settings.proposals
-    push_options = [
-        "merge_request.create",
-        f"merge_request.target={MAIN_BRANCH}",
-        f"merge_request.title={title}",
-        f"merge_request.description={reason}",
-        "merge_request.remove_source_branch",
-    ]
-    if proposals.forge != "gitlab":  # only GitLab opens a merge request for a push
-        push_options = []
+    # only GitLab opens a merge request for a push
+    push_options = merge_request(title, reason) if proposals.forge == "gitlab" else []
     pushed = person_commit.commit_to_branch(repo.repository, files, details, branch, push_options)
     link = pushed.link
     try:
@@ -192,26 +170,26 @@ def print_edit(edit: Edit, entry: Entry, published: Published | None, output: st
         "branch": published.branch if published else None,
         "link": published.link or None if published else None,
         "text": edit.text,
-        "override": override_data(entry.override),
+        "override": json_output.override_data(entry.override),
         "state": entry.state,
-        "releases": [release_data(release) for release in entry.releases],
-        "claims": [claim_data(claim) for claim in entry.claims],
+        "releases": [json_output.release_data(release) for release in entry.releases],
+        "claims": [json_output.claim_data(claim) for claim in entry.claims],
     }
     if outcome == "committed":
         lines = [
             f"{edit.summary}: commit {data['commit']} on {MAIN_BRANCH}",
             "a running generator carries out this commit, or else the next generator that starts",
-            *hint_to_pull(),
+            *target.hint_to_pull(),
         ]
     elif outcome == "proposed":
         lines = [f"{edit.summary}: merge {data['branch']} {data['link'] or ''}".rstrip()]
     else:
         text = (edit.text or "").splitlines()
         lines = [f"{edit.summary}: nothing was changed", *(f"    {line}" for line in text)]
-    show(output, data, lines)
+    json_output.show(output, data, lines)
 
 
-selecting = name_options(
+selecting = target.name_options(
     {
         name: f"Select this {name}; * matches any text, ? one character. May be repeated."
         for name in ("application", "appdef", "service", "connection", "node", "requester")

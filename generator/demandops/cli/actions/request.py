@@ -21,12 +21,8 @@ from demandops.base.errors import (
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
-from demandops.cli.actions.ledger_change import (
-    await_answer,
-    print_consequences,
-    print_refusal,
-    started_generator,
-)
+from demandops.cli.actions import ledger_change
+from demandops.cli.actions.ledger_change import started_generator
 from demandops.cli.json_output import Json, faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
@@ -52,10 +48,54 @@ class Document:
         id = goal.get("id") or goal.get("request") or goal.get("demand") or ""
         return id if isinstance(id, str) else ""
 
+    def as_release(self) -> Document:
+        goal = self.goal
+        if not isinstance(goal, dict):  # the check of goals refuses it later
+            return self
+        if not is_demand_goal(goal):
+            return replace(self, goal={**goal, "shutdown": True})
+        names = ("apiVersion", "kind", "demand", "request", "requesters")
+        given = {name: goal[name] for name in names if name in goal}
+        return replace(self, goal=given | {"operation": "release"})
 
-# The receipt, or the proposal that awaits approval.
+
 class _Answer(Future["Receipt | dict[str, str]"]):
-    pass
+    # the receipt, or the proposal that awaits approval
+
+    def of(self, generator: Generator, document: Document, wait: bool) -> _Answer:
+        def listen(stage: str, text: str) -> None:
+            if stage != "proposed":
+                return
+            if wait:
+                errors.print(f"{document.file}: request '{document.request_id}' {text}")
+            elif not self.done():
+                self.set_result(parse_waiting_text(text))
+
+        def finish(future: Future[Receipt]) -> None:
+            if self.done():  # the proposal was the answer
+                return
+            if (error := future.exception()) is not None:
+                self.set_exception(error)
+            else:
+                self.set_result(future.result())
+
+        generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
+        return self
+
+    def row(self, index: int, document: Document) -> Json:
+        try:
+            result = self.result(timeout=0)
+        except (ShuttingDown, TimeoutError):  # the command was interrupted
+            return _row(index, document.request_id, "waiting")
+        except Unsound:  # it is not known whether the request was booked
+            raise
+        except DemandOpsError as error:
+            return _refused(index, document, error)
+        if not isinstance(result, Receipt):
+            return _row(index, document.request_id, "proposed", proposal=result)
+        names = ("commit", "warnings", "not_held", "placed")
+        more = {name: getattr(result, name) for name in names}
+        return _row(index, result.request_id, result.outcome, **more)
 
 
 @click.command()
@@ -103,7 +143,7 @@ def request(
         goals = enumerate(strict_yaml.load_all(text, name))
         documents += [Document(name, goal, text, at) for at, goal in goals if goal is not None]
     if release:
-        documents = [replace(document, goal=_release_of(document.goal)) for document in documents]
+        documents = [document.as_release() for document in documents]
     if not documents:
         raise InvalidInput([fault("", f"no request in {', '.join(files)}; write one")])
     if any(form_faults(document.goal) for document in documents):
@@ -127,15 +167,6 @@ def request(
 def _is_unanswered(row: Json) -> bool:
     # a request that waits for room on a node has an answer: the commit that records the wait
     return row["outcome"] == "waiting" and row["commit"] is None
-
-
-def _release_of(goal: Any) -> Any:  # noqa: ANN401 - as it was read
-    if not isinstance(goal, dict):  # the check of goals refuses it later
-        return goal
-    if not is_demand_goal(goal):
-        return {**goal, "shutdown": True}
-    names = ("apiVersion", "kind", "demand", "request", "requesters")
-    return {name: goal[name] for name in names if name in goal} | {"operation": "release"}
 
 
 def _row(index: int, request_id: str, outcome: str, **more: object) -> Json:
@@ -183,9 +214,9 @@ def _book(
     try:
         with started_generator(state_repo, signing_key) as generator, progress("booking") as report:
             for document in documents:
-                answers.append(_submitted(generator, document, wait))
+                answers.append(_Answer().of(generator, document, wait))
             for done, answer in enumerate(answers, start=1):
-                await_answer(answer)
+                ledger_change.await_answer(answer)
                 report(done, len(documents))
     except KeyboardInterrupt:
         if not answers:
@@ -197,45 +228,7 @@ def _book(
         unsent.set_exception(Withdrawn("was not sent, because of the interrupt; send it again"))
         answers.append(unsent)
     pairs = enumerate(zip(documents, answers, strict=True))
-    return [_answered(index, document, answer) for index, (document, answer) in pairs]
-
-
-def _answered(index: int, document: Document, answer: _Answer) -> Json:
-    try:
-        result = answer.result(timeout=0)
-    except (ShuttingDown, TimeoutError):  # the command was interrupted
-        return _row(index, document.request_id, "waiting")
-    except Unsound:  # it is not known whether the request was booked
-        raise
-    except DemandOpsError as error:
-        return _refused(index, document, error)
-    if not isinstance(result, Receipt):
-        return _row(index, document.request_id, "proposed", proposal=result)
-    more = {name: getattr(result, name) for name in ("commit", "warnings", "not_held", "placed")}
-    return _row(index, result.request_id, result.outcome, **more)
-
-
-def _submitted(generator: Generator, document: Document, wait: bool) -> _Answer:
-    answer = _Answer()
-
-    def listen(stage: str, text: str) -> None:
-        if stage != "proposed":
-            return
-        if wait:
-            errors.print(f"{document.file}: request '{document.request_id}' {text}")
-        elif not answer.done():
-            answer.set_result(parse_waiting_text(text))
-
-    def finish(future: Future[Receipt]) -> None:
-        if answer.done():  # the proposal was the answer
-            return
-        if (error := future.exception()) is not None:
-            answer.set_exception(error)
-        else:
-            answer.set_result(future.result())
-
-    generator.submit(document.goal, listener=listen).future.add_done_callback(finish)
-    return answer
+    return [answer.row(index, document) for index, (document, answer) in pairs]
 
 
 def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Json]:
@@ -262,7 +255,7 @@ def _dry_run(documents: list[Document], state_repo: str, output: str) -> list[Js
                 console().print(f"Request {index}: '{decision.request.id}' would be {outcome}")
                 for rule in decision.approval:
                     console().print(f"  needs approval: {rule} requires it")
-                print_consequences(decision)
+                ledger_change.print_consequences(decision)
             more: Json = {
                 "warnings": decision.warnings,
                 "not_held": decision.changes.not_held,
@@ -282,7 +275,7 @@ def _print_rows(rows: list[Json], documents: list[Document], dry_run: bool) -> N
         if not dry_run and _is_unanswered(row):
             errors.print(f"{title} has no answer yet")
         elif row["outcome"] == "refused":
-            print_refusal(f"{title} refused", row["faults"])
+            ledger_change.print_refusal(f"{title} refused", row["faults"])
         elif not dry_run:
             told, proposal = f"{row['outcome']} in {row['commit']}", row.get("proposal")
             if proposal is not None:

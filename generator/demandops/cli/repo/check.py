@@ -17,6 +17,7 @@ from demandops.decide.changeset import CHANGE_ORDER, FileChange, MergePreview
 from demandops.repo.pull_request import merge_check
 from demandops.repo.pull_request.merge_check import CheckResult
 from demandops.repo.pull_request.rendered_charts import MISSING, NO_HELM, RenderedCharts
+from demandops.serve.approvals.proposal import backticks
 from demandops.templating.evaluator import processor_time
 from demandops.views.bookkeeping import EntryChange
 
@@ -37,7 +38,6 @@ _ROOM_FOR_NOTE = 200
 
 
 def report(checked: CheckResult, longest: int = LONGEST) -> str:
-    """Return the result of a check as Markdown, with at most ``longest`` characters."""
     parts = [f"{MARK}\n", *_findings(checked), *_consequence(checked)]
     room = longest - _ROOM_FOR_NOTE
     taken, left_out = list[str](), 0
@@ -81,7 +81,7 @@ def code(text: str) -> str:
     text = one_line(text, _LONGEST_SPAN)
     if not text.strip():
         return "(empty)"
-    marks = _longer_than_any(text, least=1)
+    marks = backticks(text, least=1)
     # Markdown needs a space between a backtick of the text and those that enclose it
     edge = " " if text.startswith("`") or text.endswith("`") else ""
     return f"{marks}{edge}{text}{edge}{marks}"
@@ -89,13 +89,8 @@ def code(text: str) -> str:
 
 def fence(text: str, language: str) -> str:
     text = lines(text)
-    marks = _longer_than_any(text, least=3)
+    marks = backticks(text, least=3)
     return f"{marks}{language}\n{text.rstrip()}\n{marks}\n"
-
-
-def _longer_than_any(text: str, least: int) -> str:
-    longest = max((len(run) for run in re.findall("`+", text)), default=0)
-    return "`" * max(least, longest + 1)
 
 
 def _findings(checked: CheckResult) -> Iterator[str]:
@@ -125,8 +120,7 @@ def _findings(checked: CheckResult) -> Iterator[str]:
 
 
 def _consequence(checked: CheckResult) -> Iterator[str]:
-    consequence = checked.preview
-    if consequence is None:
+    if (consequence := checked.preview) is None:
         yield "\nFix the errors to see what merging would do.\n"
         return
     if not consequence.files and not checked.bookkeeping:
@@ -134,8 +128,7 @@ def _consequence(checked: CheckResult) -> Iterator[str]:
         return
     yield "\n### Desired state\n"
     kinds = [release.change for release in consequence.releases]
-    counts = [f"{kinds.count(kind)} to {kind}" for kind in CHANGE_ORDER if kind in kinds]
-    if counts:
+    if counts := [f"{kinds.count(kind)} to {kind}" for kind in CHANGE_ORDER if kind in kinds]:
         yield f"\nReleases: {', '.join(counts)}.\n"
     else:
         yield "\nNo release starts, changes or stops.\n"
@@ -298,8 +291,7 @@ def _lines(checked: CheckResult) -> Iterator[str]:
             f"\nthe merge target has {commits} that this checkout lacks: git rebase --autostash "
             f"{checked.target}"
         )
-    consequence = checked.preview
-    if consequence is None:
+    if (consequence := checked.preview) is None:
         if checked.suggestions:
             yield "\nfix the errors to see what merging would do"
         return

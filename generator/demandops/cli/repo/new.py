@@ -11,10 +11,11 @@ import click
 
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import data_folder
+from demandops.cli.actions.override import override_text
 from demandops.cli.json_output import Command, output_option, show
 from demandops.cli.output import busy
 from demandops.cli.repo import scaffold
-from demandops.cli.repo.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan, document
+from demandops.cli.repo.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
 from demandops.decide.state import State, try_configuration
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.model.config.load import load
@@ -143,7 +144,8 @@ def application(  # noqa: PLR0913 - as many as options
             f"{plan.node}; to allow them, widen a rule, such as '{domain.rules[0].name}', in "
             f"{config.file_of(DOMAINS_FILE, domain.name)}",
         )
-    files = scaffold.application_files(plan, config, new_repo.files_of_library(LIBRARY_FOLDER))
+    library, texts = new_repo.files_of_library(LIBRARY_FOLDER), _texts("application")
+    files = scaffold.application_files(plan, config, library, texts)
     _lay_down(directory, existing, files, output, then)
 
 
@@ -192,18 +194,16 @@ def override(  # noqa: PLR0913 - as many as options
     if not select:
         raise click.UsageError("say what the override selects: --service, --application or --node")
     flags = {"hold": hold or None, "deny": deny or None, "keep": keep or None}
-    options = {**flags, "replicas": replicas}
-    does = {effect: value for effect, value in options.items() if value is not None}
-    if len(does) != 1:
+    effects = {**flags, "replicas": replicas}
+    if sum(value is not None for value in effects.values()) != 1:
         raise click.UsageError("give exactly one effect: --hold, --deny, --keep or --replicas")
     existing, config = _read_configuration(directory)
     if name in config.overrides:
         raise InvalidInput.at("NAME", f"'{name}' is an override already; choose another name")
-    path = f"overrides/{name}.yaml"
-    fields = {"reason": reason, "owner": owner, "select": [select], **does}
+    fields = {"reason": reason, "owner": owner, "select": [select], **effects}
     note = "overrides/README.md lists all effects and selectors of overrides, and when they end."
-    text = document(path, "override", "Override", fields, note)
-    _lay_down(directory, existing, {path: text}, output, [])
+    files = {f"overrides/{name}.yaml": override_text(name, fields, note)}
+    _lay_down(directory, existing, files, output, [])
 
 
 @new.command()
@@ -234,18 +234,21 @@ def image(name: str, repository: str, url: str, directory: Path, output: str) ->
     Examples:
       demandops new image cam --repository ghcr.io/me/cam --state-repo git@host:f
     """
-    folder = data_folder("templates") / "scaffold" / "image"
-    texts = {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
     then = ["keep .github/workflows/image.yml or .gitlab-ci.yml, whichever you need"]
-    _write_files(directory, scaffold.image_files(name, repository, url, texts), output, then)
+    files = scaffold.image_files(name, repository, url, _texts("image"))
+    _write_files(directory, files, output, then)
+
+
+def _texts(what: str) -> Files:
+    folder = data_folder("templates") / "scaffold" / what
+    return {path.name: path.read_text(encoding="utf-8") for path in sorted(folder.iterdir())}
 
 
 def _asked(question: str, check: Callable[[str], object], most: int | None) -> tuple[str, ...]:
     """Ask until the answer is at most ``most`` valid words; ``check`` raises for another word."""
 
     def valid(answer: str) -> tuple[str, ...]:
-        words = tuple(answer.split())
-        if not words:
+        if not (words := tuple(answer.split())):
             raise click.UsageError(
                 "an answer is needed; Ctrl-C ends the command, and nothing is written"
             )
@@ -261,8 +264,7 @@ def _asked(question: str, check: Callable[[str], object], most: int | None) -> t
 
 
 def _input(text: str) -> tuple[str, str]:
-    match = _INPUT.fullmatch(text)
-    if not match:
+    if not (match := _INPUT.fullmatch(text)):
         raise click.BadParameter(
             f"'{text}' is not ROLE=TYPE; write it like camera=sensor_msgs/msg/Image",
             param_hint="--input",
@@ -277,8 +279,7 @@ def _input(text: str) -> tuple[str, str]:
 
 
 def _service(text: str) -> ServicePlan:
-    match = _SERVICE.fullmatch(text)
-    if not match:
+    if not (match := _SERVICE.fullmatch(text)):
         raise click.BadParameter(
             f"'{text}' is not NAME=PACKAGE/FILE; write it like "
             "detector=my_package/detector.launch.py",
@@ -288,8 +289,7 @@ def _service(text: str) -> ServicePlan:
 
 
 def _image(text: str) -> Image:
-    match = _IMAGE.fullmatch(text)
-    if not match or not (match["tag"] or match["digest"]):
+    if not (match := _IMAGE.fullmatch(text)) or not (match["tag"] or match["digest"]):
         raise click.BadParameter(
             f"'{text}' has no tag or digest; write {text}:TAG", param_hint="--image"
         )

@@ -15,7 +15,7 @@ from demandops.base import settings
 from demandops.cli import target
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import print_lines
-from demandops.cli.table import Column, Table
+from demandops.cli.table import column, table_of
 from demandops.cli.target import context_names
 from demandops.model.config.base_model import parse
 
@@ -114,26 +114,17 @@ def list_contexts(output: str) -> None:
     Examples:
       demandops config list
     """
-    content = target.read_contexts()
-    rows = [
-        (
-            "*" if name == content.current else "",
-            name,
-            context.state_repo,
-            context.clusters or "",
-            context.signing_key or "",
-        )
-        for name, context in content.contexts.items()
-    ]
+    data = target.read_contexts().model_dump(by_alias=True, include={"current", "contexts"})
     columns = (
-        Column(""),
-        Column("Context"),
-        Column("State repo"),
-        Column("Clusters", 1),
-        Column("Signing key", 2),
+        column("", lambda context: "*" if context["name"] == data["current"] else ""),
+        column("Context", "name"),
+        column("State repo", "stateRepo"),
+        column("Clusters", "clusters", 1),
+        column("Signing key", "signingKey", 2),
     )
-    data = content.model_dump(by_alias=True, include={"current", "contexts"})
-    show(output, data, [Table(columns, rows, empty="no contexts; see demandops config set")])
+    contexts = [{"name": name, **context} for name, context in data["contexts"].items()]
+    table = table_of(columns, contexts, empty="no contexts; see demandops config set")
+    show(output, data, [table])
 
 
 @config.command("set")

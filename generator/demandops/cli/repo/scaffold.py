@@ -47,10 +47,7 @@ _URL = re.compile(r"(https|ssh)://([A-Za-z0-9._-]+@)?[A-Za-z0-9.-]+(:[0-9]+)?/[A
 def image_files(
     name: str, repository: str, state_repo: str, texts: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the container file and the pipelines, as a map from path to text.
-
-    ``texts`` has the files in ``templates/scaffold/image`` by name.
-    """
+    # by path; ``texts`` has the files in ``templates/scaffold/image`` by name
     url, image = as_git_url(state_repo), _REPOSITORY.fullmatch(repository)
     if not _IMAGE_NAME.fullmatch(name):
         message = (
@@ -68,10 +65,11 @@ def image_files(
         message = f"{quoted(state_repo)} is no valid URL; write https://HOST/PATH or git@HOST:PATH"
         raise InvalidInput.at("--state-repo", message)
     given = {"NAME": name, "REPOSITORY": repository, "HOST": image["host"], "STATE_REPO": url}
-    return {
-        _PATHS[file]: re.sub("@([A-Z_]+)@", lambda match: given[match[1]], text)
-        for file, text in texts.items()
-    }
+    return {_PATHS[file]: _filled(text, given) for file, text in texts.items()}
+
+
+def _filled(text: str, given: Mapping[str, str]) -> str:
+    return re.sub("@([A-Z_]+)@", lambda match: given[match[1]], text)
 
 
 # ---- a new application ----
@@ -83,7 +81,6 @@ def image_files(
 LIBRARY_FOLDER = f"appdefs/charts/{charts.LIBRARY}"
 _NAME = re.compile(r"^[a-z0-9]([-a-z0-9]*[a-z0-9])?$")
 _RESULT = "result"
-_REQUESTER = "operator"
 _VERSION = "0.1.0"
 
 
@@ -114,23 +111,61 @@ def refuse_name(name: str, config: Config) -> None:
 
 
 def application_files(
-    plan: ApplicationPlan, config: Config, library: Mapping[str, str]
+    plan: ApplicationPlan, config: Config, library: Mapping[str, str], texts: Mapping[str, str]
 ) -> dict[str, str]:
-    """Return the files of a new application, as a map from path to text.
-
-    They include those of the library chart, ``library``, if the state repo lacks it.
-    """
+    # by path, with those of the library chart, ``library``, if the state repo lacks it; ``texts``
+    # has the files in ``templates/scaffold/application`` by name
     refuse_name(plan.name, config)
     has_library = f"{LIBRARY_FOLDER}/Chart.yaml" in config.files
+    shared = config.files if has_library else library
+    version = re.search(r"(?m)^version: (\S+)$", shared[f"{LIBRARY_FOLDER}/Chart.yaml"])
+    given = {
+        "NAME": plan.name,
+        "DESCRIPTION": plan.description,
+        "PACKAGE": plan.services[0].package,
+        "FILE": plan.services[0].launch_file,
+        "REPOSITORY": plan.image.repository,
+        "RESULT": _RESULT,
+        "VERSION": _VERSION,
+        "LIBRARY": charts.LIBRARY,
+        "LIBRARY_FOLDER": LIBRARY_FOLDER,
+        "LIBRARY_VERSION": version[1] if version else _VERSION,
+        "EXPORT": charts.EXPORT,
+        "SERVICES": "".join(
+            f"| `{service.name}` | `ros2 launch {service.package} {service.launch_file}` "
+            f"| {', '.join(f'`{source}`' for source in inputs.values())} |\n"
+            for service, inputs in _chain(plan)
+        ),
+    }
+    values = _filled(texts["chart-values.yaml"], given)
+    given["VALUES"] = charts.table(values).rstrip("\n")
+    schema = charts.composed(
+        f"Values of the chart {plan.name}",
+        {"launch": _LAUNCH},
+        values,
+        json.loads(shared[f"{LIBRARY_FOLDER}/values.schema.json"]),
+        shared[f"{LIBRARY_FOLDER}/values.yaml"],
+    )
     root = f"appdefs/{plan.name}"
-    files = {f"{root}/appdef.yaml": _appdef(plan, config)}
+    chart = f"{root}/charts/{plan.name}"
+    files = {
+        f"{root}/appdef.yaml": _appdef(plan, config),
+        f"{root}/README.md": _filled(texts["readme"], given),
+        f"{root}/demand.yaml": _demand(plan, config),
+        f"{chart}/Chart.yaml": _filled(texts["chart.yaml"], given),
+        f"{chart}/values.yaml": values,
+        f"{chart}/values.schema.json": json.dumps(schema, indent=2, ensure_ascii=False) + "\n",
+        f"{chart}/README.md": _filled(texts["chart-readme"], given),
+        f"{chart}/templates/service.yaml": _filled(texts["service.yaml"], given),
+    }
     for service, inputs in _chain(plan):
-        files[f"{root}/values/{service.name}.yaml.j2"] = _values_template(plan, service, inputs)
-    files |= _chart(plan, f"{root}/charts/{plan.name}", config.files if has_library else library)
-    files[f"{root}/README.md"] = _readme(plan)
-    files[f"{root}/demand.yaml"] = _demand(plan, config)
+        topics = (f'    {role}_topics: {{{{ topics.{role} | join(",") }}}}\n' for role in inputs)
+        own = {"SERVICE": service.name, "PACKAGE": service.package, "FILE": service.launch_file}
+        own["TOPICS"] = "".join(topics)
+        path = f"{root}/values/{service.name}.yaml.j2"
+        files[path] = _filled(texts["values.yaml.j2"], given | own)
     for kind, content in (
-        ("charts", {"folder": f"{root}/charts/{plan.name}", "version": _VERSION}),
+        ("charts", {"folder": chart, "version": _VERSION}),
         ("images", plan.image.model_dump(exclude_none=True)),
     ):
         path = f"registry/{kind}/{plan.name}.yaml"
@@ -156,14 +191,14 @@ def _appdef(plan: ApplicationPlan, config: Config) -> str:
     taken |= {definition.prefix for definition in config.definitions.values()}
     services: dict[str, Any] = {}
     for service, inputs in _chain(plan):
-        letters = re.sub("[^a-z0-9]", "", service.name)[:8]
+        role, letters = _role(service.name), re.sub("[^a-z0-9]", "", service.name)[:8]
         prefixes = (letters, *(f"{letters}{number}" for number in range(2, 100)))
         prefix = next(word for word in prefixes if word not in taken)
         taken.add(prefix)
         services[service.name] = {
             "prefix": prefix,
             "inputs": inputs,
-            "outputs": {_RESULT: f"/{{instance}}_{_role(service.name)}"},
+            "outputs": {_RESULT: f"/{{instance}}_{role}"},
             "chart": plan.name,
             "images": [plan.name],
             "values": f"values/{service.name}.yaml.j2",
@@ -182,34 +217,6 @@ def _appdef(plan: ApplicationPlan, config: Config) -> str:
     return document(path, "application", "ApplicationDefinition", fields, note)
 
 
-def _values_template(plan: ApplicationPlan, service: ServicePlan, inputs: Iterable[str]) -> str:
-    topics = "".join(f'    {role}_topics: {{{{ topics.{role} | join(",") }}}}\n' for role in inputs)
-    return f"""\
-{{# Values of {service.name}. Each expression is written as a JSON value, so none needs quotes. The
-   arguments are those of its launch file. #}}
-replicas: {{{{ replicas }}}}
-image: {{{{ images["{plan.name}"] }}}}
-{{% if node.image_pull_secrets %}}
-imagePullSecrets:
-{{% for name in node.image_pull_secrets %}}
-  - name: {{{{ name }}}}
-{{% endfor %}}
-{{% endif %}}
-nodeSelector: {{{{ node.selector }}}}
-tolerations: {{{{ node.tolerations }}}}
-hostNetwork: {{{{ node.host_network }}}}
-ros:
-  domainId: {{{{ node.ros.domain_id }}}}
-  rmwImplementation: {{{{ node.ros.rmw }}}}
-launch:
-  package: {service.package}
-  file: {service.launch_file}
-  arguments:
-    node_name: {{{{ release | ros_name }}}}
-{topics}    {_RESULT}_topic: {{{{ outputs.{_RESULT} }}}}
-"""
-
-
 _LAUNCH: dict[str, Any] = {
     "type": "object",
     "additionalProperties": False,
@@ -224,85 +231,6 @@ _LAUNCH: dict[str, Any] = {
         },
     },
 }
-
-
-def _chart(plan: ApplicationPlan, folder: str, library: Mapping[str, str]) -> dict[str, str]:
-    shared = library[f"{LIBRARY_FOLDER}/values.yaml"]
-    schema = json.loads(library[f"{LIBRARY_FOLDER}/values.schema.json"])
-    title = f"Values of the chart {plan.name}"
-    first = plan.services[0]
-    values = f"""\
-# Values of this chart, besides those of {LIBRARY_FOLDER}: probes, resources, rights and more.
-# The templates in ../../values/ write the values of each release.
-
-image:
-  # -- Name of the image, with its registry, without tag or digest.
-  repository: {plan.image.repository}
-
-launch:
-  # -- Package of the launch file.
-  package: {first.package}
-  # -- Name of the launch file.
-  file: {first.launch_file}
-  # -- Arguments of the launch file: name → value.
-  arguments: {{}}
-
-# -- Labels of all objects, but not of the pods.
-commonLabels:
-  app.kubernetes.io/part-of: {plan.name}
-"""
-    composed = charts.composed(title, {"launch": _LAUNCH}, values, schema, shared)
-    version = re.search(r"(?m)^version: (\S+)$", library[f"{LIBRARY_FOLDER}/Chart.yaml"])
-    return {
-        f"{folder}/Chart.yaml": f"""\
-apiVersion: v2
-name: {plan.name}
-description: Runs the launch files of {plan.name}.
-type: application
-version: {_VERSION}
-dependencies:
-  - name: {charts.LIBRARY}
-    version: {version[1] if version else _VERSION}
-    repository: file://../../../charts/{charts.LIBRARY}
-    import-values: [{charts.EXPORT}]
-""",
-        f"{folder}/values.yaml": values,
-        f"{folder}/values.schema.json": json.dumps(composed, indent=2, ensure_ascii=False) + "\n",
-        f"{folder}/README.md": f"# {plan.name}\n\nRuns the launch files of {plan.name}.\n\n"
-        f"## Values\n\nBesides those of the library "
-        f"[{charts.LIBRARY}](../../../charts/{charts.LIBRARY}/README.md#values):\n\n"
-        + charts.table(values),
-        f"{folder}/templates/service.yaml": f"""\
-{{{{- $run := list "ros2" "launch" .Values.launch.package .Values.launch.file }}}}
-{{{{- range $name, $value := .Values.launch.arguments }}}}
-{{{{- $run = append $run (printf "%s:=%s" $name $value) }}}}
-{{{{- end }}}}
-{{{{- include "ros-service.service" (dict "root" . "name" "{plan.name}" "run" $run) }}}}
-""",
-    }
-
-
-def _readme(plan: ApplicationPlan) -> str:
-    rows = "".join(
-        f"| `{service.name}` | `ros2 launch {service.package} {service.launch_file}` "
-        f"| {', '.join(f'`{source}`' for source in inputs.values())} |\n"
-        for service, inputs in _chain(plan)
-    )
-    return f"""\
-# {plan.name}
-
-{plan.description}
-
-| service | runs | reads |
-| --- | --- | --- |
-{rows}
-A launch file gets the arguments `node_name`, `<input>_topics` (joined by commas) and
-`{_RESULT}_topic`. The templates in `values/` set these arguments. So if you rename an argument,
-change the launch file and the template.
-
-    demandops check .                                            # after each edit
-    demandops request --dry-run appdefs/{plan.name}/demand.yaml   # what the example would do
-"""
 
 
 def _rules_for(plan: ApplicationPlan, config: Config) -> tuple[Rule, ...]:
@@ -326,7 +254,7 @@ def _demand(plan: ApplicationPlan, config: Config) -> str:
     # The requester matches a rule that allows the application. If there is none, it matches the
     # first rule, and a person must widen the rules (`closed_domain`).
     rules = _rules_for(plan, config) or (domain.rules[:1] if domain else ())
-    requester = _REQUESTER
+    requester = "operator"
     if rules:
         pattern = rules[0].requesters[0]
         matching = next((id for id in sorted(config.nodes) if matches(id, (pattern,))), "")

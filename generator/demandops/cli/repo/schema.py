@@ -27,7 +27,6 @@ from demandops.model.demand.deployment_request_goal import WireGoal
 
 # ---- a description and an example of each property, for editors and the docs ----
 
-_INHERITS = "inherits"
 _COMMON = {
     "apiVersion": ["Version of the format", API_VERSION],
     "kind": ["Type of the file's content"],
@@ -35,18 +34,14 @@ _COMMON = {
 
 
 def describe(schema: dict[str, Any], root: str) -> None:
-    """Add descriptions and examples from ``templates/schemas/properties.yaml`` to a schema.
-
-    ``root`` is the name of the model whose JSON Schema is changed.
-    """
+    # by ``templates/schemas/properties.yaml``; ``root`` is the name of the model of the schema
     properties = _properties()
     for model, part in {root: schema, **schema.get("$defs", {})}.items():
         for name, field in part.get("properties", {}).items():
             # for the model in this schema, else for the model, else for the one it inherits from
-            places = (f"{root}/{model}", model, properties[_INHERITS].get(model, ""))
+            places = (f"{root}/{model}", model, properties["inherits"].get(model, ""))
             models = (*(properties.get(place) or {} for place in places), _COMMON)
-            entry = next((each[name] for each in models if name in each), None)
-            if entry:
+            if entry := next((each[name] for each in models if name in each), None):
                 description, *example = entry
                 field["description"] = description
                 only = (

@@ -13,15 +13,10 @@ import click
 from demandops.base import settings
 from demandops.base.errors import StateRepoError, fault
 from demandops.base.runtime import REAL
+from demandops.cli import target
 from demandops.cli.json_output import Json, output_option, show
 from demandops.cli.output import Progress, busy, errors, progress
 from demandops.cli.repo import schema
-from demandops.cli.target import (
-    dry_run_option,
-    signing_option,
-    state_repo_option,
-    writable_repo_option,
-)
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading
@@ -63,7 +58,7 @@ from demandops.templating.evaluator import processor_time
     show_default=True,
     help="The fleet to begin with: the paper's experiment with its application, or none.",
 )
-@signing_option
+@target.signing_option
 @output_option
 def init(
     directory: Path,
@@ -146,7 +141,7 @@ _SWITCH = (
 
 
 @click.command()
-@writable_repo_option
+@target.writable_repo_option
 @click.option(
     "--gitops",
     type=click.Choice(["flux", "argocd"]),
@@ -159,13 +154,13 @@ _SWITCH = (
     "demandops.yaml has no section for this controller yet. Default: the URL of the current "
     "controller.",
 )
-@dry_run_option
+@target.dry_run_option
 @click.option(
     "--yes",
     is_flag=True,
     help="Do not ask whether the steps before a change of controller are done.",
 )
-@signing_option
+@target.signing_option
 @output_option
 def upgrade(
     state_repo: str,
@@ -276,7 +271,7 @@ def _upgrade_lines(result: Upgrade, dry_run: bool) -> Iterator[str]:
 
 @click.command()
 @click.argument("revisions", required=False, metavar="[REV|A..B]")
-@state_repo_option
+@target.state_repo_option
 @click.option(
     "--whole",
     is_flag=True,
@@ -327,8 +322,7 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
     verified = sum(verdict.holds for verdict in verdicts) - skipped
     note = f", {skipped} skipped" if skipped else ""
     lines.append(f"{verified} of {len(verdicts)} commits are verified{note}")
-    signed = sum(verdict.signed for verdict in verdicts)
-    if signed:
+    if signed := sum(verdict.signed for verdict in verdicts):
         good = sum(bool(verdict.signer) for verdict in verdicts)
         listed = f", {good} by keys that policy/allowed-signers lists" if good else ""
         lines.append(f"{signed} of {len(verdicts)} are signed{listed}")
@@ -341,7 +335,7 @@ def verify(revisions: str | None, state_repo: str, whole: bool, output: str) -> 
 
 
 @click.command()
-@writable_repo_option
+@target.writable_repo_option
 @click.option(
     "--set-aside",
     is_flag=True,

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict
+from collections.abc import Mapping
 
 import click
 
-from demandops.cli.json_output import output_option, show, time_text
+from demandops.cli.json_output import Json, output_option, show, time_text
 from demandops.cli.output import at_option, progress, version_lines, warn_of
-from demandops.cli.table import Column, Table
+from demandops.cli.table import Table, column, joined, table_of
 from demandops.cli.target import state_repo_option
 from demandops.repo import reader
-from demandops.views.bookkeeping import ConnectionEntry, ServiceEntry, as_data
+from demandops.views.bookkeeping import as_data
 from demandops.views.bookkeeping import bookkeeping as derive
 
 
@@ -32,103 +31,84 @@ def bookkeeping(state_repo: str, at: str | None, output: str) -> None:
         with progress("reading the ledger") as report:
             snapshot = repo.snapshot(at, report)
         warn_of(repo.problems() if at is None else ())
-    books, commit = derive(snapshot.state), str(snapshot.commit)
-    services = [
-        (
-            name,
-            [entry.service, *(f"{key} = {value}" for key, value in entry.parameters.items())],
-            version_lines(asdict(entry)),
-            entry.node,
-            entry.source or entry.applications,
-            [line for topics in entry.inputs.values() for line in _lines(topics, entry)],
-            ", ".join(entry.requesters),
-        )
-        for name, entry in books.services.items()
+    commit = str(snapshot.commit)
+    data = as_data(derive(snapshot.state), commit)
+    capacity = [
+        {"node": node, "name": name, **amounts}
+        for node, resources in data.get("nodes", {}).items()
+        for name, amounts in resources.items()
     ]
-    connections = [
-        (
-            id,
-            entry.type,
-            entry.source,
-            entry.target,
-            list(_lines(entry.topics, entry)),
-            ", ".join(entry.requesters),
-        )
-        for id, entry in books.connections.items()
+    text: list[str | Table] = []
+    for title, columns, items in (
+        ("Services", _SERVICES, _named(data["services"])),
+        ("Connections", _CONNECTIONS, _named(data["connections"])),
+        ("Suspended", _SUSPENDED, data.get("suspended")),
+        ("Capacity", _CAPACITY, capacity),
+        ("Waiting for room", _WAITING, data.get("waiting")),
+    ):
+        if items or title in ("Services", "Connections"):
+            text += [table_of(columns, items or (), title=title), ""]
+    show(output, data, [*text, f"at {commit}"])
+
+
+def _named(entries: dict[str, Json]) -> list[Json]:
+    return [{"name": name, **entry} for name, entry in entries.items()]
+
+
+def _topics(topics: Mapping[str, list[str]], entry: Json) -> list[str]:
+    # a topic is followed by its requesters if the entry has others too
+    return [
+        topic if who == entry["requesters"] else f"{topic} ({', '.join(who)})"
+        for topic, who in topics.items()
     ]
-    suspended = [
-        (
-            f"{claim.kind} {claim.id}",
-            claim.demand,
-            ", ".join(claim.requesters),
-            claim.override,
-            claim.reason,
-        )
-        for claim in books.suspended
-    ]
-    text: list[str | Table] = [
-        Table(_SERVICES, services, "Services"),
-        "",
-        Table(_CONNECTIONS, connections, "Connections"),
-        "",
-    ]
-    if suspended:
-        text += [Table(_SUSPENDED, suspended, "Suspended"), ""]
-    if books.nodes:
-        capacity = [
-            (node, name, each.requested, each.capacity)
-            for node, resources in books.nodes.items()
-            for name, each in resources.items()
-        ]
-        text += [Table(_CAPACITY, capacity, "Capacity"), ""]
-    if books.waiting:
-        waiting = [
-            (
-                demand.demand,
-                "\n".join(demand.requesters),
-                time_text(demand.since),
-                str(demand.priority),
-            )
-            for demand in books.waiting
-        ]
-        text += [Table(_WAITING, waiting, "Waiting for room"), ""]
-    show(output, as_data(books, commit), [*text, f"at {commit}"])
 
 
 _SERVICES = (
-    Column("Service"),
-    Column("Kind", 5),
-    Column("Version", 4),
-    Column("Node", 1),
-    Column("For", 3, wraps=True),
-    Column("Takes in", 6),
-    Column("Requesters", 2, wraps=True),
+    column("Service", "name"),
+    column(
+        "Kind",
+        lambda entry: [
+            entry["service"],
+            *(f"{name} = {value}" for name, value in entry["parameters"].items()),
+        ],
+        5,
+    ),
+    column("Version", version_lines, 4),
+    column("Node", "node", 1),
+    column("For", lambda entry: entry["source"] or entry["applications"], 3, wraps=True),
+    column(
+        "Takes in",
+        lambda entry: [
+            line for topics in entry["inputs"].values() for line in _topics(topics, entry)
+        ],
+        6,
+    ),
+    column("Requesters", joined("requesters"), 2, wraps=True),
 )
 _CONNECTIONS = (
-    Column("Connection"),
-    Column("By", 3),
-    Column("From", 1),
-    Column("To", 1),
-    Column("Topics", 4),
-    Column("Requesters", 2, wraps=True),
+    column("Connection", "name"),
+    column("By", "type", 3),
+    column("From", "source", 1),
+    column("To", "target", 1),
+    column("Topics", lambda entry: _topics(entry["topics"], entry), 4),
+    column("Requesters", joined("requesters"), 2, wraps=True),
 )
 _SUSPENDED = (
-    Column("Subject"),
-    Column("Demand", 3),
-    Column("Requesters", 2, wraps=True),
-    Column("By", 1),
-    Column("Reason", 4, wraps=True),
+    column("Subject", lambda claim: "{kind} {id}".format(**claim)),
+    column("Demand", "demand", 3),
+    column("Requesters", joined("requesters"), 2, wraps=True),
+    column("By", "override", 1),
+    column("Reason", "reason", 4, wraps=True),
+)
+_CAPACITY = (
+    column("Node", "node"),
+    column("Resource", "name"),
+    column("Requested", "requested"),
+    column("Capacity", "capacity"),
 )
 _WAITING = (
-    Column("Demand"),
-    Column("Requesters", 2, wraps=True),
-    Column("Since", 1),
-    Column("Priority", 1),
+    column("Demand", "demand"),
+    column("Requesters", lambda demand: "\n".join(demand["requesters"]), 2, wraps=True),
+    column("Since", lambda demand: time_text(demand["since"]), 1),
+    column("Priority", lambda demand: str(demand["priority"]), 1),
 )
-_CAPACITY = (Column("Node"), Column("Resource"), Column("Requested"), Column("Capacity"))
-
-
-def _lines(topics: Mapping[str, list[str]], entry: ServiceEntry | ConnectionEntry) -> Iterator[str]:
-    # a topic is followed by its requesters if the entry has others too
-    for topic, who in topics.items():
-        yield topic if who == entry.requesters else f"{topic} ({', '.join(who)})"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import datetime, timedelta
@@ -17,18 +16,8 @@ from demandops.base.naming import SubjectKind
 from demandops.base.quoting import json_escaped, quoted
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
-from demandops.cli.json_output import (
-    Json,
-    claim_data,
-    lease_data,
-    output_formats,
-    override_data,
-    print_json,
-    release_data,
-    show,
-    time_data,
-    time_text,
-)
+from demandops.cli import json_output
+from demandops.cli.json_output import Json, claim_data, time_data, time_text
 from demandops.cli.output import (
     at_option,
     errors,
@@ -38,7 +27,7 @@ from demandops.cli.output import (
     warn_of,
     warn_of_not_rendered,
 )
-from demandops.cli.table import Cell, Column, Table
+from demandops.cli.table import CellOf, Column, Table, column, joined, table_of
 from demandops.cli.target import name_options, names_of, state_repo_option
 from demandops.model.config.base_model import duration_text, relative
 from demandops.model.config.override import parse_time
@@ -59,7 +48,6 @@ from demandops.views.release_causes import override_report, override_state
 # ---- the kinds of things: their data, columns and filters ----
 
 Values = Callable[[Json], Iterable[str]]
-CellOf = Callable[[Json, datetime], Cell]
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,28 +58,16 @@ class Source:
     not_rendered: Collection[str] = ()  # files that a generator has yet to write or remove
 
 
-class Kind(ABC):
-    """A kind of thing: its items, each with a ``name``, and how they are shown."""
-
+class Kind:
+    items: Callable[[Source], list[Json]]  # each with a ``name``
     columns: Sequence[tuple[Column, CellOf]]
     wide: Sequence[tuple[Column, CellOf]]  # further columns for `-o wide`
     # An item is listed if the option matches one of the values that its filter returns.
     filters: ClassVar[Mapping[str, Values]]
 
-    @abstractmethod
-    def items(self, source: Source) -> list[Json]: ...
-
     def table(self, items: Iterable[Json], now: datetime, *, wide: bool = False) -> Table:
         shown = [*self.columns, *(self.wide if wide else ())]
-        rows = [[cell_of(item, now) for _, cell_of in shown] for item in items]
-        return Table([column for column, _ in shown], rows, whole=wide)
-
-
-def _column(
-    title: str, cell: str | CellOf, rank: int = 0, *, wraps: bool = False
-) -> tuple[Column, CellOf]:
-    cell_of = cell if callable(cell) else lambda item, now: item[cell] or ""
-    return Column(title, rank, wraps), cell_of
+        return table_of(shown, items, now, whole=wide)
 
 
 def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
@@ -99,8 +75,7 @@ def _state_now(state: str, lease: Lease | None, now: datetime) -> str:
 
 
 def _lease_text(item: Json, now: datetime) -> str:
-    lease = item["lease"]
-    if lease is None:
+    if (lease := item["lease"]) is None:
         return ""
     if not lease["until"]:
         return "not started"
@@ -135,10 +110,6 @@ def _holds(item: Json, now: datetime) -> list[str]:
     return [*item["applications"], *item["connections"]]
 
 
-def _joined(key: str) -> CellOf:
-    return lambda item, now: ", ".join(item[key])
-
-
 def _ago(key: str) -> CellOf:
     return lambda item, now: relative(parse_time(item[key]), now) if item[key] else ""
 
@@ -160,17 +131,17 @@ _COMMON = {"node": _key("nodes"), "requester": _key("requesters"), "domain": _ke
 
 class _Claims(Kind):
     columns = (
-        _column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
-        _column("Requesters", _joined("requesters"), 1, wraps=True),
-        _column("State", "state", 2),
-        _column("Since", _ago("since"), 3),
-        _column("Lease", _lease_text, 4, wraps=True),
-        _column("Demand", "demand", 5),
+        column("Subject", lambda item, now: "{kind} {id}".format(**item["subject"])),
+        column("Requesters", joined("requesters"), 1, wraps=True),
+        column("State", "state", 2),
+        column("Since", _ago("since"), 3),
+        column("Lease", _lease_text, 4, wraps=True),
+        column("Demand", "demand", 5),
     )
     wide = (
-        _column("Request", "request"),
-        _column("Since (UTC)", _utc("since")),
-        _column("File", "file"),
+        column("Request", "request"),
+        column("Since (UTC)", _utc("since")),
+        column("File", "file"),
     )
     filters = _COMMON | {
         "application": lambda item: (
@@ -195,13 +166,13 @@ class _Claims(Kind):
 
 class _Connections(Kind):
     columns = (
-        _column("Connection", "name"),
-        _column("Type", "type", 2),
-        _column("From", "source", 1),
-        _column("To", "target", 1),
-        _column("Requesters", _joined("requesters"), 3, wraps=True),
+        column("Connection", "name"),
+        column("Type", "type", 2),
+        column("From", "source", 1),
+        column("To", "target", 1),
+        column("Requesters", joined("requesters"), 3, wraps=True),
     )
-    wide = (_column("Topics", lambda item, now: list(item["topics"])),)
+    wide = (column("Topics", lambda item, now: list(item["topics"])),)
     filters = _COMMON | {"node": lambda item: [item["source"], item["target"]]}
 
     def items(self, source: Source) -> list[Json]:
@@ -218,18 +189,18 @@ class _Connections(Kind):
 
 class _Demands(Kind):
     columns = (
-        _column("Demand", "name"),
-        _column("State", "state", 3),
-        _column("Requesters", _joined("requesters"), 1, wraps=True),
-        _column("Holds", _holds, 2),
-        _column("Since", _ago("since"), 5),
-        _column("Lease", _lease_text, 4, wraps=True),
+        column("Demand", "name"),
+        column("State", "state", 3),
+        column("Requesters", joined("requesters"), 1, wraps=True),
+        column("Holds", _holds, 2),
+        column("Since", _ago("since"), 5),
+        column("Lease", _lease_text, 4, wraps=True),
     )
     wide = (
-        _column("Requests", "requests"),
-        _column("Nodes", "nodes"),
-        _column("Since (UTC)", _utc("since")),
-        _column("Suspended by", "suspended_by"),
+        column("Requests", "requests"),
+        column("Nodes", "nodes"),
+        column("Since (UTC)", _utc("since")),
+        column("Suspended by", "suspended_by"),
     )
     filters = _COMMON | {"application": _key("applications")}
 
@@ -239,7 +210,7 @@ class _Demands(Kind):
                 **asdict(demand),
                 "state": _state_now(demand.state, demand.lease, source.now),
                 "since": time_data(demand.since),
-                "lease": lease_data(demand.lease),
+                "lease": json_output.lease_data(demand.lease),
             }
             for demand in demand_lists.demands(source.snapshot.state)
         ]
@@ -247,10 +218,10 @@ class _Demands(Kind):
 
 class _Leases(Kind):
     columns = (
-        _column("Demand", "name"),
-        _column("Requesters", _joined("requesters"), 2, wraps=True),
-        _column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
-        _column(
+        column("Demand", "name"),
+        column("Requesters", joined("requesters"), 2, wraps=True),
+        column("Term", lambda item, now: duration_text(item["lease"]["seconds"]), 3),
+        column(
             "Ends",
             lambda item, now: _lease_text(item, now).removeprefix("ends "),
             1,
@@ -258,8 +229,8 @@ class _Leases(Kind):
         ),
     )
     wide = (
-        _column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
-        _column("Holds", _holds),
+        column("Ends (UTC)", lambda item, now: _utc("until")(item["lease"], now)),
+        column("Holds", _holds),
     )
     filters = _COMMON | {"application": _key("applications")}
 
@@ -271,23 +242,23 @@ class _Leases(Kind):
 
 class _Nodes(Kind):
     columns = (
-        _column("Node", "name"),
-        _column("Type", "type", 2),
-        _column("Domain", "domain", 3),
-        _column("Cluster", "cluster", 5),
-        _column("State", _node_state, 1),
-        _column("Releases", lambda item, now: str(len(item["releases"])), 4),
-        _column("Requesters", _joined("requesters"), 6, wraps=True),
+        column("Node", "name"),
+        column("Type", "type", 2),
+        column("Domain", "domain", 3),
+        column("Cluster", "cluster", 5),
+        column("State", _node_state, 1),
+        column("Releases", lambda item, now: str(len(item["releases"])), 4),
+        column("Requesters", joined("requesters"), 6, wraps=True),
     )
     wide = (
-        _column("Capabilities", "capabilities"),
-        _column(
+        column("Capabilities", "capabilities"),
+        column(
             "Properties",
             lambda item, now: [
                 f"{name}: {json.dumps(value)}" for name, value in item["properties"].items()
             ],
         ),
-        _column("Names of releases", "releases"),
+        column("Names of releases", "releases"),
     )
     filters = _COMMON | {
         "node": _key("name"),
@@ -305,12 +276,12 @@ class _Nodes(Kind):
 
 class _Overrides(Kind):
     columns = (
-        _column("Override", "name"),
-        _column("State", "state", 1),
-        _column("Does", lambda item, now: effect_words(item), 2, wraps=True),
-        _column("Until", _ago("until"), 3),
-        _column("Owner", "owner", 4),
-        _column(
+        column("Override", "name"),
+        column("State", "state", 1),
+        column("Does", lambda item, now: effect_words(item), 2, wraps=True),
+        column("Until", _ago("until"), 3),
+        column("Owner", "owner", 4),
+        column(
             "To",
             lambda item, now: [
                 *dict.fromkeys(release["name"] for release in item["releases"]),
@@ -318,11 +289,11 @@ class _Overrides(Kind):
             ],
             5,
         ),
-        _column("Reason", "reason", 6, wraps=True),
+        column("Reason", "reason", 6, wraps=True),
     )
     wide = (
-        _column("Priority", lambda item, now: str(item["priority"])),
-        _column("Until (UTC)", _utc("until")),
+        column("Priority", lambda item, now: str(item["priority"])),
+        column("Until (UTC)", _utc("until")),
     )
     filters = _COMMON | {
         "node": lambda item: [release["node"] for release in item["releases"]],
@@ -333,9 +304,9 @@ class _Overrides(Kind):
     def items(self, source: Source) -> list[Json]:
         return [
             {
-                **override_data(entry.override),
+                **json_output.override_data(entry.override),
                 "state": override_state(entry, source.snapshot.state, source.not_rendered),
-                "releases": [release_data(release) for release in entry.releases],
+                "releases": [json_output.release_data(release) for release in entry.releases],
                 "claims": [claim_data(claim) for claim in entry.claims],
             }
             for entry in override_report(source.snapshot.state, source.now)
@@ -344,14 +315,14 @@ class _Overrides(Kind):
 
 class _Proposals(Kind):
     columns = (
-        _column("Branch", "branch"),
-        _column("Commit", lambda item, now: item["commit"][:10]),
-        _column("Requesters", _joined("requesters"), 1, wraps=True),
-        _column("Since", _ago("since"), 2),
-        _column("What", "summary", 3, wraps=True),
-        _column("Link", "link", 5),
+        column("Branch", "branch"),
+        column("Commit", lambda item, now: item["commit"][:10]),
+        column("Requesters", joined("requesters"), 1, wraps=True),
+        column("Since", _ago("since"), 2),
+        column("What", "summary", 3, wraps=True),
+        column("Link", "link", 5),
     )
-    wide = (_column("Demands", "demands"), _column("Since (UTC)", _utc("since")))
+    wide = (column("Demands", "demands"), column("Since (UTC)", _utc("since")))
     filters: ClassVar[Mapping[str, Values]] = {"requester": _key("requesters")}
 
     def items(self, source: Source) -> list[Json]:
@@ -382,19 +353,19 @@ class _Proposals(Kind):
 
 class _Services(Kind):
     columns = (
-        _column("Service", "name"),
-        _column("Kind", "service", 4),
-        _column("Version", lambda item, now: version_lines(item), 5),
-        _column("Node", "node", 1),
-        _column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
-        _column("Requesters", _joined("requesters"), 2, wraps=True),
+        column("Service", "name"),
+        column("Kind", "service", 4),
+        column("Version", lambda item, now: version_lines(item), 5),
+        column("Node", "node", 1),
+        column("For", lambda item, now: item["source"] or item["applications"], 3, wraps=True),
+        column("Requesters", joined("requesters"), 2, wraps=True),
     )
     wide = (
-        _column(
+        column(
             "Takes in",
             lambda item, now: [topic for topics in item["inputs"].values() for topic in topics],
         ),
-        _column(
+        column(
             "Parameters",
             lambda item, now: [f"{name} = {value}" for name, value in item["parameters"].items()],
         ),
@@ -428,21 +399,10 @@ KINDS: dict[str, Kind] = {
 # ---- the command ----
 
 FILTERS = ("node", "requester", "application", "domain")
-_POLL_S = 1.0
-_POLL_REMOTE_S = 10.0  # each look is a fetch
+_OF_NOTE = ("drained", "expired", "held back", "matches nothing", "not rendered yet", "overdue")
 _COLORS = {
-    "drained": "yellow",
-    "expired": "yellow",
-    "held": "green",
-    "in force": "green",
-    "held back": "yellow",
-    "matches nothing": "yellow",
-    "not in the inventory": "red",
-    "not rendered yet": "yellow",
-    "overdue": "yellow",
-    "partly suspended": "yellow",
-    "suspended": "yellow",
-    "waiting": "yellow",
+    **dict.fromkeys((*_OF_NOTE, "partly suspended", "suspended", "waiting"), "yellow"),
+    **{"held": "green", "in force": "green", "not in the inventory": "red"},
 }
 
 
@@ -486,7 +446,7 @@ def _item_names(ctx: click.Context, param: click.Parameter, incomplete: str) -> 
     is_flag=True,
     help="Print the list again when a new commit or proposal changes it.",
 )
-@output_formats("text", "wide", "name", "json", "yaml")
+@json_output.output_formats("text", "wide", "name", "json", "yaml")
 def get(
     kind: str,
     names: tuple[str, ...],
@@ -527,7 +487,8 @@ def get(
         items = _matching(listed, items, names, wanted)
         _print_list(kind, source, items, output, watch)
         while watch:
-            REAL.sleep(_POLL_S if repo.repository.always_current else _POLL_REMOTE_S)
+            # each look at a remote is a fetch
+            REAL.sleep(1.0 if repo.repository.always_current else 10.0)
             try:
                 is_same = repo.refresh() == str(source.snapshot.commit)
             except RemoteAway as error:
@@ -594,14 +555,14 @@ def _print_list(kind: str, source: Source, items: list[Json], output: str, watch
     if output == "json" and watch:
         click.echo(json_escaped(json.dumps(plain, ensure_ascii=False)))
     elif output == "json":
-        print_json(plain)
+        json_output.print_json(plain)
     elif output == "yaml":
         click.echo(("---\n" if watch else "") + strict_yaml.dump(plain), nl=False)
     elif output == "name":
-        show(output, None, [item["name"] for item in items])
+        json_output.show(output, None, [item["name"] for item in items])
     else:
         table = KINDS[kind].table(items, source.now, wide=output == "wide")
         table = replace(table, empty=f"no {kind}", styles=_COLORS)
         when = f"{source.now:%H:%M:%S} UTC, " if watch else ""
         note = painted(f"{when}at {commit[:10]}", "dim")
-        show(output, None, [table, *([note] if watch else [])])
+        json_output.show(output, None, [table, *([note] if watch else [])])

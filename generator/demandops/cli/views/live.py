@@ -32,8 +32,6 @@ from demandops.web.server import WebServer
 # ---- ``demandops watch``: releases, demands and the latest commits live ----
 
 
-_PAUSE_S = 2.0
-_COMMITS = 6
 # Two lines are the title, one before each of the three parts is empty, and one at the bottom stays
 # free.
 _OTHER_LINES = 6
@@ -70,7 +68,7 @@ def watch(state_repo: str, access_file: Path | None) -> None:
                         raise
                     shown[1] = painted(f"not well, last valid state: {one_line(str(error))}", "red")
                 live.update(Text.from_ansi("\n".join(shown), no_wrap=True), refresh=True)
-                REAL.sleep(_PAUSE_S)
+                REAL.sleep(2.0)
                 try:
                     repo.refresh()
                     away = ""
@@ -89,7 +87,7 @@ def _screen(
     source = Source(repo, repo.snapshot(), now)
     demands = KINDS["demands"]
     items = demands.items(source)
-    rows = [commit_data(entry) for entry in islice(repo.log(), _COMMITS)]
+    rows = [commit_data(entry) for entry in islice(repo.log(), 6)]
     amiss = "; ".join(filter(None, (status.amiss(clusters), away)))
     health = painted(f"not well: {amiss}", "red") if amiss else painted("all is well", "green")
     if not clusters and not amiss:
@@ -116,8 +114,6 @@ def _part(title: str, table: Table, width: int, room: int) -> list[str]:
 
 # ---- ``demandops web``: the web page, without ROS ----
 
-_INTERVAL = "5s"
-
 
 @click.command()
 @state_repo_option
@@ -132,7 +128,7 @@ _INTERVAL = "5s"
 @click.option(
     "--fetch-interval",
     "interval",
-    default=_INTERVAL,
+    default="5s",
     show_default=True,
     callback=read_by(parse_interval),
     metavar="DURATION",

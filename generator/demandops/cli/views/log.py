@@ -13,7 +13,7 @@ from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.cli.json_output import Json, commit_data, output_formats, show, time_text
 from demandops.cli.output import busy
-from demandops.cli.table import Column, Table
+from demandops.cli.table import Table, column, table_of
 from demandops.cli.target import name_options, state_repo_option
 from demandops.model.config.base_model import relative
 from demandops.model.config.override import parse_time
@@ -24,22 +24,8 @@ from demandops.repo.reader import Reader
 
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
-    "join",
-    "shutdown",
-    "put",
-    "release",
-    "renew",
-    "expire",
-    "wait",
-    "decommission",
-    "drain",
-    "scale-down",
-    "follow",
-    "expire-override",
-    "rollback",
-    "upgrade",
-    "init",
-    "by-hand",
+    *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
+    *("scale-down", "follow", "expire-override", "rollback", "upgrade", "init", "by-hand"),
 )
 
 _TRAILERS = {
@@ -143,8 +129,7 @@ def log(
             )
 
         with busy("looking through the commits"):
-            entries = list(islice(filter(matches, commits), max_count))
-            if not entries:
+            if not (entries := list(islice(filter(matches, commits), max_count))):
                 _refuse_unknown(repo, given)
     rows = [commit_data(entry) for entry in entries]
     table = log_table(rows, REAL.now(), wide=output == "wide")
@@ -165,8 +150,7 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
         for name, values in names.items()
         if given[name] not in values
     ]
-    node = given["node"]
-    if node is not None:
+    if (node := given["node"]) is not None:
         # no commit needs to have changed a node that the inventory has
         nodes = {*repo.last_valid_snapshot(repo.commit()).state.config.nodes}
         if node not in nodes and not any(
@@ -179,32 +163,28 @@ def _refuse_unknown(repo: Reader, given: dict[str, Any]) -> None:
 
 
 _COLUMNS = (
-    Column("Commit"),
-    Column("When", 2),
-    Column("What", 0, wraps=True),
-    Column("Requesters", 1, wraps=True),
+    column("Commit", lambda row, now: row["commit"][:10]),
+    column("When", lambda row, now: relative(parse_time(row["time"]), now), 2),
+    column("What", "summary", wraps=True),
+    column(
+        "Requesters",
+        lambda row, now: (
+            # the trailers name the requesters whose claims changed; a person asked for it
+            f"{row['author']}, for {', '.join(row['requesters'])}"
+            if row["operation"] == "rollback"
+            else ", ".join(row["requesters"]) or row["author"]
+        ),
+        1,
+        wraps=True,
+    ),
 )
-_WIDE = (Column("Time (UTC)"), Column("Operation"), Column("Author"), Column("Request"))
+_WIDE = (
+    column("Time (UTC)", lambda row, now: time_text(row["time"]).removesuffix(" UTC")),
+    column("Operation", lambda row, now: row["operation"] or "by hand"),
+    column("Author", "author"),
+    column("Request", "request"),
+)
 
 
 def log_table(rows: list[Json], now: datetime, *, wide: bool = False) -> Table:
-    cells = []
-    for row in rows:
-        requesters = row["requesters"] or [row["author"]]
-        # the trailers name the requesters whose claims changed; a person asked for it
-        if row["operation"] == "rollback":
-            requesters = [f"{row['author']}, for {', '.join(row['requesters'])}"]
-        shown = (
-            row["commit"][:10],
-            relative(parse_time(row["time"]), now),
-            row["summary"],
-            ", ".join(requesters),
-        )
-        more = (
-            time_text(row["time"]).removesuffix(" UTC"),
-            row["operation"] or "by hand",
-            row["author"],
-            row["request"] or "",
-        )
-        cells.append(shown + (more if wide else ()))
-    return Table([*_COLUMNS, *(_WIDE if wide else ())], cells, whole=wide)
+    return table_of([*_COLUMNS, *(_WIDE if wide else ())], rows, now, whole=wide)

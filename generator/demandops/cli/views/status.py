@@ -20,7 +20,7 @@ from demandops.cli.output import (
     version_lines,
     warn_of_not_rendered,
 )
-from demandops.cli.table import Column, Table
+from demandops.cli.table import Table, column, table_of
 from demandops.cli.target import clusters_option, state_repo_option
 from demandops.cluster import clusters_file, rollouts
 from demandops.cluster.health import ObjectSelector, health_reader
@@ -34,8 +34,6 @@ from demandops.repo.git.repository import RemoteAway
 from demandops.repo.load.last_valid_config import Problem
 from demandops.repo.reader import Reader
 
-_SHORT = 10
-_POLL_S = 2.0
 _PATIENCE_S = 10
 
 
@@ -104,7 +102,7 @@ def status(
             if amiss != told:
                 errors.print(f"waiting: {amiss}")
                 told = amiss
-            REAL.sleep(_POLL_S)
+            REAL.sleep(2.0)
             try:
                 repo.refresh()
             except RemoteAway as error:  # then the last fetched commit is shown
@@ -250,31 +248,22 @@ class Status:
 
 _COLORS = {"failing": "red", "healthy": "green", "unknown": "yellow", "waiting": "yellow"}
 _COLUMNS = (
-    Column("Release"),
-    Column("Health", 0),
-    Column("Seen", 2),
-    Column("Node", 4),
-    Column("Reason", 1, wraps=True),
-    Column("Since", 5),
-    Column("Version", 6),
-    Column("What", 8),
-    Column("Cluster", 7),
+    column("Release", "name"),
+    column("Health", lambda row: "failing" if row["failing"] else row["health"]),
+    column("Seen", lambda row: (row["seen"] or "")[:10], 2),
+    column("Node", "node", 4),
+    column(
+        "Reason",
+        lambda row: f"{row['object']}: {row['reason']}" if row["object"] else row["reason"] or "",
+        1,
+        wraps=True,
+    ),
+    column("Since", "since", 5),
+    column("Version", version_lines, 6),
+    column("What", lambda row: row["what"].partition(" on ")[0], 8),
+    column("Cluster", "cluster", 7),
 )
 
 
 def releases_table(rows: Iterable[Json]) -> Table:
-    cells = [
-        (
-            row["name"],
-            "failing" if row["failing"] else row["health"],
-            (row["seen"] or "")[:_SHORT],
-            row["node"],
-            f"{row['object']}: {row['reason']}" if row["object"] else row["reason"] or "",
-            row["since"] or "",
-            version_lines(row),
-            row["what"].partition(" on ")[0],
-            row["cluster"],
-        )
-        for row in rows
-    ]
-    return Table(_COLUMNS, cells, styles=_COLORS)
+    return table_of(_COLUMNS, rows, styles=_COLORS)

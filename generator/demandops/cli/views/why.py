@@ -11,18 +11,8 @@ from demandops.base.errors import StateRepoError, closest, suggestion
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
-from demandops.cli.json_output import (
-    Json,
-    claim_data,
-    commit_data,
-    output_option,
-    override_data,
-    place_data,
-    release_data,
-    show,
-    subject_data,
-    time_text,
-)
+from demandops.cli import json_output
+from demandops.cli.json_output import Json, commit_data, override_data, release_data, time_text
 from demandops.cli.output import at_option, busy
 from demandops.cli.target import names_of, state_repo_option
 from demandops.cli.views.diff import loaded
@@ -48,14 +38,8 @@ from demandops.views.release_causes import affected_releases, override_report
 # ---- the object that has the given name ----
 
 KINDS = (
-    "release",
-    "application",
-    "connection",
-    "demand",
-    "node",
-    "appdef",
-    "requester",
-    "override",
+    *("release", "application", "connection", "demand"),
+    *("node", "appdef", "requester", "override"),
 )
 _MOST_LISTED = 8
 
@@ -70,10 +54,7 @@ class Match:
 
 
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
-    """Return the object that a name or path identifies; ``kind`` limits the search to one kind.
-
-    Only the history up to the commit of ``snapshot`` counts.
-    """
+    # of a name or a path; only the history up to the commit of ``snapshot`` counts
     if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     world = snapshot.state
@@ -147,8 +128,7 @@ def _by_looser_match(
             yield Match("release", release.name, path_of(release), release)
             return
     if kind in (None, "demand"):
-        ids = sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(name))
-        if ids:
+        if ids := sorted(id for id in world.ledger.indexed_names("demand") if id.startswith(name)):
             yield Match("demand", _the_only_name(name, ids, "demand ids begin with {}"))
             return
         if demand_commits(repo, snapshot, name):
@@ -181,8 +161,7 @@ def demand_commits(repo: Reader, snapshot: Snapshot, id: str) -> list[LogEntry]:
 def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
     path = path.rstrip("/")
     text = repo.file_reader(str(snapshot.commit))(path)
-    key = ledger_files.key_of(path, snapshot.state.ledger)
-    if key is not None:
+    if (key := ledger_files.key_of(path, snapshot.state.ledger)) is not None:
         return Match("claim", key.demand, path, subject=key.subject)
     name = path.rsplit("/", 1)[-1].removesuffix(".yaml")
     release = release_causes.release_named(snapshot.state, name)
@@ -325,8 +304,6 @@ def _commit_lines(entry: Json, *, why: bool) -> Iterator[str]:
 
 # ---- the command ----
 
-_MOST_CARRIED_OUT = 5
-
 
 @click.command()
 @click.argument(
@@ -353,7 +330,7 @@ _MOST_CARRIED_OUT = 5
     show_default=True,
     help="List at most this many of the commits that changed the object.",
 )
-@output_option
+@json_output.output_option
 def why(
     name: str, state_repo: str, at: str | None, kind: str | None, most: int, output: str
 ) -> None:
@@ -396,7 +373,7 @@ def why(
                 answer["state"] = "not rendered yet"
             answer["not_rendered"] = not_rendered
             answer |= {"file": match.path or None, **_commits(repo, snapshot, match, most)}
-    show(output, answer, lines_of(answer))
+    json_output.show(output, answer, lines_of(answer))
 
 
 def _described(world: World, match: Match) -> Json:
@@ -406,7 +383,7 @@ def _described(world: World, match: Match) -> Json:
         claims = release_causes.claims_behind(without_suspended(world).ledger, release)
         return {
             "runs": True,
-            **place_data(release),
+            **json_output.place_data(release),
             **_claims(claims, world),
             "shaped_by": [
                 {"file": file, "entry": entry or None, "what": what}
@@ -425,19 +402,18 @@ def _described(world: World, match: Match) -> Json:
         return {
             "runs": any(suspended_by(claim, world) is None for claim in claims),
             "what": what,
-            "subject": subject_data(match.subject),
+            "subject": json_output.subject_data(match.subject),
             **_claims(claims, world),
             "releases": [release_data(release) for release in releases],
         }
     if match.kind == "release":  # it does not run; perhaps an override denies it
         file_name = match.path.rsplit("/", 1)[-1].removesuffix(".yaml")
-        denied = release_causes.denied_release_named(world, file_name)
-        if denied is None:
+        if (denied := release_causes.denied_release_named(world, file_name)) is None:
             return {"runs": False}
         release, override = denied
         return {
             "runs": False,
-            **place_data(release),
+            **json_output.place_data(release),
             "denied_by": override_data(override, ("deny",)),
         }
     if match.kind == "demand":
@@ -500,7 +476,7 @@ def _claims(claims: list[Claim], world: World) -> Json:
         suspended = suspended_by(claim, world)
         kept = world.config.overrides.get(claim.keeping_override or "")
         rows.append(
-            claim_data(claim)
+            json_output.claim_data(claim)
             | {
                 "release_by": release_causes.how_to_release(claim),
                 "overdue": claim.lease is not None and claim.lease.has_ended(REAL.now()),
@@ -517,8 +493,7 @@ def _claims(claims: list[Claim], world: World) -> Json:
 def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> Json:
     history = PathHistory(None, (), 0, None)
     if match.kind == "demand":
-        about = demand_commits(repo, snapshot, match.name)
-        if about:  # else the history was made anew
+        if about := demand_commits(repo, snapshot, match.name):  # else the history was made anew
             *newer, first = about
             held = ("demand", match.name) in snapshot.state.ledger.index
             stopped = None if held or not newer else newer.pop(0)
@@ -530,7 +505,7 @@ def _commits(repo: Reader, snapshot: Snapshot, match: Match, most: int) -> Json:
     def row(entry: LogEntry | None) -> Json | None:
         if entry is None:
             return None
-        behind = repo.person_commits_behind(entry, _MOST_CARRIED_OUT)
+        behind = repo.person_commits_behind(entry, most=5)
         return commit_data(entry) | {"carries_out": [commit_data(commit) for commit in behind]}
 
     return {

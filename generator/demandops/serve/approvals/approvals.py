@@ -16,14 +16,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias
 
-from demandops.base.errors import (
-    DemandOpsError,
-    InvalidInput,
-    Refused,
-    ShuttingDown,
-    Withdrawn,
-    fault,
-)
+from demandops.base import errors
+from demandops.base.errors import DemandOpsError, InvalidInput, Refused, fault
 from demandops.base.quoting import quoted
 from demandops.base.settings import PROPOSAL_LIMIT
 from demandops.cluster.rollouts import targets_of_decision
@@ -87,7 +81,12 @@ class Approvals:
         self._demands = demands
         self._with_targets = with_targets
         self._branches = ProposalBranches(repository)
-        self._forge = ForgeWorker(token_file, self._on_forge_update, repository.runtime)
+
+        def on_update(branch: str) -> None:
+            self._changed.append(branch)  # in the forge's thread; a deque needs no lock for it
+            demands.wake()
+
+        self._forge = ForgeWorker(token_file, on_update, repository.runtime)
         self._timer = CheckTimer(repository.runtime, local=repository.always_current)
         self._proposals: dict[str, Proposal] = {}  # by branch
         self._changed: deque[str] = deque()
@@ -111,8 +110,7 @@ class Approvals:
         # Before the batch is evaluated: once a branch is gone, nobody can merge it. If a person
         # merged it earlier, the batch is evaluated on a tip that includes the merge.
         for ticket in batch if self._proposals else ():
-            request = _release_request(ticket, state)
-            if request is None:
+            if (request := _release_request(ticket, state)) is None:
                 continue
             for proposal in self._proposals.values():
                 if not releases(request, proposal.requests):
@@ -128,7 +126,7 @@ class Approvals:
         request = _release_request(by, state) if earlier else None
         for index, (ticket, result) in enumerate(earlier):
             if request and isinstance(result, Decision) and releases(request, [result.request]):
-                earlier[index] = (ticket, Withdrawn(RELEASED))
+                earlier[index] = (ticket, errors.Withdrawn(RELEASED))
                 by.has_released = True
 
     def add(self, ticket: Ticket, decision: Decision) -> None:
@@ -165,7 +163,7 @@ class Approvals:
             replaces = next((old.record.as_replaced() for old in replaced), "")
             proposal = Proposal(ProposalRecord(branch, replaces=replaces), searched_to=ticket.base)
         if not self._demands.propose(ticket, proposal.record):
-            self._demands.fail([ticket], Withdrawn(TAKEN_BACK))
+            self._demands.fail([ticket], errors.Withdrawn(TAKEN_BACK))
             return
         self._proposals[proposal.branch] = proposal
         proposal.tickets.append(ticket)
@@ -207,10 +205,8 @@ class Approvals:
         return self._branches.heads()
 
     def check(self, snapshot: Snapshot, heads: BranchHeads) -> None:
-        """Answer the demands that are decided or withdrawn, and update the other proposals.
-
-        ``snapshot`` is of main, at ``heads.main`` or later. After an error, the next check goes on.
-        """
+        # It answers the demands that are decided or withdrawn, and updates the other proposals.
+        # ``snapshot`` is of main, at ``heads.main`` or later. After an error, the next one goes on.
         while self._changed:
             if changed := self._proposals.get(self._changed.popleft()):
                 changed.checked_at = ""
@@ -298,9 +294,12 @@ class Approvals:
         # a person merged the demand, but a later commit changed its files
         if isinstance(decision, InvalidInput) or decision.files:
             return Receipt(ticket.operation, ticket.name, "booked", commit)
-        before = snapshot.state
+        receipt = self.receipt(ticket, decision, commit, snapshot.state)
+        return replace(receipt, outcome="booked")
+
+    def receipt(self, ticket: Ticket, decision: Decision, commit: str, before: State) -> Receipt:
         targets = targets_of_decision(before, decision) if self._with_targets else ()
-        return replace(receipt_of(ticket, decision, commit, targets), outcome="booked")
+        return receipt_of(ticket, decision, commit, targets)
 
     # ---- the branch and its pull request ----
 
@@ -308,8 +307,7 @@ class Approvals:
         self, proposal: Proposal, verdict: Verdict, snapshot: Snapshot, heads: BranchHeads
     ) -> bool:
         # false if a demand was withdrawn meanwhile, so that the proposal must be checked again
-        head = heads.branches.get(proposal.branch)
-        if head and head not in proposal.record.commits:
+        if (head := heads.branches.get(proposal.branch)) and head not in proposal.record.commits:
             # a rebuild would throw away what a person has written
             if not proposal.edited:
                 log.info("%s has commits by a person and stays unchanged", proposal.branch)
@@ -395,12 +393,8 @@ class Approvals:
         self._proposals.pop(proposal.branch, None)
         self._forge.forget(proposal.branch, code(closed_as) if closed_as else "")
 
-    def _on_forge_update(self, branch: str) -> None:
-        self._changed.append(branch)  # in the forge's thread; appending to a deque needs no lock
-        self._demands.wake()
-
     def suspend(self) -> None:
-        error = ShuttingDown("the demand awaits approval, and is resumed at the next start")
+        error = errors.ShuttingDown("the demand awaits approval, and is resumed at the next start")
         for proposal in self._proposals.values():
             self._demands.fail(proposal.tickets, error, keep=True)
         self._proposals = {}

@@ -24,8 +24,6 @@ _PAUSE_FACTOR = 9
 
 
 class CheckTimer:
-    """Decides when the next check is due. A failed check is retried when the interval is over."""
-
     def __init__(self, runtime: Runtime, *, local: bool) -> None:
         self._runtime = runtime
         self._interval = CHECK_LOCAL_S if local else CHECK_REMOTE_S
@@ -76,8 +74,7 @@ class _Task:
 
 
 class ForgeWorker:
-    """Opens, watches and closes pull requests; only the worker thread calls its public methods."""
-
+    # only the worker thread calls its public methods
     def __init__(
         self, token_file: Path | None, on_update: Callable[[str], None], runtime: Runtime
     ) -> None:
@@ -139,8 +136,7 @@ class ForgeWorker:
                 task = self._tasks.popleft()
                 pull_request = self._pull_requests.get(task.branch)
                 try:
-                    forge = forge_for(task.forge, self._token_file)
-                    if forge is None:
+                    if (forge := forge_for(task.forge, self._token_file)) is None:
                         continue
                     pull_request = self._handle(task, forge, pull_request)
                 except ForgeError as error:

@@ -195,7 +195,7 @@ def parse_waiting_text(text: str) -> dict[str, str]:
 
 def pull_request_texts(message: str) -> tuple[str, str]:
     # Requesters choose the ids in the message. Outside of a code block, an id could become a link.
-    title, fence = message.partition("\n")[0], _fence(message, 3)
+    title, fence = message.partition("\n")[0], backticks(message, 3)
     return title, (
         f"{_head(message)} Merging approves the demand; closing this pull request or deleting the "
         f"branch rejects the demand.\n\n{fence}text\n{message.rstrip()}\n{fence}\n"
@@ -210,13 +210,17 @@ def push_options(message: str, labels: Iterable[str]) -> list[str]:
         f"{_head(message)} {code(why)} Merging approves the demand; deleting the branch rejects "
         "the demand."
     )
+    labelled = (f"merge_request.label={label}" for label in labels)
+    return [*merge_request(title, description), *labelled]
+
+
+def merge_request(title: str, description: str) -> list[str]:
     return [
         "merge_request.create",
         f"merge_request.target={MAIN_BRANCH}",
         f"merge_request.title={title}",
         f"merge_request.description={description}",
         "merge_request.remove_source_branch",
-        *(f"merge_request.label={label}" for label in labels),
     ]
 
 
@@ -233,10 +237,10 @@ def _head(message: str) -> str:
 
 def code(text: str) -> str:
     """Return text from outside as code in one line of Markdown."""
-    fence = _fence(text, 1)
+    fence = backticks(text, 1)
     return f"{fence} {harmless(one_line(text))} {fence}"
 
 
-def _fence(text: str, shortest: int) -> str:
+def backticks(text: str, least: int) -> str:
     # more backticks than the text has in a row
-    return "`" * max([shortest, *(len(run) + 1 for run in re.findall(r"`+", text))])
+    return "`" * max([least, *(len(run) + 1 for run in re.findall(r"`+", text))])

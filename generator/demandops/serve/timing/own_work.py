@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterable
-from datetime import datetime, timedelta
+from datetime import datetime
 
 from demandops.base.errors import InvalidInput, OverLimit
 from demandops.base.quoting import quoted
@@ -25,9 +25,6 @@ from demandops.serve.timing.timers import within
 # configuration.
 
 log = logging.getLogger("demandops")
-
-# The pause before a retry to move the applications that stayed on a drained node.
-_RETRY_DRAINING = timedelta(seconds=60)
 
 
 class Draining:
@@ -74,7 +71,7 @@ class Draining:
         for node in world.config.drained_nodes:
             # not for a minute after a try, unless a person changed the configuration or the clock
             config, at = self._tried.get(node, (None, now))
-            is_new = config is not world.config or not at <= now < at + _RETRY_DRAINING
+            is_new = config is not world.config or not at <= now < at + RETRY
             if is_new and world.ledger.applications_on.get(node):
                 nodes.append(node)
         return nodes
@@ -105,8 +102,7 @@ class WaitingTurns:
         while self.left:
             demand = self.left.pop(0)
             state, now = commits.head.state, self._runtime.now()
-            waiting = state.ledger.waiting.get(demand)
-            if waiting is None:  # it was released meanwhile
+            if (waiting := state.ledger.waiting.get(demand)) is None:  # it was released meanwhile
                 continue
             checkpoint = within(state.config.repo_settings.limits, self._runtime)
             try:
@@ -152,24 +148,21 @@ class OwnWork:
         self._override_expiry = OverrideExpiry()
         self._scale_down = ScaleDown()
         self._draining = Draining(runtime)
-        self._waiting_turns = WaitingTurns(runtime)
+        self.waiting_turns = WaitingTurns(runtime)
 
     def commit_due(self, commits: CommitBatch) -> None:
         # a scale-down frees room for what moves, and what runs moves before what waits is booked
         self._override_expiry.end_due(commits, self._runtime.now())
         self._scale_down.end_due(commits, self._runtime.now())
         self._draining.move_due(commits)
-        self._waiting_turns.book_due(commits)
-
-    def follow(self, commits: CommitBatch, before: State) -> None:
-        self._waiting_turns.follow(commits, before)
+        self.waiting_turns.book_due(commits)
 
     def postpone(self) -> None:
         # because a fetch or a publication failed
         later = self._runtime.now() + RETRY
         self._override_expiry.not_before = self._scale_down.not_before = later
         self._draining.after.clear()
-        self._waiting_turns.left.clear()
+        self.waiting_turns.left.clear()
 
     def is_due(self, state: State) -> bool:
         now = self._runtime.now()
@@ -177,12 +170,12 @@ class OwnWork:
             self._override_expiry.is_due(state, now)
             or self._scale_down.is_due(state.ledger, now)
             or self._draining.is_due(state)
-            or self._waiting_turns.is_due(state)
+            or self.waiting_turns.is_due(state)
         )
 
     def seconds_until_due(self, state: State, longest: float) -> float:
         # what was left off goes on at once, but after the demands that arrived meanwhile
-        if self._draining.after or self._waiting_turns.left:
+        if self._draining.after or self.waiting_turns.left:
             return 0.0
         now = self._runtime.now()
         seconds = self._override_expiry.seconds_until_due(state, now, longest)

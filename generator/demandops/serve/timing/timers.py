@@ -49,11 +49,9 @@ class Backoff:
         self._turn = self._away = FIRST_PAUSE_S
 
     def overtaken(self, size: int, evaluating_s: float, pushing_s: float) -> float:
-        """Return the seconds to wait if another writer published first; adjust ``max_demands``.
+        # The seconds to wait, as another writer published first. ``size`` counts the demands of the
+        # attempt, which took ``evaluating_s`` to commit them, and ``pushing_s`` from then on.
 
-        ``size`` counts the demands of the attempt, which took ``evaluating_s`` to decide and commit
-        them, and ``pushing_s`` from then to the rejection.
-        """
         # a writer that evaluates for longer than its push takes always loses to faster writers
         self.max_demands = max(1, int(size * min(1.0, pushing_s / max(evaluating_s, 1e-9))))
         wait, self._turn = self._turn, min(self._turn * 2, LONGEST_TURN_S)
@@ -74,8 +72,6 @@ FIRST_S, LONGEST_S = 1.0, 60.0
 
 
 class Rest:
-    """A pause after an error; each further error doubles it until a success."""
-
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._next, self._until = FIRST_S, runtime.monotonic()
@@ -101,7 +97,6 @@ class Rest:
 # ---- when to fetch from the state repo while no demand comes ----
 
 DEFAULT_INTERVAL = "30s"
-_LONGEST_BACKOFF_S = 60.0
 _SHORTEST_GAP_S = 0.5  # a Git server may report many pushes at once; they share a fetch
 # The longest interval for a repository on this disk, where a check is cheap: it reads one file.
 _LOCAL_S = 1.0
@@ -115,13 +110,9 @@ def parse_interval(text: str) -> float:
 
 
 class PollTimer:
-    """Decides when to fetch: on request, and at an interval that grows while fetches fail.
-
-    Any thread may call :meth:`request`. Only one thread may call the other methods.
-    """
-
+    # any thread may call `request`, but only one thread may call the other methods
     def __init__(self, interval: float, runtime: Runtime, *, local: bool = False) -> None:
-        """Start the timer. With an interval of 0, only :meth:`request` makes a fetch due."""
+        # the interval grows while fetches fail; if it is 0, only `request` makes a fetch due
         self._interval = min(interval, _LOCAL_S) if local else interval
         self._runtime = runtime
         self._pause = self._interval
@@ -146,7 +137,7 @@ class PollTimer:
 
     def finished(self, *, reached: bool) -> None:
         """Plan the next fetch after a fetch or a push, which both tell of others' commits."""
-        longest = max(_LONGEST_BACKOFF_S, self._interval)
+        longest = max(60.0, self._interval)
         self._last = self._runtime.monotonic()
         if self._next is not None:
             self._pause = self._interval if reached else min(self._pause * 2, longest)
@@ -217,11 +208,8 @@ class RateLimit:
     def faults(
         self, request: DemandRequest, config: Config, operation: str, received: datetime
     ) -> Iterator[Fault]:
-        """Count a demand, and yield a fault for each quota that a requester exceeds with it.
-
-        A demand counts even if it is refused afterwards. A request that adds no claims is not
-        limited.
-        """
+        # A demand counts even if it is refused afterwards. A request that adds no claims is not
+        # limited.
         if not request.adds_claims:
             return
         homes = (config.domain_of.get(demanded.held.home) for demanded in request.demanded)
@@ -241,8 +229,7 @@ class RateLimit:
         # forget requesters that sent nothing for a minute, because vehicles come and go
         while self._seen:
             idlest = next(iter(self._seen))
-            times = self._seen[idlest]
-            if times and abs(received - times[-1][0]) <= _WINDOW:
+            if (times := self._seen[idlest]) and abs(received - times[-1][0]) <= _WINDOW:
                 break
             del self._seen[idlest]
         seen = self._seen.pop(key, None) or deque()
