@@ -59,10 +59,7 @@ _TRIES_ON_JOURNAL = 40
 Either of the two threads in ``_OTHER_THREAD`` may journal a demand, so the repetitions alternate
 between the two. For such a fault, strace counts only calls on the journal (:func:`_counted`).
 """
-_OTHER_THREAD = {
-    "demandops-journal": "demandops-writer",
-    "demandops-writer": "demandops-journal",
-}
+_OTHER_THREAD = {"demandops-journal": "demandops-writer", "demandops-writer": "demandops-journal"}
 _KNOWN: dict[Path, list[Site]] = {}
 """The system calls that booking :data:`DEMAND` makes in a rig; the key is the rig's folder."""
 _WITHOUT_REASON = (

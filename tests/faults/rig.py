@@ -250,9 +250,7 @@ class Rig:
         traces = self.scratch / "traces"
         shutil.rmtree(traces, ignore_errors=True)
         traces.mkdir()
-        environment = NO_GIT_CONFIG | {
-            "DEMANDOPS_DATA_HOME": str(self.home),
-        }
+        environment = NO_GIT_CONFIG | {"DEMANDOPS_DATA_HOME": str(self.home)}
         if strace is not None and strace.is_of_git:
             environment |= {
                 "PATH": f"{self._git}:{os.environ['PATH']}",

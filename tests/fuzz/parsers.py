@@ -335,14 +335,7 @@ _RULES = (
             {"near": {**_AREA, "start": 5, "stop": 9}, "dwell": "1s", "retry": "5s"},
             {"together": {"source": "cars", "other": "bikes", "start": 5, "stop": 9}},
             {"count": {**_AREA, "start": 2, "stop": 1}},
-            {
-                "threshold": {
-                    "source": "batteries",
-                    "field": "percentage",
-                    "below": 3,
-                    "stop": 8,
-                }
-            },
+            {"threshold": {"source": "batteries", "field": "percentage", "below": 3, "stop": 8}},
             {"schedule": {"start": "06:00", "stop": "22:00", "days": ["mon"], "zone": "UTC"}},
         )
     ),

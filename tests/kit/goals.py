@@ -85,12 +85,7 @@ def goal(
     id: str = "request",
     shutdown: bool = False,
 ) -> Goal:
-    return {
-        "id": id,
-        "apps": list(apps),
-        "connections": list(connections),
-        "shutdown": shutdown,
-    }
+    return {"id": id, "apps": list(apps), "connections": list(connections), "shutdown": shutdown}
 
 
 def perception(**changed: Any) -> Goal:

@@ -178,11 +178,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 def is_of_ledger(path: str) -> bool:
     """Return whether a file contains a claim, shutdowns, kept replicas or a waiting demand."""
-    roots = (
-        records.SHUTDOWNS_ROOT,
-        records.REPLICAS_ROOT,
-        records.WAITING_ROOT,
-    )
+    roots = (records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT, records.WAITING_ROOT)
     return bool(claim_file.kind_of(path)) or path.startswith(roots)
 
 

@@ -36,9 +36,7 @@ NO_GIT_CONFIG = {
     "GIT_TERMINAL_PROMPT": "0",
     "LC_ALL": "C.UTF-8",
 }
-TEST_GIT_CONFIG = NO_GIT_CONFIG | {
-    "GIT_CONFIG_GLOBAL": str(Path(__file__).with_name("gitconfig")),
-}
+TEST_GIT_CONFIG = NO_GIT_CONFIG | {"GIT_CONFIG_GLOBAL": str(Path(__file__).with_name("gitconfig"))}
 GIT_ENVIRONMENT = TEST_GIT_CONFIG | {
     "GIT_AUTHOR_NAME": "Petra Platform",
     "GIT_AUTHOR_EMAIL": "petra@example.org",

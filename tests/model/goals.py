@@ -31,10 +31,7 @@ STATION = "station00"
 VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
 PARTIES = (*VEHICLES, STATION)
 
-SKELETON = World(
-    nodes=frozenset({*PARTIES, "edge", "cloud"}),
-    brokers=frozenset({"edge", "cloud"}),
-)
+SKELETON = World(nodes=frozenset({*PARTIES, "edge", "cloud"}), brokers=frozenset({"edge", "cloud"}))
 """The nodes and brokers in the inventory that ``demandops init`` writes."""
 
 REQUESTS = ("station00/collective-perception-intersection", "again", "")

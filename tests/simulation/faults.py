@@ -139,11 +139,7 @@ def take_the_first_domain(patch: Patch) -> None:
 
 def forget_what_is_booked_in_a_domain(patch: Patch) -> None:
     chosen = admitted_request._chosen
-    patch(
-        admitted_request,
-        "_chosen",
-        lambda one, booked, *more: chosen(one, {}, *more),
-    )
+    patch(admitted_request, "_chosen", lambda one, booked, *more: chosen(one, {}, *more))
 
 
 # ---- routes ----
