@@ -37,14 +37,12 @@ def state_of(config: Config, ledger: Ledger | None = None) -> State:
 
 
 def edited(path: str, old: str, new: str) -> dict[str, str]:
-    """Return path and text of a skeleton file in which ``new`` replaces the first ``old``."""
     text = skeleton()[path]
     assert old in text, f"{path} does not contain {old!r}"
     return {path: text.replace(old, new, 1)}
 
 
 def brokers(*nodes: str) -> dict[str, str]:
-    """Return path and text of an ``inventory/brokers.yaml`` with a broker on each given node."""
     entries = [{"node": node, "host": f"broker-{node}"} for node in nodes]
     head = {"apiVersion": "demandops/v1", "kind": "Brokers"}
     return {"inventory/brokers.yaml": yaml.safe_dump(head | {"brokers": entries})}

@@ -27,7 +27,6 @@ from tests.kit import goals
 from tests.kit.memory import MemoryRepo
 
 Files = Mapping[str, str]
-"""Texts by path."""
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -53,7 +52,6 @@ DELETED = "DELETED"
 
 
 def requests_of(case: str) -> list[Path]:
-    """Return the request files of a case, in order."""
     if case in (EXPERIMENT, *FOLLOWING):
         return list(goals.EXPERIMENT)
     return sorted((GOLDEN / case / "requests").glob("*.yaml"))
@@ -86,7 +84,6 @@ def rendered(case: str) -> Mapping[str, Files]:
 
 
 def read(case: str) -> dict[str, dict[str, str]]:
-    """Return the texts of the files below ``expected/``, by step and then by path."""
     expected = GOLDEN / case / "expected"
     steps: dict[str, dict[str, str]] = {}
     for path in sorted(expected.rglob("*")):

@@ -39,8 +39,6 @@ class Answer:
 
 @dataclass
 class Server:
-    """A running server: its URL, the calls so far, and the function that answers the next calls."""
-
     answer: Callable[[Call], Answer] = lambda call: Answer()
     url: str = ""
     calls: list[Call] = field(default_factory=list)
@@ -52,7 +50,6 @@ class Server:
 
 @contextmanager
 def running(server: ThreadingHTTPServer) -> Iterator[str]:
-    """Run a server for the length of a block; yield its URL."""
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()
@@ -94,7 +91,6 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
 
 
 def kubeconfig(folder: Path, url: str) -> Path:
-    """Write a kubeconfig for the API server at ``url``; return its path."""
     config = {
         "apiVersion": "v1",
         "kind": "Config",

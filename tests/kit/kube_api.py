@@ -41,7 +41,6 @@ class KubeApi:
             self._changed.notify_all()
 
     def patch(self, path: str, body: Item) -> None:
-        """Record a patch; if its object exists, give the object the patch's annotations."""
         *_, namespace, plural, name = path.split("/")
         with self._changed:
             item = self._items.get((plural, namespace, name))
@@ -64,10 +63,7 @@ class KubeApi:
             return {"metadata": {"resourceVersion": str(len(self._log))}, "items": found}
 
     def events(self, plural: str, namespace: str, since: int, seconds: float) -> Iterator[Item]:
-        """Yield the changes of a namespace's objects of one kind after the version ``since``.
-
-        The iterator ends after ``seconds``, or when the server is closed.
-        """
+        """Yield the changes after a version, for some seconds or until the server is closed."""
         end = time.monotonic() + seconds
         while not self.closed and time.monotonic() < end:
             with self._changed:
@@ -79,21 +75,18 @@ class KubeApi:
                     yield {"type": "MODIFIED", "object": item}
 
     def flux(self, namespace: str, domain: str, commit: str) -> None:
-        """Report that Flux has applied a commit to an access domain."""
         revision = f"main@sha1:{commit}"
         ready = {"type": "Ready", "status": "True"}
         status = {"lastAppliedRevision": revision, "conditions": [ready]}
         self.put("kustomizations", namespace, domain, status)
 
     def helm_release(self, namespace: str, name: str, fault: str = "", since: str = "") -> None:
-        """Report a Helm release as failed with ``fault``, or as ready if ``fault`` is empty."""
         ready = {"type": "Ready", "status": "False" if fault else "True", "message": fault}
         ready["lastTransitionTime"] = since or "2026-05-04T12:00:00Z"
         status = {"observedGeneration": 1, "conditions": [ready]}
         self.put("helmreleases", namespace, name, status)
 
     def deployment(self, namespace: str, name: str, available: int = 1) -> None:
-        """Report a Deployment that wants one replica, with this number of available replicas."""
         status = {"observedGeneration": 1, "updatedReplicas": 1, "availableReplicas": available}
         self.put("deployments", namespace, name, status, spec={"replicas": 1})
 

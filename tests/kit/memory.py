@@ -66,11 +66,9 @@ class MemoryRepo:
         return self.state.config
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
-        """Decide a goal and leave the repo unchanged; raise :class:`Refused` if it is refused."""
         return decide(self.state, goal, now or self.now, self.files.get)
 
     def send(self, goal: object, now: datetime | None = None) -> Decision:
-        """Decide a goal and commit the decision; raise :class:`Refused` if it is refused."""
         decision = self.decide(goal, now)
         self.state = decision.state
         for path, text in decision.files.items():
@@ -82,10 +80,7 @@ class MemoryRepo:
         return decision
 
     def scale_down(self, now: datetime) -> list[str]:
-        """Remove replicas that need not be kept any more at ``now``, as the generator does.
-
-        Return the names of the changed releases.
-        """
+        """Remove the replicas that are due; return the names of the changed releases."""
         names = []
         for instance in self.state.ledger.kept.due(now):
             self.state, change = scale_down(self.state, instance, now, self.files.get)
@@ -96,7 +91,6 @@ class MemoryRepo:
         return names
 
     def take(self, goal: object, now: datetime | None = None) -> Decision | Refused:
-        """Decide a goal and commit the decision; return the decision or the refusal."""
         before = dict(self.files), self.state
         try:
             return self.send(goal, now)
@@ -112,7 +106,6 @@ class MemoryRepo:
         ]
 
     def forget_shutdowns(self) -> None:
-        """Remove the recent shutdowns, so that a repeated shutdown counts as a new one."""
         shutdowns = self.state.ledger.shutdowns
         self.state = replace(
             self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
@@ -127,11 +120,9 @@ class MemoryRepo:
         return [f"{fault.field}: {fault.message}" for fault in refusal.faults]
 
     def bookkeeping(self) -> dict[str, Any]:
-        """Return the bookkeeping as plain data; its commit id is empty."""
         return as_data(bookkeeping(self.state), "")
 
     def books(self) -> dict[str, Any]:
-        """Return the services and connections of the bookkeeping."""
         data = self.bookkeeping()
         return {"services": data["services"], "connections": data["connections"]}
 
@@ -140,7 +131,6 @@ class MemoryRepo:
         return in_model_words(self.bookkeeping(), object_lists(self.below("clusters").values()))
 
     def below(self, *roots: str) -> dict[str, str]:
-        """Return the files below these top-level folders, without READMEs."""
         return {
             path: text
             for path, text in self.files.items()
@@ -156,7 +146,6 @@ class MemoryRepo:
         }
 
     def objects(self, kind: str) -> dict[str, dict[str, Any]]:
-        """Return the objects of a kind in :meth:`rendered`, by name."""
         documents = [
             document
             for text in self.rendered().values()
@@ -169,7 +158,6 @@ class MemoryRepo:
 
 
 def rebuilt(claims: Iterable[Claim]) -> Ledger:
-    """Return a ledger with these claims, added one by one."""
     ledger = Ledger()
     for claim in claims:
         ledger = ledger.replace(claim.key, claim)
@@ -177,7 +165,6 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_of_ledger(path: str) -> bool:
-    """Return whether a file contains a claim, shutdowns, kept replicas or a waiting demand."""
     roots = (records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT, records.WAITING_ROOT)
     return bool(claim_file.kind_of(path)) or path.startswith(roots)
 
@@ -200,7 +187,6 @@ def outcome(taken: Decision | Refused) -> str:
 
 
 def books_after(goals: Iterable[Goal]) -> dict[str, Any]:
-    """Return the bookkeeping after ``goals``, decided one by one."""
     repo = MemoryRepo()
     for goal in goals:
         repo.send(goal)

@@ -46,7 +46,6 @@ replicas: 2
 
 
 def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
-    """Return a demand for a connection from a vehicle to the cloud, with a lease."""
     return {
         "apiVersion": "demandops/v1",
         "kind": "Demand",
@@ -66,15 +65,12 @@ def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
 
 
 def released(id: str, vehicle: str) -> Goal:
-    """Return the goal that releases the demand of :func:`leased`."""
     goal = leased(id, vehicle) | {"operation": "release"}
     return {key: value for key, value in goal.items() if key not in ("lease", "connections")}
 
 
 @dataclass
 class Story:
-    """The fleet: its state repo, generator and API server, a person, and the web page."""
-
     bare: Path
     generator: Generator
     api: KubeApi
@@ -87,17 +83,13 @@ class Story:
         return self.server.url.rstrip("/")
 
     def wait_followed(self) -> None:
-        """Wait until the page has the newest commit."""
         commit = str(self.generator.snapshot.commit)
         wait_until(
             lambda: self.follower.newest.commit_state.commit == commit, "the page has the commit"
         )
 
     def settle(self, *, mended: bool = False) -> None:
-        """Make the API server report that the cluster has applied the newest commit.
-
-        The server reports the release ``FAILING`` as failed unless ``mended`` is true.
-        """
+        """Report the newest commit as applied; ``FAILING`` fails unless it is mended."""
         commit = str(self.generator.snapshot.commit)
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")
         self.api.flux(NAMESPACE, "perception", commit)
@@ -111,7 +103,6 @@ class Story:
 
 @contextmanager
 def story(bare: Path, folder: Path) -> Iterator[Story]:
-    """Run the fleet and its page for the length of a block."""
     with ExitStack() as stack:
         api = stack.enter_context(kube_api())
         generator = Generator(str(bare), fetch_interval=0.2)

@@ -49,7 +49,6 @@ _LAST = 100
 
 @contextmanager
 def reserved() -> Iterator[int]:
-    """Reserve an unused ROS domain and yield it; limit ROS to this machine."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     domains = list(range(1, _LAST + 1))
     random.shuffle(domains)
@@ -67,7 +66,6 @@ def reserved() -> Iterator[int]:
 
 
 def _is_free(domain: int) -> bool:
-    """Return whether the port of the domain's first participant is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("", 7400 + 250 * domain + 10))
@@ -87,7 +85,6 @@ class Served:
     domain: int
 
     def demandops(self, *args: str) -> str:
-        """Run a command on the state repo in this process; it must succeed. Return its output."""
         with redirect_stdout(io.StringIO()) as printed:
             assert run([*args, "--state-repo", self.state_repo]) == 0
         return printed.getvalue()
@@ -114,10 +111,7 @@ class Served:
             time.sleep(0.05)
 
     def last_words(self) -> str:
-        """Return how the process ended, and its log.
-
-        A process that still runs is aborted. The result then also says what each thread was doing.
-        """
+        """Return how the process ended, and its log; abort a process that still runs."""
         code, pid = self.process.poll(), self.process.pid
         lines = [f"ended with {code}" if code is not None else f"runs as {pid}"]
         if code is None:
@@ -132,7 +126,6 @@ class Served:
         return "\n".join([*lines, self.log.read_text()])
 
     def _scheduled(self, thread: int) -> tuple[float, float]:
-        """Return the seconds that a thread ran and waited for a processor; zeros if it ended."""
         try:
             path = Path(f"/proc/{self.process.pid}/task/{thread}/schedstat")
             ran, waited, _ = map(int, path.read_text().split())
@@ -149,11 +142,7 @@ Serve = Callable[..., Served]
 
 
 class Servers:
-    """Starts `demandops serve` in one ROS domain.
-
-    With ``warm``, each command is a fork of a process that has imported its modules, so it starts
-    faster.
-    """
+    """Starts `demandops serve` in one ROS domain, with ``warm`` as forks, which start faster."""
 
     def __init__(
         self, folder: Path, domain: int, warm: WarmCommands | None = None, **environment: str
@@ -166,7 +155,6 @@ class Servers:
         return self.run(state_repo, "serve", "--state-repo", state_repo, *args)
 
     def run(self, state_repo: str, *words: str) -> Served:
-        """Start any command of ``demandops`` in the ROS domain."""
         log = self._folder / f"node-{len(self._started)}.log"
         environment = {
             **os.environ,
@@ -198,8 +186,6 @@ class Servers:
 
 @dataclass
 class Sent:
-    """A goal that was sent, and the server's answers so far."""
-
     at: float
     handle: Any = None
     accepted: bool | None = None
@@ -216,7 +202,6 @@ class Sent:
 
     @property
     def commit(self) -> str:
-        """The commit that the result names."""
         return self.message.splitlines()[0].split()[-1]
 
 
@@ -243,7 +228,6 @@ class Client:
         )
 
     def wait(self, condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
-        """Spin until a condition is true; fail the test after ``seconds``."""
         end = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < end, "the condition did not hold in time"
@@ -253,7 +237,6 @@ class Client:
         return bool(self._client.server_is_ready())
 
     def ready(self) -> None:
-        """Wait until the node and this client have discovered each other."""
         self.wait(self.reaches_a_node)
         asked: list[Any] = []
         ask_at = 0.0
@@ -298,7 +281,6 @@ class Client:
         sent.status = STATUS[answer.status]
 
     def cancel(self, sent: Sent) -> bool:
-        """Cancel a goal; return whether the server agreed."""
         future = sent.handle.cancel_goal_async()
         self.wait(future.done)
         return bool(future.result().goals_canceling)

@@ -12,13 +12,10 @@ import pytest
 
 
 class Screen:
-    """All text that was printed on a terminal."""
-
     def __init__(self) -> None:
         self._parts: list[bytes] = []
 
     def read(self, master: int) -> None:
-        """Read until the other end is closed; Linux then reports an I/O error."""
         while True:
             try:
                 part = os.read(master, 65536)
@@ -37,10 +34,7 @@ class Screen:
 def terminal(
     monkeypatch: pytest.MonkeyPatch, columns: int = 80, lines: int = 1000
 ) -> Iterator[Screen]:
-    """Make standard output a terminal for the length of a block; yield its screen.
-
-    The text of the screen is complete after the block.
-    """
+    """Make standard output a terminal for a block; the screen is complete after the block."""
     master, slave = os.openpty()
     screen = Screen()
     reading = threading.Thread(target=screen.read, args=(master,))
