@@ -49,16 +49,9 @@ _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
 
 _MISSED = "not reached"
 _TRIES = 8
-"""How often to repeat a fault that missed its call, because the number of a call varies.
-
-Before each repetition, the calls are counted again.
-"""
+"""How often to repeat a fault that missed its call, with calls counted anew; numbers vary."""
 _TRIES_ON_JOURNAL = 40
-"""How often to repeat a fault that missed its call on the journal.
-
-Either of the two threads in ``_OTHER_THREAD`` may journal a demand, so the repetitions alternate
-between the two. For such a fault, strace counts only calls on the journal (:func:`_counted`).
-"""
+"""The same for calls on the journal, which either of two threads may make, so tries alternate."""
 _OTHER_THREAD = {"demandops-journal": "demandops-writer", "demandops-writer": "demandops-journal"}
 _KNOWN: dict[Path, list[Site]] = {}
 """The system calls that booking :data:`DEMAND` makes in a rig; the key is the rig's folder."""
@@ -72,21 +65,18 @@ _WITHOUT_REASON = (
     "the server cannot read the branch",
     "check the path in the address",
 )
-"""Words of messages that do not say why a process of git failed, be it here or at the server.
+"""Words of messages that do not say why a process of git failed, here or at the server.
 
-If a server cannot read its references, it may offer no reference, so the generator says that the
-repo "has no branch". Or the server offers a branch whose id has only zeros. If a server cannot read
-its folder, it says that the folder is no repository.
+A server that cannot read its references or folder offers no branch, or calls it no repository.
 """
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
 """Messages about files that libgit2 could not read; they give no reason."""
 
 
 _UNNOTICED = ("git receive-pack", "getdents64", "state.git/objects/tmp_objdir-incoming-*/??")
-"""The system call by which ``git receive-pack`` lists a folder of objects that it received.
+"""If this listing of received objects fails, Git believes that it is complete.
 
-If the call fails, Git believes that the list is complete, and may lose an object. The generator
-cannot see the loss. docs/reliability.md describes the loss under "Known and open".
+It may lose an object, which the generator cannot see: docs/reliability.md, "Known and open".
 """
 
 
@@ -106,28 +96,22 @@ class Site:
     creates: bool = False
     which: int = 0
     place: int = 0
-    """How many calls of the same class (:attr:`call_class`) came before this one."""
+    """How many calls of the same class came before this one."""
 
     @property
     def call_class(self) -> tuple[str, str, str, bool]:
-        """What calls of one class share: role, kind, class of file, and whether they create it."""
         return self.role, self.kind, self.file, self.creates
 
     @property
     def is_threads(self) -> bool:
-        """Whether a thread of the generator makes the call, not a process of git."""
         return not self.which
 
     @property
     def changes(self) -> bool:
-        """Whether the call changes or syncs a file."""
         return self.kind in CHANGES or self.creates
 
     def faults(self) -> list[str]:
-        """Return the faults that can be injected at this call.
-
-        A kill ends the process before the call, so the disk is as the previous call left it.
-        """
+        """Return the faults to inject here; a kill leaves the disk as the previous call left it."""
         errors = ["EIO"]
         if self.kind in _BY_NAME:
             errors.append("EACCES")
@@ -140,8 +124,6 @@ class Site:
 
 @dataclass(frozen=True)
 class Job:
-    """One fault at one call, with or without a remote."""
-
     remote: bool
     site: Site
     fault: str
@@ -149,10 +131,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Result:
-    """The problems that a fault caused.
+    """The problems that a fault caused at a role's call on a class of file.
 
-    ``where`` has the thread or program, the call and the class of file. ``known`` has the problems
-    that docs/reliability.md lists as open. ``hangs``: a process did not end in time.
+    ``known`` has the problems that docs/reliability.md lists as open; ``hangs``: a process did
+    not end in time.
     """
 
     part: str
@@ -164,11 +146,7 @@ class Result:
 
 
 def sites(rig: Rig) -> list[Site]:
-    """Return the system calls that booking :data:`DEMAND` makes.
-
-    The demand is booked twice: strace traces the threads in one run, and git's processes in the
-    other.
-    """
+    """Return the calls that booking :data:`DEMAND` makes: first of threads, then of git."""
     options = ["-s", "64", "-e", EVERYTHING]
     rig.restore()
     ran = rig.must(rig.book(DEMAND, Strace(["-f", *options]), PLENTY_S))
@@ -186,11 +164,10 @@ def sites(rig: Rig) -> list[Site]:
 
 
 def _here(rig: Rig, site: Site) -> Site:
-    """Return a call with the number that :func:`sites` found for the call in this rig.
+    """Return a call with its number in this rig, because numbers differ between processes.
 
-    The number of a call differs between processes, because a process may read more or fewer files.
-    If the site's thread did not make the call, return a call of the same kind that another thread
-    made on the same class of file.
+    If the site's thread did not make the call, return a call of the same kind that another
+    thread made on the same class of file.
     """
     known = _KNOWN[rig.folder]
     same = [
@@ -213,10 +190,10 @@ def _is_of_journal(site: Site) -> bool:
 
 
 def _counted(rig: Rig, site: Site) -> tuple[int, list[str]]:
-    """Return the number of the call to inject at, and the options that limit what strace counts.
+    """Return the number of the call, and options that limit what strace counts.
 
-    For a thread's call on the journal, strace counts only calls on the journal, because the number
-    of other calls, such as calls that wake a thread, depends on timing.
+    On the journal it counts only the journal's calls, because the number of others depends on
+    timing.
     """
     if _is_of_journal(site):
         return site.place + 1, ["-P", str(next(rig.home.rglob("outbox.jsonl")))]
@@ -238,12 +215,8 @@ def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call.
 
-    With ``short``, choose the last call of each class, and these of its faults:
-
-    - For a call that changes or syncs a file: the faults that ``_SHORT`` lists.
-    - For a call that only reads: EIO without a remote, no fault with a remote.
-
-    For syncs without a remote, choose the first call of the class too.
+    With ``short``, choose the last call of each class (and the first, for syncs without a
+    remote) and the faults of ``_SHORT``, and for reads only EIO without a remote.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
@@ -268,7 +241,6 @@ def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
 
 
 def run(rig: Rig, job: Job) -> Result:
-    """Inject one fault; return the problems that it caused."""
     if rig.folder not in _KNOWN:
         sites(rig)
     site = _here(rig, job.site)
@@ -291,8 +263,8 @@ def run(rig: Rig, job: Job) -> Result:
 def _counted_anew(rig: Rig, wanted: Site, here: Site, *, only_here: bool) -> Site:
     """Book the demand without a fault; return the wanted call with its number in this run.
 
-    If ``only_here``, trace only the thread or process that makes the call, which is cheaper. If
-    the thread or process does not make the call this time, trace all threads and processes.
+    With ``only_here``, trace only its thread or process, which is cheaper, and all if it does
+    not make the call.
     """
     if only_here:
         before = sum(
@@ -315,7 +287,6 @@ def _at(site: Site) -> str:
 
 
 def _traces(site: Site) -> list[str]:
-    """Return strace's options to trace calls of the site's kind and calls that `parse` needs."""
     return ["-s64", "-e", f"trace={site.kind},chdir,execve,clone,clone3,fork,vfork"]
 
 

@@ -33,8 +33,6 @@ _RANDOM = (
 
 @dataclass(frozen=True)
 class Call:
-    """A system call; it is the ``n``-th call of its ``kind`` in a thread or process."""
-
     process: int
     role: str
     kind: str
@@ -45,12 +43,10 @@ class Call:
 
     @property
     def failed(self) -> bool:
-        """Whether the call returned an error, be it real or injected."""
         return self.result.startswith(("-1", "?"))
 
     @property
     def text(self) -> bytes:
-        """The bytes that the call wrote."""
         found = _TEXT.search(self.arguments)
         return _decoded(found[1]) if found else b""
 
@@ -66,8 +62,7 @@ def file_class(path: str, root: Path) -> str:
 def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> list[Call]:
     """Return the calls that touch a file below ``root``, in the order in which they ended.
 
-    ``roles`` has the names of threads and processes. Any other process is named after the program
-    that it executes. The first process starts in ``folder``.
+    ``roles`` names threads and processes; any other process is named after its program.
     """
     known, roles = set(roles), dict(roles)
     folders: dict[int, str] = {}
@@ -140,10 +135,9 @@ def _program(arguments: str, before: str) -> str:
 
 
 def _paths(kind: str, arguments: str, folder: str) -> list[str]:
-    """Return the paths of the files to which a call refers, by name or by an open file's number.
+    """Return the paths of a call's files, by name or by number.
 
-    A text in quotes may also be data that is read or written. Only the kind of the call shows
-    whether it is a name.
+    Only the kind of the call shows whether a text in quotes is a name or data.
     """
     if kind in _AT:
         named = [Path(_name(base), _name(name)) for base, name in _NAME_IN.findall(arguments)]

@@ -58,7 +58,6 @@ def _text(data: bytes) -> str:
 
 
 def _bytes(paths: Iterable[Path], most: int = 20) -> tuple[bytes, ...]:
-    """Return the distinct contents of the files, at most ``most`` of them."""
     return tuple(dict.fromkeys(path.read_bytes() for path in paths))[:most]
 
 
@@ -79,7 +78,6 @@ def names_its_faults(check: Callable[[Any], object]) -> Callable[[Any], object]:
 
 @cache
 def _folder() -> Path:
-    """Return a new folder, and make it the working directory of this process."""
     folder = Path(tempfile.mkdtemp(prefix="demandops-fuzz-"))
     os.chdir(folder)
     return folder
@@ -110,7 +108,6 @@ def goal_as_data(data: Any) -> None:
 
 
 def _goals() -> st.SearchStrategy[Any]:
-    """Return a strategy for any data, and for valid goals in which parts are replaced."""
     models = [rich.reference_goal(), rich.own_goal()]
     return st.one_of(ANYTHING, *(_near(model, ANYTHING | TEXT) for model in models))
 
@@ -128,7 +125,6 @@ def _near(value: Any, other: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
 
 
 def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
-    """Return a strategy for messages of a type with any content."""
     known = {"string": TEXT.filter(str.isprintable), "boolean": st.booleans()}
     known |= {"double": st.floats(), "uint8": st.integers(0, 255)}
     known |= {"uint32": st.integers(0, 2**32 - 1), "int32": st.integers(-(2**31), 2**31 - 1)}
@@ -395,10 +391,7 @@ _PLACES = (
 
 
 def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
-    """Return a strategy for what an API may report instead of ``value``.
-
-    In these values, parts are missing or null, and texts and numbers differ.
-    """
+    """Return a strategy for objects with parts missing or null, or with other texts and numbers"""
     if isinstance(value, dict):
         parts = {key: _reported(inner, is_top=False) for key, inner in value.items()}
         if not is_top:

@@ -33,12 +33,7 @@ _SAME = {str: "text", bool: "a truth", int: "a number", list: "a list", dict: "a
 
 
 class Mutation(NamedTuple):
-    """A copy of a document with one mistake.
-
-    ``place`` is where the mistake is, ``kind`` names the mistake, and ``value`` is the former value
-    at ``place``. For a misspelt field, ``new_place`` has the new name; otherwise it equals
-    ``place``.
-    """
+    """A copy of a document with one mistake, and the value before it; a misspelt field moves."""
 
     place: Place
     kind: str
@@ -51,10 +46,7 @@ class Mutation(NamedTuple):
         return any(_overlaps(field, path(place)) for place in (self.place, self.new_place))
 
     def names(self) -> set[str]:
-        """Return the keys on the path to the mistake, and all texts in the former value.
-
-        A fault at another place must quote one of these names.
-        """
+        """Return keys and texts of which a fault at another place must quote one."""
         names = {str(part) for part in self.place}
         values = [self.value]
         while values:
@@ -73,12 +65,7 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
 
 
 def _mutations(document: Any, limits: Iterable[int]) -> Iterator[Mutation]:
-    """Yield a mutation for each mistake at each place of a document.
-
-    ``limits`` are tried in place of whole numbers. To save time, a place gets only one value of a
-    wrong type, and a text gets only one control character; the next place gets the next type and
-    the next control character. With ``DEMANDOPS_EXAMPLES`` above 1, each place gets all of them.
-    """
+    """Yield mutations at each place; what is tried changes from place to place."""
     for turn, place in enumerate(places(document)):
         value = _at(document, place)
         wrong = {kind: new for kind, new in _WRONG_TYPES.items() if kind != _SAME.get(type(value))}
@@ -120,7 +107,6 @@ def _in_turn(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
 
 
 def places(document: Any, place: Place = ()) -> Iterator[Place]:
-    """Yield the place of every value in a document, at any depth."""
     entries: Any = ()
     if isinstance(document, dict):
         entries = document.items()
@@ -193,7 +179,6 @@ class Form:
         self._validator = jsonschema_rs.validator_for(schema)
 
     def forbids(self, document: Any) -> bool:
-        """Return whether the schema rejects a document."""
         return not self._validator.is_valid(document)
 
     def fields(self) -> set[str]:

@@ -16,10 +16,7 @@ from typing import Any, Literal
 Goal = dict[str, Any]
 Item = dict[str, Any]
 Demand = tuple[str, tuple[str, ...]]
-"""A demand: the request id and the sorted, distinct requesters of its joins.
-
-Each claim on a subject has a demand of its own.
-"""
+"""A request id, and the sorted, distinct requesters of its joins."""
 
 Subject = tuple[str, str]
 """A subject: its kind (``application`` or ``connection``) and its id."""
@@ -40,8 +37,6 @@ _BODY = "object_detection_fusion_app"
 
 @dataclass(frozen=True)
 class World:
-    """The part of the state repo's inventory that the bookkeeping needs."""
-
     nodes: frozenset[str]
     brokers: frozenset[str]
 
@@ -50,8 +45,7 @@ class World:
 class Result:
     """What became of a request.
 
-    ``not_held`` has each (id, topic, requester) that a shutdown lists although the requester does
-    not hold the topic. The topic is ``None`` if the shutdown lists no topics. ``touched`` has the
+    ``not_held`` has what a shutdown lists in vain, with None for no topic; ``touched`` has the
     claims that the request adds, changes or removes.
     """
 
@@ -62,7 +56,6 @@ class Result:
 
     @property
     def effective(self) -> bool:
-        """Whether the request must become a commit."""
         return self.outcome in ("booked", "released")
 
 
@@ -81,13 +74,10 @@ def requesters(item: Item) -> list[str]:
 
 
 def demand_of(goal: Goal, item: Item) -> Demand:
-    """Return the demand that an item belongs to; a demand has at most one claim on a subject."""
     return goal.get("id", ""), tuple(sorted(set(requesters(item))))
 
 
 class Books:
-    """The model: :meth:`take` handles a request, :meth:`view` returns who holds what."""
-
     def __init__(self, world: World) -> None:
         self.world = world
         self.claims: Claims = {}
@@ -97,8 +87,8 @@ class Books:
     def take(self, goal: Goal, pause: int = 1) -> Result:
         """Book or release a request as a whole, or refuse it as a whole.
 
-        ``pause`` is the number of seconds since the previous request. It is at least 1, so all
-        claims differ in age: a shutdown takes from the oldest claim first.
+        ``pause`` is at least a second, so claims differ in age: a shutdown takes from the
+        oldest first.
         """
         self.now += pause
         problem = next(self._inadmissible(goal), None)
@@ -175,11 +165,7 @@ class Books:
             yield "no broker"
 
     def _broker(self, item: Item) -> str:
-        """Return the node of an item's broker, or an empty text if the item names no broker.
-
-        If the inventory has only one broker, return its node. If it has several, return the first
-        node with a broker among these: the named node, the target, the source.
-        """
+        """Return the broker of an item; "" if it names none."""
         asked, brokers = item.get("broker_node_id", ""), self.world.brokers
         ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))
         found = [*brokers][:1] if len(brokers) == 1 else [n for n in (asked, *ends) if n in brokers]
@@ -216,12 +202,10 @@ class Books:
     # Leaving: a shutdown takes one hold of each named requester on each listed topic
 
     def _shut_down(self, goal: Goal, found: Claims) -> Result:
-        """Take the holds that a shutdown lists.
+        """Take the holds that a shutdown lists from the claims ``found`` before it, each once.
 
-        ``found`` has the claims before the shutdown. If a hold is listed twice, both entries choose
-        the same claim in ``found``, so the hold is taken once. The design leaves one case open: a
-        shutdown with several requesters and no topics. In this model, each requester then gives up
-        its holds on one claim, which may be another claim for each requester.
+        The design leaves open a shutdown with several requesters and no topics: here, each
+        gives up its holds on one claim, which may be another for each.
         """
         # a shutdown repeats another one if it lists the same, in any order and any number of times
         said = frozenset(_said(item) for item in _items(goal))
@@ -273,11 +257,7 @@ class Books:
     # The view
 
     def services(self) -> dict[tuple[str, str, str], dict[str, Any]]:
-        """Return who requests each service; the key is the service, its node, and what it is for.
-
-        A detection is for one point cloud (``<source> <topic>``), a fusion for one application. An
-        object list of a fusion has the name of the point cloud from which it is made.
-        """
+        """Return who requests each service: (service, node, point cloud or application)."""
         found: dict[tuple[str, str, str], dict[str, Any]] = {}
         for id_, claim in self._on("application"):
             node, who = claim["fixed"]["node"], requesters_of(claim)
@@ -295,7 +275,6 @@ class Books:
         return {key: _sorted(entry) for key, entry in found.items()}
 
     def connection_view(self) -> dict[str, dict[str, Any]]:
-        """Return who requests each connection, in the form of the bookkeeping's JSON."""
         found: dict[str, dict[str, Any]] = {}
         for id_, claim in self._on("connection"):
             ends = {end: claim["fixed"][end] for end in ("source", "target")}
@@ -313,11 +292,9 @@ class Books:
         return ((id_, claim) for ((of, id_), _), claim in _flat(self.claims).items() if of == kind)
 
     def view(self) -> dict[str, Any]:
-        """Return services and connections, in the form of :func:`in_model_words`."""
         return {"services": self.services(), "connections": self.connection_view()}
 
     def holds(self) -> dict[tuple[Subject, Demand], dict[Topic, set[str]]]:
-        """Return who holds each topic, for each claim."""
         return {key: claim["holds"] for key, claim in _flat(self.claims).items()}
 
 
@@ -326,7 +303,6 @@ def _flat(claims: Claims) -> dict[tuple[Subject, Demand], Claim]:
 
 
 def requesters_of(claim: Claim) -> set[str]:
-    """Return the requesters that hold anything in a claim."""
     return {one for who in claim["holds"].values() for one in who}
 
 
@@ -343,10 +319,7 @@ def _subject(item: Item) -> Subject:
 
 
 def _fixed(item: Item) -> dict[str, Any]:
-    """Return the fields that all claims on a subject share: the node or the ends, and the type.
-
-    A field that a shutdown leaves out is an empty text.
-    """
+    """Return the fields that all claims on a subject share; "" if a shutdown leaves one out."""
     if "header" in item:
         return {"node": item["header"].get("node_id", ""), "type": item.get("type", 0)}
     ends = {end: item.get(f"{end}_node_id", "") for end in ("source", "target")}
@@ -359,10 +332,6 @@ def _is_meant(claim: Claim, item: Item) -> bool:
 
 
 def _topics(item: Item) -> set[Topic]:
-    """Return the topics of an item.
-
-    A connection's source topic has only one target, so it is enough to name the topic.
-    """
     if "header" not in item:
         return {(source,) for source in _pairs(item)}
     return {(role, topic, of) for role, topics in _inputs(item).items() for of, topic in topics}
@@ -428,12 +397,7 @@ def _sorted(entry: dict[str, Any]) -> dict[str, Any]:
 def in_model_words(
     data: Mapping[str, Any], object_lists: Mapping[tuple[str, str], str]
 ) -> dict[str, Any]:
-    """Return the program's bookkeeping in the form of :meth:`Books.view`.
-
-    Args:
-        data: ``services`` and ``connections`` as ``demandops bookkeeping --output json`` prints.
-        object_lists: the result of :func:`object_lists` for the rendered releases.
-    """
+    """Return the program's bookkeeping as :meth:`Books.view` gives it."""
     services = {}
     for entry in data["services"].values():
         node = entry["node"]
@@ -464,10 +428,7 @@ def in_model_words(
 
 
 def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:
-    """Return a map from (node, topic of an object list) to the point cloud that it is made from.
-
-    ``manifests`` are the rendered releases.
-    """
+    """Map (node, topic of an object list) to the point cloud that releases make it from."""
     found: dict[tuple[str, str], str] = {}
     for text in manifests:
         published = re.search(r"objectListTopic: (\S+)", text)

@@ -32,7 +32,6 @@ VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
 PARTIES = (*VEHICLES, STATION)
 
 SKELETON = World(nodes=frozenset({*PARTIES, "edge", "cloud"}), brokers=frozenset({"edge", "cloud"}))
-"""The nodes and brokers in the inventory that ``demandops init`` writes."""
 
 REQUESTS = ("station00/collective-perception-intersection", "again", "")
 
@@ -77,25 +76,18 @@ CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
         {"/vehicles/vehicle01/ego_data": "/vehicles/vehicle01/ego_data"},
     ),
 }
-"""Source, target, broker and topics of each connection."""
 
 
 def ego(vehicle: str) -> Topic:
-    """Return the topic of a vehicle's usual ego data."""
     return f"/vehicles/{vehicle}/ego_data", vehicle
 
 
 def shutdown_of(joined: Goal) -> Goal:
-    """Return the shutdown that lists the same as a join."""
     return {**deepcopy(joined), "shutdown": True}
 
 
 class Maker:
-    """Makes random requests.
-
-    The requests of a ``calm`` maker never contradict each other, so all of them can be booked
-    together.
-    """
+    """Makes random requests; those of a ``calm`` maker never contradict each other."""
 
     def __init__(self, random: Random, *, calm: bool = False) -> None:
         self._random = random
@@ -104,11 +96,9 @@ class Maker:
         self.left: list[Goal] = []
 
     def sequence(self, length: int) -> list[Goal]:
-        """Return random requests, each made by :meth:`any`."""
         return [self.any() for _ in range(length)]
 
     def any(self) -> Goal:
-        """Return a join, a repeated join, a shutdown or a repeated shutdown."""
         if not self.joined or self._random.randrange(2) == 0:
             return self.join()
         if self._odds(6):
@@ -122,7 +112,6 @@ class Maker:
         return self.left[-1]
 
     def join(self, request: str | None = None, who: Sequence[str] | None = None) -> Goal:
-        """Return a join of one to four subjects, mostly with the same requesters for all."""
         random = self._random
         people = list(who) if who is not None else self._people()
         apps = [self._application(people) for _ in range(random.randrange(3))]
@@ -207,7 +196,6 @@ class Maker:
         return [first, STATION if first != STATION else self._pick(VEHICLES)]
 
     def _disturb(self, made: Goal) -> None:
-        """Sometimes make a part of the goal contradict other goals or make no sense."""
         for app in made["apps"]:
             self._disturb_application(app)
         for item in made["connections"]:
@@ -259,7 +247,6 @@ class Maker:
             item["type"] = self._pick([0, 2, 7])
 
     def _ask_others(self, made: Goal) -> None:
-        """Change the requesters of a goal: keep only the first one, replace all, or add some."""
         people = self._people()
         for kind in ("apps", "connections"):
             named = [one for item in made[kind] for one in requesters(item)]
@@ -320,5 +307,4 @@ class Maker:
 
 
 def summary(made: Goal) -> dict[str, Any]:
-    """Return a goal without empty lists and false values, for the output of a failed test."""
     return {key: value for key, value in made.items() if value not in ([], False)}

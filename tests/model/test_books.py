@@ -21,12 +21,7 @@ STEPS = (
     ("7-vehicle02-leaves", "S 3", "", "3"),
     ("8-vehicle03-leaves", "", "", ""),
 )
-"""One row for each step of the experiment.
-
-The first column names the step's file. The second has the requesters of the services that read the
-station's data, and the third the requesters of the services that read vehicle 0's data. The last
-has the further vehicles that have a connection.
-"""
+"""Each step, who reads the station's and vehicle 0's data, and who else has a connection."""
 
 
 def people(text: str) -> list[str]:

@@ -42,8 +42,6 @@ _APPDEFS = HERE.parent / "appdefs"
 
 
 class ExpectedFault(FrozenModel):
-    """An expected fault: its code, file and field, and words that its message contains."""
-
     code: str = "invalid"
     file: str = ""
     field: str = ""
@@ -63,10 +61,9 @@ _CHECKS = (
 class Step(FrozenModel):
     """An event of a scenario, and its expected effects; an effect that is None is not compared.
 
-    ``config`` changes the configuration from this step on, like a person's commit. ``after`` lets
-    time pass. ``clock`` moves only the wall clock, by a duration that may be negative. ``restart``
-    discards the generator's memory. ``expires`` lists the demands that the generator releases after
-    these changes, in order. In a step without ``expires``, the generator must release none.
+    ``config`` changes files as a person does, ``clock`` sets only the wall clock, ``restart``
+    discards the generator's memory, and ``expires`` lists the demands that it then releases, in
+    order.
     """
 
     why: str = ""
@@ -103,12 +100,10 @@ class Step(FrozenModel):
 
 
 class Scenario(FrozenModel):
-    """A whole scenario.
+    """A scenario.
 
-    ``config`` changes the files that ``demandops init`` writes. A mapping in ``config`` is merged
-    into the file's mapping, and any other value replaces the file's value. ``appdefs`` names
-    folders of ``tests/appdefs`` to add. ``invalid`` lists the faults that the configuration must
-    have.
+    ``config`` is merged into what ``demandops init`` writes, ``appdefs`` are of tests/appdefs,
+    and ``invalid`` lists the faults that the configuration must have.
     """
 
     must: str = Field(min_length=1)
@@ -125,7 +120,6 @@ class Scenario(FrozenModel):
 
 
 def read(text: str, file: str) -> Scenario:
-    """Parse a scenario; raise ``InvalidInput`` if it is not valid or checks nothing."""
     return parse_file(Scenario, text, file)
 
 
@@ -145,7 +139,6 @@ def _laid_over(below: Any, above: Any) -> Any:
 def configuration(
     appdefs: Iterable[str] = (), config: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
-    """Return the files of a configuration with these appdefs and changes, by path."""
     files = skeleton_config()
     overlays: list[tuple[str, Any]] = []
     for name in (*appdefs, "driver") if appdefs else ():
@@ -170,8 +163,6 @@ def configuration(
 
 
 class World(MemoryRepo):
-    """A state repo in memory, with the clock and the memory of one generator."""
-
     def __init__(self, state: State, config: Mapping[str, str]) -> None:
         super().__init__(state=state)
         self.clock = Clock(START)
@@ -180,7 +171,6 @@ class World(MemoryRepo):
         self.restart()
 
     def configure(self, state: State, config: Mapping[str, str]) -> None:
-        """Replace the configuration, and write the files that the generator derives from it."""
         before = self.state.ledger
         self.state = replace(state, ledger=self.state.ledger)
         moved = following_overrides(self.state)
@@ -194,12 +184,10 @@ class World(MemoryRepo):
         self.files = {**self._initial, **ledger, **rendered_files(self.state)}
 
     def restart(self) -> None:
-        """Discard the generator's memory: its lease clock and its rate limits."""
         self._lease_clock = LeaseExpiry(self.clock)
         self._throttle = RateLimit()
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
-        """Return the decision on a goal; the state repo stays unchanged."""
         self._sent += 1
         operation, now = f"hand-in-{self._sent}", now or self.clock.now()
         return decide(
@@ -211,11 +199,7 @@ class World(MemoryRepo):
         )
 
     def do_what_is_due(self) -> list[str]:
-        """Release the demands whose leases have ended; return their ids in order.
-
-        Then do what the generator also does by itself: remove replicas that it need not keep any
-        longer, move placed applications away from drained nodes, and try to book waiting demands.
-        """
+        """Do what the generator does by itself; return the demands whose leases ended, in order."""
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
         done = []
         for demand in dict.fromkeys(claim.demand for claim in claims):
@@ -232,13 +216,11 @@ class World(MemoryRepo):
         return done
 
     def book_waiting(self) -> None:
-        """Try to book each waiting demand, in the order of the queue."""
         for waiting in in_turn(self.state.ledger.waiting):
             taken = self.take(dict(waiting.goal))
             assert isinstance(taken, Decision), taken
 
     def waiting(self) -> list[str]:
-        """Return the ids of the waiting demands, in the order of the queue."""
         return [one.demand for one in in_turn(self.state.ledger.waiting)]
 
     def runs(self) -> dict[str, list[str]]:
@@ -249,7 +231,6 @@ class World(MemoryRepo):
         }
 
     def leases(self) -> dict[str, datetime]:
-        """Return, for each demand, the latest of its leases' recorded ends."""
         found: dict[str, datetime] = {}
         for claim in self.state.ledger:
             if claim.lease:
@@ -278,7 +259,6 @@ def _purpose(entry: Mapping[str, Any]) -> str:
 
 
 def run(scenario: Scenario) -> None:
-    """Run all steps; raise an AssertionError if a step has other effects than it expects."""
     files = configuration(scenario.appdefs, scenario.config)
     world = World(state_of(load(files)), files)
     for number, step in enumerate(scenario.steps, 1):
@@ -329,7 +309,6 @@ def _take(step: Step, world: World, place: str) -> None:
 
 
 def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
-    """Yield each difference between the decision on a demand and the step's expectation."""
     if isinstance(taken, Refused):
         told = "\n".join(f"{found.code}: {found}" for found in taken.faults)
         if step.refused is None:
@@ -356,7 +335,6 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
 
 
 def same_faults(wanted: Iterable[ExpectedFault], found: Iterable[Fault]) -> bool:
-    """Return whether the faults found are the expected ones, each once, in any order."""
     wanted, left = list(wanted), list(found)
     for fault in found:
         fitting = next((one for one in wanted if one.fits(fault)), None)

@@ -68,10 +68,6 @@ watcher: {nodeName: {{ (release | ros_name) ~ "_Watcher" }}}
 
 @lru_cache(maxsize=1)
 def template() -> Path:
-    """Return the state repo that every history copies.
-
-    It is in memory, has leases and approval, and its nodes may become full.
-    """
     path = repo.init(Path(mkdtemp(dir=MEMORY, prefix="simulation-")) / "template.git")
     files = GitRepo(path).files()
     policy, nodes, appdef = (plain_yaml.load(files[name]) for name in (POLICY, NODES, APPDEF))
@@ -142,7 +138,6 @@ class History:
         )
 
     def run(self, steps: int) -> None:
-        """Play ``steps`` random steps, then mend all faults and check the end."""
         things = (
             [self.demand] * 15 + [self.rush] * 2 + [self.wait] * 4 + [self.edit] * 3
             + [self.decide] * 2 + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
@@ -182,10 +177,7 @@ class History:
         self._send([self._goal() for _ in range(self.chance.choice([1, 1, 1, 2, 4]))])
 
     def rush(self) -> None:
-        """Send two demands at once, for which the generator chooses nodes.
-
-        If such a demand has a node already, send its release first.
-        """
+        """Send two demands without a node; first release one that has a node."""
         held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
         goals = [self._placed(), self._placed()]
         for claim in held[:1]:
@@ -228,10 +220,7 @@ class History:
         return made
 
     def _tallied(self) -> Goal:
-        """Return a put, release or renewal of an application of the type `tally`.
-
-        The application runs on the node that is in two access domains.
-        """
+        """Return a put, release or renewal of a tally on the node that is in two access domains."""
         topics = self.chance.sample(range(4), self.chance.randrange(1, 5))
         inputs = {"ego_data": [{"topic": f"/e{one}", "source": "vehicle00"} for one in topics]}
         known = [one for one in self._sent if one.get("demand", "").startswith("tally")]
@@ -257,7 +246,6 @@ class History:
         return made | ({"lease": lease} if lease else {})
 
     def _placed(self) -> Goal:
-        """Return a put, release or renewal of a demand whose node the generator chooses."""
         number = self.chance.randrange(4)
         who = [f"vehicle0{one}" for one in self.chance.choice([[0], [1], [0, 1]])]
         made = {"kind": "Demand", "demand": f"place{number}", "requesters": who}
@@ -356,7 +344,6 @@ class History:
         return GitRepo(Path(self.world.remote.path)).files(under)
 
     def _override(self) -> None:
-        """Add an override, which mostly ends by itself, change its end, or remove it."""
         name = self.chance.choice(sorted(_OVERRIDES))
         path = f"overrides/{name}.yaml"
         if path in self._files("overrides/") and self.chance.randrange(2):
@@ -376,7 +363,6 @@ class History:
         self._commit({NODES: plain_yaml.dump(data)})
 
     def _drain(self) -> None:
-        """Drain a node, mostly one in use, or end its draining."""
         self.oracle.check()
         data, books = plain_yaml.load(self._files(NODES)[NODES]), self.oracle.books
         used = sorted(PLACES - books.free() - books.drained) if self.chance.randrange(3) else []
@@ -387,7 +373,6 @@ class History:
         self.oracle.edits[commit] = lambda books: books.drain(name, drained)
 
     def _stop_waiting(self) -> None:
-        """Delete the file of a waiting demand."""
         self.oracle.check()
         if found := sorted(self._files("ledger/waiting").items()):
             path, text = self.chance.choice(found)
@@ -429,7 +414,6 @@ class History:
         return sorted(b for b in self.world.remote.branches.local if b.startswith("demand/"))
 
     def decide(self) -> None:
-        """Choose a proposal, merge it or not, and delete its branch."""
         if not (branches := self._branches()):
             return
         remote, branch = self.world.remote, self.chance.choice(branches)
@@ -453,7 +437,6 @@ class History:
 
 
 def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:
-    """Play the history of a seed; return the last commit, and how often each thing happened."""
     with TemporaryDirectory(dir=MEMORY, prefix="simulation-") as folder:
         world = World(seed, template(), Path(folder), machines=1 + seed % 3)
         history = History(world)
@@ -464,6 +447,5 @@ def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:
 
 
 def clean_up() -> None:
-    """Remove the state repo that :func:`template` made."""
     shutil.rmtree(template().parent)
     template.cache_clear()

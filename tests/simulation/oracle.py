@@ -38,10 +38,9 @@ VISITOR = "visitor"
 
 @dataclass(eq=False)
 class Asked:
-    """A demand that was sent to a machine.
+    """A demand that was sent to a machine when main had ``place`` commits.
 
-    ``time`` is when it was sent: by the monotonic clock for a demand in our own format, by the wall
-    clock for a goal of the reference. ``place`` is the number of commits on main before the demand.
+    ``time`` is monotonic for our own format, and by the wall clock for a goal of the reference.
     """
 
     goal: Goal
@@ -59,10 +58,7 @@ class Asked:
 
     @property
     def subjects(self) -> set[Subject]:
-        """The subjects of the demand, and the demand's name.
-
-        Demands that share one of these are booked in the order in which they were sent.
-        """
+        """Return its subjects; demands that share one are booked in the order of sending."""
         found = {("demand", self.goal["demand"])} if "demand" in self.goal else set()
         kinds = ("applications", "connections")
         return found | {(kind, each["id"]) for kind in kinds for each in self.goal.get(kind, ())}
@@ -77,16 +73,13 @@ class Oracle:
         self.edits: dict[str, Callable[[Running], object]] = {}
         """The change that a person's commit makes in the model, by the commit's id."""
         self.approved: set[str] = set()
-        """The branches of the proposals that a person has merged."""
         self.decided: set[str] = set()
-        """The branches of the proposals that a person has merged or turned down."""
         self.counts = Counter[str]()
         self._seen = world.tip
         self.books = Running(SLACK_S, nodes=PLACES)
         self._ended: set[Override] = set()
-        """The overrides of the last commit that have ended."""
         self._pushed_at = world.turns.monotonic()
-        """The time at which the oracle last found a new tip of main."""
+        """When the oracle last found a new tip of main."""
         self._models = [pickle.dumps(self.books)]
         """The pickled model after each commit of main; copying the model takes ten times longer."""
         self._place: dict[str, int] = {}
@@ -99,7 +92,6 @@ class Oracle:
         world.on_push = lambda: self._guard(self._follow_main)
 
     def ask(self, machine: Machine, goal: Goal) -> Asked:
-        """Send a demand to a machine and watch for its answer."""
         turns = self.world.turns
         turns.pass_(0.001)
         assert machine.generator is not None
@@ -113,13 +105,11 @@ class Oracle:
         return asked
 
     def check(self) -> None:
-        """Follow main; fail if anything since the last check contradicts the model."""
         self._guard(self._follow_main)
         if self.world.failure is not None:
             raise self.world.failure
 
     def claims(self, revision: str = MAIN) -> dict[str, Claim]:
-        """Return the claims of a commit, by the paths of their files."""
         commit = self.world.remote.revparse_single(revision).id
         tree = trees.commit_of(self.world.remote, commit).tree
         found = {}
@@ -193,7 +183,6 @@ class Oracle:
     def _compare_instances(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> None:
-        """Fail unless a commit has the instances of the model and keeps the same replicas."""
         entry, now = entry_of(commit), _made(commit) + timedelta(seconds=1)
         self.counts["scaled_down"] += entry.first("Operation") == "scale-down"
         for one in self.books.kept.keys() | records.keys():
@@ -224,7 +213,6 @@ class Oracle:
         self.books.overrides = frozenset(overrides) - self._ended
 
     def _compare_running(self, commit: pygit2.Commit) -> None:
-        """Fail unless a generator's commit runs the services and connections of the model."""
         services, links = _rendered(commit)
         expected = self.books.services()
         assert services == expected, f"after {commit.message}\n{services} run, not {expected}"
@@ -234,10 +222,7 @@ class Oracle:
     def _time_of_own_work(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> datetime:
-        """Return the time at which a generator acted without a demand.
-
-        A new record of kept replicas gives the exact time. Otherwise it is the time of the commit.
-        """
+        """Return when a generator acted by itself; new records of replicas tell it exactly."""
         known = {end for steps in self._records.values() for end in steps.values()}
         told = {end for steps in records.values() for end in steps.values()} - known
         made = _made(commit)
@@ -251,7 +236,6 @@ class Oracle:
         return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return priority, start of the wait, and requesters of each waiting demand in a commit."""
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
         found = [plain_yaml.load(text) for text in texts]
         return {
@@ -260,11 +244,7 @@ class Oracle:
         }
 
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
-        """Update the model with a generator's act that no demand asked for.
-
-        The generator ended leases, booked a waiting demand, or moved applications away from a
-        drained node.
-        """
+        """Follow what a generator did by itself: it ends leases, lets in and moves."""
         both = self._claims.keys() & claims.keys()
         moved = {one for one in both if _node(self._claims[one]) != _node(claims[one])}
         let_in = {demand for demand, _ in claims.keys() - both}
@@ -278,11 +258,7 @@ class Oracle:
         assert moved or gone or let_in, "a generator acted without a reason"
 
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, str]]:
-        """Return the ids of the operations of a commit and of all commits that it merges.
-
-        Each id comes with the branch of the proposal that contained the operation, or an empty
-        text. The lease of a proposed demand starts at the merge.
-        """
+        """Return the operations of a commit and of what it merges, each with its proposal."""
         commits = [commit]
         if len(commit.parents) > 1:
             remote, main = self.world.remote, commit.parents[0].id
@@ -321,10 +297,7 @@ class Oracle:
         )
 
     def _guard(self, check: Callable[[], object]) -> None:
-        """Run a check; keep its failure for the next :meth:`check`.
-
-        Generators and futures catch most errors, so a failure that is only raised would be lost.
-        """
+        """Keep a failure for :meth:`check`, because generators and futures catch errors."""
         try:
             check()
         except Exception as error:
@@ -401,10 +374,7 @@ class Oracle:
                 )
 
     def check_end(self) -> None:
-        """Fail unless all demands are answered, and all booked demands are in effect.
-
-        The check comes long after all faults were mended.
-        """
+        """All demands are answered, and what is booked is in effect, long after all faults."""
         self.check()
         tip = self.world.tip
         left = [op for op, one in self.asked.items() if not (one.is_answered or one.is_lost)]
@@ -438,7 +408,6 @@ def _made(commit: pygit2.Commit) -> datetime:
 
 
 def _kept_replicas(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
-    """Return the numbers of replicas that each instance keeps, each with the time of its end."""
     return dict(map(_record, trees.texts(commit.tree, [KEPT_REPLICAS]).values()))
 
 
@@ -466,10 +435,7 @@ def _overrides(commit: pygit2.Commit) -> tuple[list[Override], set[str]]:
 def _rendered(
     commit: pygit2.Commit,
 ) -> tuple[dict[Service, tuple[list[str], int]], dict[Link, dict[str, str]]]:
-    """Return the rendered services and connections, as the model names them.
-
-    A connection carries what its source client sends under a name that its target client reads.
-    """
+    """Return the rendered services and connections; both clients must name topics alike."""
     services: dict[Service, tuple[list[str], int]] = {}
     ends: dict[tuple[str, str], tuple[str, dict[str, str]]] = {}
     for path, blob in trees.blobs(commit.tree, ["clusters"]):
@@ -512,7 +478,6 @@ def _carried(text: str) -> dict[str, str]:
 
 
 def _rendered_instances(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:
-    """Yield namespace, version, topics and replicas of each rendered instance."""
     for path, blob in trees.blobs(commit.tree, ["clusters"]):
         if Path(path).name.startswith("ta-"):
             yield _rendered_instance(trees.text_of(blob))

@@ -27,7 +27,6 @@ RESULTS = Path("build/simulate.json")
 
 
 def main() -> int:
-    """Play at most ``HISTORIES`` histories while there is time; return 1 if one failed, else 0."""
     os.environ.update(NO_GIT_CONFIG)
     logging.disable(logging.CRITICAL)
     sync.force(False)
