@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from email.message import Message
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -27,7 +27,7 @@ class Call:
 @dataclass(frozen=True)
 class Answer:
     status: int = 200
-    body: bytes = b""
+    body: bytes | Iterable[bytes] = b""
     headers: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -80,9 +80,13 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
             self.send_response(given.status)
             for name, value in given.headers.items():
                 self.send_header(name, value)
-            self.send_header("Content-Length", str(len(given.body)))
+            whole = isinstance(given.body, bytes)
+            if whole:
+                self.send_header("Content-Length", str(len(given.body)))
             self.end_headers()
-            self.wfile.write(given.body)
+            with suppress(OSError):
+                for part in (given.body,) if whole else given.body:
+                    self.wfile.write(part)
 
         do_GET = do_POST = do_PUT = do_PATCH = do_DELETE = _serve
 
