@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -29,6 +30,13 @@ def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, 
     }
     files |= changed or {}
     return {path: text for path, text in files.items() if text is not None}
+
+
+@lru_cache
+def texts_below(folder: Path) -> dict[str, str]:
+    """Return the texts of all files in a folder, by their paths in it."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in files}
 
 
 def state_of(config: Config, ledger: Ledger | None = None) -> State:

@@ -24,6 +24,7 @@ from demandops.base import strict_yaml
 from demandops.decide.state import State, rendered_files
 
 from tests.kit import goals
+from tests.kit.config import texts_below
 from tests.kit.memory import MemoryRepo
 
 Files = Mapping[str, str]
@@ -59,9 +60,7 @@ def requests_of(case: str) -> list[Path]:
 
 def start(case: str) -> tuple[State, dict[str, str]]:
     """Return the state before the first request, and the files generated from it."""
-    overlay = GOLDEN / case / "state-repo"
-    files = {p.relative_to(overlay).as_posix(): p.read_text() for p in overlay.rglob("*.yaml")}
-    state = MemoryRepo(files).state
+    state = MemoryRepo(texts_below(GOLDEN / case / "state-repo")).state
     return state, rendered_files(state)
 
 

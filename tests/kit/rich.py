@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from pathlib import Path
 
 from demandops.model.config.appdef import ApplicationDefinition, ServiceDefinition
@@ -16,7 +15,7 @@ from demandops.model.demand.deployment_request_goal import WireGoal
 from pydantic import BaseModel
 
 from tests.kit import plain_yaml
-from tests.kit.config import configuration
+from tests.kit.config import configuration, texts_below
 from tests.kit.goals import CLOUD, EGO, Goal, application, connection, goal
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
@@ -38,15 +37,9 @@ GOAL_MODELS: tuple[type[BaseModel], ...] = (WireGoal, DemandGoal)
 _FOLDER = Path(__file__).parents[1] / "fixtures" / "rich"
 
 
-@lru_cache
-def _texts(folder: Path) -> dict[str, str]:
-    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
-    return {path.relative_to(folder).as_posix(): path.read_text() for path in files}
-
-
 def rich() -> dict[str, str]:
     """Return the files of a valid configuration with every field except ``proposals.api``."""
-    files = configuration(_texts(_FOLDER / "state-repo"))
+    files = configuration(texts_below(_FOLDER / "state-repo"))
     charts = "appdefs/object-detection-fusion/charts"
     chart = files[f"{charts}/object-detection/Chart.yaml"]
     files[f"{charts}/object-detection-next/Chart.yaml"] = chart.replace("0.1.0", "0.3.0", 1)
@@ -55,7 +48,7 @@ def rich() -> dict[str, str]:
 
 def rich_with_api() -> dict[str, str]:
     """Return the files of :func:`rich`, but for Argo CD and with ``proposals.api``."""
-    return rich() | {"demandops.yaml": _texts(_FOLDER)["proposals-by-api.yaml"]}
+    return rich() | {"demandops.yaml": texts_below(_FOLDER)["proposals-by-api.yaml"]}
 
 
 def reference_goal() -> Goal:
@@ -69,5 +62,5 @@ def reference_goal() -> Goal:
 
 def own_goal() -> Goal:
     """Return a valid demand in our own format with every field."""
-    made: Goal = plain_yaml.load(_texts(_FOLDER)["own-goal.yaml"])
+    made: Goal = plain_yaml.load(texts_below(_FOLDER)["own-goal.yaml"])
     return made

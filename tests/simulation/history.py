@@ -14,106 +14,37 @@ from demandops.repo.git.repository import MAIN
 from demandops.serve.timing.expiry import LONGEST_WAIT_S
 
 from tests.kit import plain_yaml, repo
+from tests.kit.config import texts_below
 from tests.kit.promises import Maker, name_of
-from tests.kit.repo import POLICY, GitRepo
-from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, MAY, NEXT, TALLY
+from tests.kit.repo import GitRepo
+from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
 from tests.model.leases import Goal
-from tests.model.running import CITY_QUOTA
 from tests.simulation.oracle import KEPT_REPLICAS, PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
 
 STEPS = 30
+STATE_REPO = Path(__file__).with_name("state-repo")
 MEMORY = "/dev/shm"
-NODES = "inventory/nodes.yaml"
+NODES = "inventory/nodes/places.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 VERSIONS = "registry/versions.yaml"
-_RULES = [
-    {"name": "visitors", "requesters": [f"{VISITOR}*"], "approval": "required"},
-    {"name": "residents", "requesters": ["vehicle*", "station*"]},
-]
 _OVERRIDES: dict[str, dict[str, object]] = {
     "more": {"select": [{"nodes": ["edge", "cloud"]}], "replicas": 2},
     "many": {"select": [{"nodes": ["edge"]}], "replicas": 3, "priority": 10},
     "closed": {"select": [{"connections": ["x"]}], "deny": True},
 }
 _LONGEST_LEASE_S = 90
-_TALLY = f"""apiVersion: demandops/v1
-kind: ApplicationDefinition
-name: {TALLY}
-description: Counts vehicles
-versions: separate
-inputs:
-  ego_data: {{description: State of a vehicle, type: perception_msgs/msg/EgoData}}
-services:
-  counter:
-    prefix: ta
-    description: Counts vehicles
-    inputs: {{ego_data: ego_data}}
-    chart: object-fusion
-    images: [object-fusion]
-    values: values/counter.yaml.j2
-    scaling: {{max: 3, per: {{topics: 1}}, downAfter: 120s}}
-"""
-_COUNTER = """replicas: {{ replicas }}
-image: {tag: {{ images["object-fusion"].tag }}}
-inputs: {egoData: {{ topics.ego_data }}, objectList: []}
-fusion:
-  nodeName: {{ release | ros_name }}
-  rawObjectListsTopic: /raw
-  fusedObjectListsTopic: /fused
-  fusedTrajectoriesTopic: /trajectories
-watcher: {nodeName: {{ (release | ros_name) ~ "_Watcher" }}}
-"""
 
 
 @lru_cache(maxsize=1)
 def template() -> Path:
     path = repo.init(Path(mkdtemp(dir=MEMORY, prefix="simulation-")) / "template.git")
-    files = GitRepo(path).files()
-    policy, nodes, appdef = (plain_yaml.load(files[name]) for name in (POLICY, NODES, APPDEF))
-    policy["domains"][0] |= {
-        "rules": _RULES,
-        "leases": {"slack": f"{SLACK_S}s"},
-        "whenFull": "wait",
-    }
-    nodes["nodes"] += [
-        {"id": id, "type": "rack", "cluster": "c-its", "capacity": {"slots": 1}}
-        for id in sorted(PLACES)
-    ]
+    files = texts_below(STATE_REPO)
+    appdef = plain_yaml.load(GitRepo(path).files(APPDEF)[APPDEF])
     appdef["services"]["object-fusion"]["requests"] = {"slots": 1}
-    city = sorted(name for name, nodes in MAY.items() if FURTHER in nodes)
-    policy["domains"].append(
-        {
-            "name": "city",
-            "namespace": "city",
-            "nodes": ["nothing-else"],
-            "ros": {"domainId": 42},
-            "rules": [{"name": "control", "requesters": city}],
-            "leases": {"slack": f"{SLACK_S}s"},
-            "quotas": {"claimsPerRequester": CITY_QUOTA},
-        }
-    )
-    further = [{"name": "city"}]
-    nodes["nodes"].append(
-        {"id": HALL, "type": "hall", "cluster": "c-its", "accessDomains": further}
-    )
-    changed = {POLICY: policy, NODES: nodes, APPDEF: appdef}
-    texts = {name: plain_yaml.dump(data) for name, data in changed.items()}
-    folder = f"appdefs/{TALLY}"
-    texts |= {f"{folder}/appdef.yaml": _TALLY, f"{folder}/values/counter.yaml.j2": _COUNTER}
-    GitRepo(path).commit(texts | {VERSIONS: _versions(NEXT)})
+    GitRepo(path).commit(files | {APPDEF: plain_yaml.dump(appdef)})
     repo.git(path, "repack", "-adq")
     return path
-
-
-def _versions(testing: str) -> str:
-    entry = {
-        "default": DEFAULT,
-        "channels": {"testing": testing},
-        "versions": {DEFAULT: {}, NEXT: {"images": {"object-fusion": {"tag": NEXT}}}},
-    }
-    head = {"apiVersion": "demandops/v1", "kind": "Versions"}
-    return plain_yaml.dump(head | {"applications": {TALLY: entry}})
 
 
 class History:
@@ -393,7 +324,9 @@ class History:
     def _move_channel(self) -> None:
         self.oracle.check()
         version = self.chance.choice([DEFAULT, NEXT])
-        commit = self._commit({VERSIONS: _versions(version)})
+        data = plain_yaml.load(self._files(VERSIONS)[VERSIONS])
+        data["applications"][TALLY]["channels"]["testing"] = version
+        commit = self._commit({VERSIONS: plain_yaml.dump(data)})
         self.oracle.edits[commit] = lambda books: setattr(books, "testing", version)
 
     def _delete_claim(self) -> None:
