@@ -149,7 +149,7 @@ class Books:
             yield "source and target topics do not pair"
         if connection.get("type", 0) not in _CONNECTION_TYPES:
             yield "no such type of connection"
-        if _two_targets(connection):
+        if len(dict(_pairs(connection))) < len(set(_pairs(connection))):
             yield "one source topic with two targets"
         if not joining:
             return
@@ -176,7 +176,7 @@ class Books:
     def _join(self, goal: Goal) -> None:
         for item in _items(goal):
             claims = self.claims.setdefault(_subject(item), {})
-            fixed, broker, routes = _fixed(item), self._broker(item), _pairs(item)
+            fixed, broker, routes = _fixed(item), self._broker(item), dict(_pairs(item))
             for other in claims.values():
                 if other["fixed"] != fixed:
                     raise _Refused("another node, type or end")
@@ -187,13 +187,8 @@ class Books:
                     raise _Refused("the source topic has another target")
             demand = demand_of(goal, item)
             was = claims.get(demand, {"broker": "", "routes": {}, "holds": {}, "booked": self.now})
-            claim = {
-                "fixed": fixed,
-                "broker": was["broker"] or broker,
-                "routes": was["routes"] | routes,
-                "holds": deepcopy(was["holds"]),
-                "booked": was["booked"],
-            }
+            claim = deepcopy(was) | {"fixed": fixed, "broker": was["broker"] or broker}
+            claim["routes"] |= routes
             for topic in _topics(item):
                 claim["holds"].setdefault(topic, set()).update(demand[1])
             # the design leaves this open; here, a join that changes a claim sets its booking time
@@ -216,19 +211,12 @@ class Books:
         for item in _items(goal):
             subject, demand = _subject(item), demand_of(goal, item)
             claims = {d: c for d, c in found.get(subject, {}).items() if _is_meant(c, item)}
-            first = sorted(
-                claims, key=lambda d: (d != demand, d[0] != demand[0], claims[d]["booked"])
-            )
+            ranked = [(d != demand, d[0] != demand[0], c["booked"], d) for d, c in claims.items()]
             for one in demand[1]:
-                theirs = [d for d in first if one in requesters_of(claims[d])]
-                asked: list[tuple[Topic | None, Demand | None]] = [
-                    (
-                        topic,
-                        next((d for d in theirs if one in claims[d]["holds"].get(topic, ())), None),
-                    )
-                    for topic in sorted(_topics(item))
-                ] or [(None, next(iter(theirs), None))]
-                for topic, giver in asked:
+                theirs = [d for *_, d in sorted(ranked) if one in requesters_of(claims[d])]
+                for topic in sorted(_topics(item)) or [None]:
+                    holding = (d for d in theirs if one in claims[d]["holds"].get(topic, ()))
+                    giver = next(holding if topic else iter(theirs), None)
                     if giver is None:
                         in_vain.append((subject[1], topic, one))
                     else:
@@ -259,34 +247,34 @@ class Books:
     def services(self) -> dict[tuple[str, str, str], dict[str, Any]]:
         """Return who requests each service: (service, node, point cloud or application)."""
         found: dict[tuple[str, str, str], dict[str, Any]] = {}
+
+        def read(key: tuple[str, str, str], app: str, role: str, topic: str, who: set[str]) -> None:
+            new: dict[str, Any] = {"applications": set(), "inputs": {}, "requesters": set()}
+            entry = found.setdefault(key, new)
+            entry["applications"].add(app)
+            entry["requesters"] |= who
+            entry["inputs"].setdefault(role, {}).setdefault(topic, set()).update(who)
+
         for id_, claim in self._on("application"):
-            node, who = claim["fixed"]["node"], requesters_of(claim)
-            fusion = found.setdefault(("object-fusion", node, id_), _service())
-            _add(fusion, id_, who)
-            for (role, topic, source), holders in claim["holds"].items():
+            node = claim["fixed"]["node"]
+            for (role, topic, source), who in claim["holds"].items():
                 if role == "ego_data":
-                    _hold(fusion["inputs"]["ego_data"], topic, holders)
+                    read(("object-fusion", node, id_), id_, role, topic, who)
                     continue
                 cloud = f"{source} {topic}"
-                _hold(fusion["inputs"]["object_list"], cloud, holders)
-                detection = found.setdefault(("object-detection", node, cloud), _service())
-                _add(detection, id_, holders)
-                _hold(detection["inputs"]["point_cloud"], topic, holders)
-        return {key: _sorted(entry) for key, entry in found.items()}
+                read(("object-fusion", node, id_), id_, "object_list", cloud, who)
+                read(("object-detection", node, cloud), id_, "point_cloud", topic, who)
+        return _sorted(found)
 
     def connection_view(self) -> dict[str, dict[str, Any]]:
         found: dict[str, dict[str, Any]] = {}
         for id_, claim in self._on("connection"):
             ends = {end: claim["fixed"][end] for end in ("source", "target")}
             entry = found.setdefault(id_, {**ends, "topics": {}, "requesters": set()})
-            for (topic,), holders in claim["holds"].items():
-                _hold(entry["topics"], topic, holders)
-            entry["requesters"] |= requesters_of(claim)
-        return {
-            id_: entry
-            | {"topics": _lists(entry["topics"]), "requesters": sorted(entry["requesters"])}
-            for id_, entry in found.items()
-        }
+            for (topic,), who in claim["holds"].items():
+                entry["topics"].setdefault(topic, set()).update(who)
+                entry["requesters"] |= who
+        return _sorted(found)
 
     def _on(self, kind: str) -> Iterator[tuple[str, Claim]]:
         return ((id_, claim) for ((of, id_), _), claim in _flat(self.claims).items() if of == kind)
@@ -333,7 +321,7 @@ def _is_meant(claim: Claim, item: Item) -> bool:
 
 def _topics(item: Item) -> set[Topic]:
     if "header" not in item:
-        return {(source,) for source in _pairs(item)}
+        return {(source,) for source, _ in _pairs(item)}
     return {(role, topic, of) for role, topics in _inputs(item).items() for of, topic in topics}
 
 
@@ -353,45 +341,17 @@ def _inputs(app: Item) -> dict[str, set[tuple[str, str]]]:
     }
 
 
-def _pairs(connection: Item) -> dict[str, str]:
-    return dict(_absolute_pairs(connection))
-
-
-def _two_targets(connection: Item) -> bool:
-    pairs = set(_absolute_pairs(connection))
-    return len({source for source, _ in pairs}) < len(pairs)
-
-
-def _absolute_pairs(connection: Item) -> list[tuple[str, str]]:
-    sources, targets = connection.get("source_topics", []), connection.get("target_topics", [])
+def _pairs(item: Item) -> list[tuple[str, str]]:
+    sources, targets = item.get("source_topics", []), item.get("target_topics", [])
     pairs = zip(sources, targets, strict=False)  # a request whose topics do not pair is refused
     return [(absolute(source), absolute(target)) for source, target in pairs]
 
 
-def _service() -> dict[str, Any]:
-    inputs: dict[str, dict[str, set[str]]] = {"ego_data": {}, "object_list": {}, "point_cloud": {}}
-    return {"applications": set(), "inputs": inputs, "requesters": set()}
-
-
-def _add(entry: dict[str, Any], application: str, who: Iterable[str]) -> None:
-    entry["applications"].add(application)
-    entry["requesters"].update(who)
-
-
-def _hold(topics: dict[str, set[str]], topic: str, who: Iterable[str]) -> None:
-    topics.setdefault(topic, set()).update(who)
-
-
-def _lists(topics: Mapping[str, set[str]]) -> dict[str, list[str]]:
-    return {topic: sorted(who) for topic, who in sorted(topics.items())}
-
-
-def _sorted(entry: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "applications": sorted(entry["applications"]),
-        "inputs": {role: _lists(topics) for role, topics in entry["inputs"].items() if topics},
-        "requesters": sorted(entry["requesters"]),
-    }
+def _sorted(value: Any) -> Any:
+    """Return plain data in which sets have become sorted lists."""
+    if isinstance(value, dict):
+        return {key: _sorted(inner) for key, inner in value.items()}
+    return sorted(value) if isinstance(value, set) else value
 
 
 def in_model_words(
@@ -415,10 +375,8 @@ def in_model_words(
                 object_lists.get((node, topic), f"published by nobody: {topic}"): who
                 for topic, who in inputs["object_list"].items()
             }
-        services[key] = {
-            "applications": entry["applications"],
-            "inputs": inputs,
-            "requesters": entry["requesters"],
+        services[key] = {name: entry[name] for name in ("applications", "requesters")} | {
+            "inputs": inputs
         }
     told = ("source", "target", "topics", "requesters")
     connections = {
