@@ -11,38 +11,10 @@ from pathlib import Path
 
 from tests.faults.invariants import DEMAND, after_fault, after_restart
 from tests.faults.rig import GIT, PLENTY_S, Ran, Rig, Strace
-from tests.faults.trace import Call, file_class, parse
+from tests.faults.trace import Call, calls_of, file_class, parse
 
 EVERYTHING = "trace=%file,%desc,%process"
-CANNOT_FAIL = {
-    "chdir",
-    "close",  # with an injected error, the file would stay open
-    "execve",
-    "fcntl",
-    "fstat",
-    "getcwd",
-    "ioctl",
-    "lseek",
-    "mmap",
-    "munmap",
-}
-"""Calls at which no fault is injected, because a disk's fault does not show in them."""
-CHANGES = {
-    "creat", "fallocate", "fchmod", "fdatasync", "fsync", "ftruncate", "link", "linkat", "mkdir",
-    "mkdirat", "chmod", "pwrite64", "rename", "renameat", "renameat2", "rmdir", "symlink", "sync",
-    "sync_file_range", "truncate", "unlink", "unlinkat", "write", "writev",
-}  # fmt: skip
-SYNCS = {"fsync", "fdatasync", "sync_file_range", "syncfs", "msync"}
-_BY_NAME = {
-    "access", "chmod", "creat", "link", "linkat", "lstat", "mkdir", "mkdirat", "newfstatat", "open",
-    "openat", "readlink", "rename", "renameat", "renameat2", "rmdir", "stat", "statx", "symlink",
-    "truncate", "unlink", "unlinkat",
-}  # fmt: skip
-_NEED_ROOM = {
-    "creat", "fallocate", "fdatasync", "fsync", "link", "linkat", "mkdir", "mkdirat", "pwrite64",
-    "rename", "renameat", "renameat2", "symlink", "write", "writev",
-}  # fmt: skip
-_INTERRUPTIBLE = {"flock", "fsync", "open", "openat", "pread64", "pwrite64", "read", "write"}
+SYNCS = calls_of("syncs")
 KILL = "SIGKILL"
 _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
 """The faults that a short run injects; the key says whether the state repo is remote."""
@@ -56,14 +28,8 @@ _OTHER_THREAD = {"demandops-journal": "demandops-writer", "demandops-writer": "d
 _KNOWN: dict[Path, list[Site]] = {}
 """The system calls that booking :data:`DEMAND` makes in a rig; the key is the rig's folder."""
 _WITHOUT_REASON = (
-    "failed to update ref",
-    "unpack",
-    "Killed",
-    "hung up",
-    "signal 9",
-    "has no branch",
-    "the server cannot read the branch",
-    "check the path in the address",
+    *("failed to update ref", "unpack", "Killed", "hung up", "signal 9", "has no branch"),
+    *("the server cannot read the branch", "check the path in the address"),
 )
 """Words of messages that do not say why a process of git failed, here or at the server.
 
@@ -71,8 +37,6 @@ A server that cannot read its references or folder offers no branch, or calls it
 """
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
 """Messages about files that libgit2 could not read; they give no reason."""
-
-
 _UNNOTICED = ("git receive-pack", "getdents64", "state.git/objects/tmp_objdir-incoming-*/??")
 """If this listing of received objects fails, Git believes that it is complete.
 
@@ -108,16 +72,16 @@ class Site:
 
     @property
     def changes(self) -> bool:
-        return self.kind in CHANGES or self.creates
+        return self.kind in calls_of("changes") or self.creates
 
     def faults(self) -> list[str]:
         """Return the faults to inject here; a kill leaves the disk as the previous call left it."""
         errors = ["EIO"]
-        if self.kind in _BY_NAME:
+        if self.kind in calls_of("by name"):
             errors.append("EACCES")
-        if self.kind in _NEED_ROOM or self.creates:
+        if self.kind in calls_of("needs room") or self.creates:
             errors.append("ENOSPC")
-        if self.kind in _INTERRUPTIBLE:
+        if self.kind in calls_of("interruptible"):
             errors.append("EINTR")
         return [*errors, KILL] if self.changes else errors
 
@@ -220,23 +184,24 @@ def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
-        if site.kind not in CANNOT_FAIL:
+        if site.kind not in calls_of("cannot fail"):
             classes.setdefault(site.call_class, []).append(site)
     made = []
     for group in classes.values():
-        chosen = group
-        if short and remote and not group[0].changes:
+        changes = group[0].changes
+        if short and remote and not changes:
             continue
+        chosen = group
         if short:
             is_sync = group[0].kind in SYNCS and not remote
             chosen = list(dict.fromkeys((group[0], group[-1]))) if is_sync else group[-1:]
-        for site in chosen:
-            faults = site.faults()
-            if short and not site.changes:
-                faults = ["EIO"]
-            elif short:
-                faults = [each for each in faults if each in _SHORT[remote]]
-            made += [Job(remote, site, fault) for fault in faults]
+        tried = _SHORT[remote] if changes else ("EIO",)
+        made += [
+            Job(remote, site, fault)
+            for site in chosen
+            for fault in site.faults()
+            if not short or fault in tried
+        ]
     return made
 
 

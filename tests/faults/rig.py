@@ -57,27 +57,6 @@ _CHANCE = re.compile(
 GIT = "git"
 """The value of ``Strace.at`` for all processes of git; each process gets a strace of its own."""
 
-_GIT = """#!/bin/sh
-# Runs one of git's programs, under strace if it is the process that is asked for.
-program=${0##*/}
-command=${program#git-}
-if [ "$program" = git ]; then
-  for command in "$@"; do case $command in -*) ;; *) break ;; esac; done
-fi
-if [ -n "$FAULTS_AT" ]; then
-  number=1
-  set -C  # so that > fails if the file exists; mkdir would do, but it would be a process
-  until true 2>/dev/null >"$FAULTS_TRACES/$command $number"; do number=$((number + 1)); done
-  case "$FAULTS_AT" in git | "git $command $number")
-    trace="$FAULTS_TRACES/$command $number"
-    pwd -P >"$trace.folder"
-    exec strace -y -o "$trace.calls" $FAULTS_STRACE "$FAULTS_EXEC/$program" "$@"
-    ;;
-  esac
-fi
-exec "$FAULTS_EXEC/$program" "$@"
-"""
-
 
 @dataclass(frozen=True)
 class Strace:
@@ -147,7 +126,7 @@ class Rig:
     def _wrap_git(self) -> None:
         """Replace git's programs, even those that git starts, by a script that can trace them."""
         wrapper, self._git = self.scratch / "wrapper", self.scratch / "git-core"
-        wrapper.write_text(_GIT)
+        wrapper.write_bytes(Path(__file__).with_name("git.sh").read_bytes())
         wrapper.chmod(0o755)
         self._git.mkdir()
         for program in _git_core().glob("git*"):

@@ -181,32 +181,25 @@ class Promises:
 
     def _take(self, names: list[str], one: str, subject: Subject, topics: frozenset[str]) -> bool:
         theirs = [
-            (name, self.held[name][subject])
+            (name, held)
             for name in names
-            if one in self.held.get(name, {}).get(subject, Held({}, frozenset())).requesters
+            if (held := self.held.get(name, {}).get(subject)) and one in held.requesters
         ]
-        givers = [
-            next(
-                (
-                    (name, held, topic)
-                    for name, held in theirs
-                    if one in held.holders.get(topic, ())
-                ),
-                None,
-            )
-            for topic in topics
-        ]
-        if theirs and not topics:
-            name, held = theirs[0]
-            givers = [(name, held, topic) for topic in held.holders]
-        for name, held, topic in filter(None, givers):
+        listed = topics or frozenset(*[held.holders for _, held in theirs[:1]])
+        has_taken = False
+        for topic in listed:
+            holding = ((n, held) for n, held in theirs if one in held.holders.get(topic, ()))
+            name, held = next(holding if topics else iter(theirs), ("", Held({}, frozenset())))
+            if not name:
+                continue
+            has_taken = True
             held.holders[topic] -= {one}
             if not held.holders[topic]:
                 del held.holders[topic], held.what["topics"][topic]
             held.requesters = frozenset().union(*held.holders.values())
             if not held.holders:
                 self._drop(name, subject)
-        return any(givers)
+        return has_taken
 
     def _drop(self, demand: str, subject: Subject) -> None:
         del self.held[demand][subject]
@@ -217,19 +210,16 @@ class Promises:
 
     def may_go(self, now: int) -> set[tuple[str, Subject]]:
         """Return the holds whose leases are over at ``now``; the generator may release them."""
-        return self._over(now)
-
-    def must_go(self, now: int) -> set[tuple[str, Subject]]:
-        """Return the holds that a check must release at ``now``, because their slack is over."""
-        return self._over(now - self.slack)
-
-    def _over(self, now: int) -> set[tuple[str, Subject]]:
         return {
             (demand, subject)
             for demand, subjects in self.held.items()
             for subject, held in subjects.items()
             if held.promised is not None and held.promised < now
         }
+
+    def must_go(self, now: int) -> set[tuple[str, Subject]]:
+        """Return the holds that a check must release at ``now``, because their slack is over."""
+        return self.may_go(now - self.slack)
 
     def gone(self, released: Iterable[tuple[str, Subject]]) -> None:
         for demand, subject in released:

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from collections.abc import Callable
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
+from typing import Any
 
 import pygit2
 from demandops.repo.git.repository import MAIN
@@ -19,6 +21,7 @@ from tests.kit.promises import Maker, name_of
 from tests.kit.repo import GitRepo
 from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
 from tests.model.leases import Goal
+from tests.model.running import Running
 from tests.simulation.oracle import KEPT_REPLICAS, PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
 
@@ -112,8 +115,7 @@ class History:
         held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
         goals = [self._placed(), self._placed()]
         for claim in held[:1]:
-            names = {"demand": claim.demand, "requesters": [*claim.requesters]}
-            goals.insert(0, {"kind": "Demand", "operation": "release", **names})
+            goals.insert(0, _named(claim.demand, [*claim.requesters]) | {"operation": "release"})
         self._send(goals)
 
     def _send(self, goals: list[Goal]) -> None:
@@ -161,57 +163,37 @@ class History:
             return puts[-1] | {"applications": [app | {"inputs": inputs}]}
         names = ["traffic", "vehicle01", "vehicle01", "vehicle01", "vehicle00"]
         who = sorted({self.chance.choice(names), self.chance.choice(names)})
-        made = {"kind": "Demand", "demand": f"tally{self.chance.randrange(2)}", "requesters": who}
+        made = _named(f"tally{self.chance.randrange(2)}", who)
         if puts and not self.chance.randrange(3):
             return made | {"operation": self.chance.choice(["release", "renew"])}
-        app = {
-            "id": self.chance.choice(["hall0", "hall0", "hall0", "hall1", f"hall0@{NEXT}"]),
-            "type": TALLY,
-            "node": self.chance.choice([HALL, FIRST, FURTHER, FURTHER]),
-            "version": self.chance.choice(["", "", DEFAULT, NEXT, "testing"]),
-            "connect": "none",
-            "inputs": inputs,
-        }
-        made |= {"operation": "put", "applications": [app], "connections": []}
-        lease = self.chance.choice([None, None, None, 90])
-        return made | ({"lease": lease} if lease else {})
+        app = _fusion(
+            self.chance.choice(["hall0", "hall0", "hall0", "hall1", f"hall0@{NEXT}"]),
+            type=TALLY,
+            node=self.chance.choice([HALL, FIRST, FURTHER, FURTHER]),
+            version=self.chance.choice(["", "", DEFAULT, NEXT, "testing"]),
+            inputs=inputs,
+        )
+        return made | _put(app, self.chance.choice([None, None, None, 90]))
 
     def _placed(self) -> Goal:
         number = self.chance.randrange(4)
         who = [f"vehicle0{one}" for one in self.chance.choice([[0], [1], [0, 1]])]
-        made = {"kind": "Demand", "demand": f"place{number}", "requesters": who}
+        made = _named(f"place{number}", who)
         if not self.chance.randrange(3):
             return made | {"operation": self.chance.choice(["release", "release", "renew"])}
-        app = {
-            "id": f"place{number}",
-            "type": "object-detection-fusion",
-            "place": {"role": "rack"},
-            "connect": "none",
-            "inputs": {"ego_data": [{"topic": "/ego1", "source": "vehicle00"}]},
-        }
-        made |= {"operation": "put", "applications": [app], "connections": []}
         made["priority"] = self.chance.choice([0, 0, 5])
-        lease = self.chance.choice([None, 10, 60, 90])
-        return made | ({"lease": lease} if lease else {})
+        app = _fusion(f"place{number}", place={"role": "rack"})
+        return made | _put(app, self.chance.choice([None, 10, 60, 90]))
 
     def _visitor(self) -> Goal:
         number = self.chance.randrange(3)
         made = self._maker.put()
-        made |= {"demand": f"visit{number}", "requesters": [f"{VISITOR}{number}"]}
+        named = _named(f"visit{number}", [f"{VISITOR}{number}"])
         if not self.chance.randrange(4):
-            named = {key: made[key] for key in ("kind", "demand", "requesters")}
             return named | {"operation": self.chance.choice(["release", "renew"])}
         topics = [{"topic": f"/ego{self.chance.randrange(3)}", "source": "vehicle00"}]
-        made["applications"] = [
-            {
-                "id": f"visit{number}",
-                "type": "object-detection-fusion",
-                "node": "edge",
-                "connect": "none",
-                "inputs": {"ego_data": topics},
-            }
-        ]
-        return made | {"connections": []}
+        app = _fusion(f"visit{number}", node="edge", inputs={"ego_data": topics})
+        return made | named | {"applications": [app], "connections": []}
 
     def wait(self) -> None:
         self.turns.sleep(self.chance.choice([0.1, 1, 10, 31, 61, 100, 200, 1000]))
@@ -254,18 +236,9 @@ class History:
     # ---- people ----
 
     def edit(self) -> None:
-        edits = (
-            self._override,
-            self._override,
-            self._inventory,
-            self._drain,
-            self._stop_waiting,
-            self._come_down,
-            self._move_channel,
-            self._delete_claim,
-            self._delete_claim,
-        )
-        self.chance.choice((*edits, self._edit_generated, *[self._edited_often] * 4))()
+        edits = [self._override] * 2 + [self._inventory, self._drain, self._stop_waiting]
+        edits += [self._come_down, self._move_channel] + [self._delete_claim] * 2
+        self.chance.choice([*edits, self._edit_generated, *[self._edited_often] * 4])()
 
     def _commit(self, changed: dict[str, str | None]) -> str:
         who = ("Petra Platform", "petra@example.org", int(self.turns.now().timestamp()))
@@ -287,46 +260,55 @@ class History:
             file["expires"] = end.isoformat().replace("+00:00", "Z")
         self._commit({path: plain_yaml.dump(file)})
 
+    def _changed(self, path: str, change: Callable[[Any], object]) -> str:
+        """Commit a change of a file's data; return the commit's id."""
+        data = plain_yaml.load(self._files(path)[path])
+        change(data)
+        return self._commit({path: plain_yaml.dump(data)})
+
     def _inventory(self) -> None:
-        data = plain_yaml.load(self._files(NODES)[NODES])
-        added = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
-        data["nodes"].append(added)
-        self._commit({NODES: plain_yaml.dump(data)})
+        def add(data: Any) -> None:
+            car = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
+            data["nodes"].append(car)
+
+        self._changed(NODES, add)
 
     def _drain(self) -> None:
         self.oracle.check()
-        data, books = plain_yaml.load(self._files(NODES)[NODES]), self.oracle.books
+        books = self.oracle.books
         used = sorted(PLACES - books.free() - books.drained) if self.chance.randrange(3) else []
         name = self.chance.choice(used or sorted(PLACES))
-        (node,) = (one for one in data["nodes"] if one["id"] == name)
-        drained = node["drained"] = not node.get("drained", False)
-        commit = self._commit({NODES: plain_yaml.dump(data)})
+        drained = name not in books.drained
+
+        def drain(data: Any) -> None:
+            (node,) = (one for one in data["nodes"] if one["id"] == name)
+            node["drained"] = drained
+
+        commit = self._changed(NODES, drain)
         self.oracle.edits[commit] = lambda books: books.drain(name, drained)
 
-    def _stop_waiting(self) -> None:
+    def _delete_record(self, under: str, follow: Callable[[Running, Any], object]) -> None:
         self.oracle.check()
-        if found := sorted(self._files("ledger/waiting").items()):
+        if found := sorted(self._files(under).items()):
             path, text = self.chance.choice(found)
-            demand = plain_yaml.load(text)["demand"]
-            commit = self._commit({path: None})
-            self.oracle.edits[commit] = lambda books: books.waiting.pop(demand)
+            record = plain_yaml.load(text)
+            self.oracle.edits[self._commit({path: None})] = lambda books: follow(books, record)
+
+    def _stop_waiting(self) -> None:
+        self._delete_record("ledger/waiting", lambda books, one: books.waiting.pop(one["demand"]))
 
     def _come_down(self) -> None:
         """Let a service scale down at once: delete the record of the replicas that it keeps."""
-        self.oracle.check()
-        if found := sorted(self._files(KEPT_REPLICAS).items()):
-            path, text = self.chance.choice(found)
-            record = plain_yaml.load(text)
-            instance = record["application"], record["node"]
-            commit = self._commit({path: None})
-            self.oracle.edits[commit] = lambda books: books.kept.pop(instance)
+        self._delete_record(
+            KEPT_REPLICAS, lambda books, one: books.kept.pop((one["application"], one["node"]))
+        )
 
     def _move_channel(self) -> None:
         self.oracle.check()
         version = self.chance.choice([DEFAULT, NEXT])
-        data = plain_yaml.load(self._files(VERSIONS)[VERSIONS])
-        data["applications"][TALLY]["channels"]["testing"] = version
-        commit = self._commit({VERSIONS: plain_yaml.dump(data)})
+        commit = self._changed(
+            VERSIONS, lambda data: data["applications"][TALLY]["channels"].update(testing=version)
+        )
         self.oracle.edits[commit] = lambda books: setattr(books, "testing", version)
 
     def _delete_claim(self) -> None:
@@ -367,6 +349,21 @@ class History:
                     remote.create_commit(MAIN, by, by, "Merge\n", tree, [ours, theirs])
             self.oracle.check()
         remote.branches.delete(branch)
+
+
+def _named(demand: str, who: list[str]) -> Goal:
+    return {"kind": "Demand", "demand": demand, "requesters": who}
+
+
+def _fusion(id: str, **more: Any) -> dict[str, Any]:
+    inputs = {"ego_data": [{"topic": "/ego1", "source": "vehicle00"}]}
+    app = {"id": id, "type": "object-detection-fusion", "connect": "none", "inputs": inputs}
+    return app | more
+
+
+def _put(app: dict[str, Any], lease: int | None) -> Goal:
+    made = {"operation": "put", "applications": [app], "connections": []}
+    return made | ({"lease": lease} if lease else {})
 
 
 def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:

@@ -169,18 +169,18 @@ class Oracle:
             renews = any(one.lease for one in self.claims(str(commit.id)).values())
             assert outcome != "unchanged" or renews, f"{operation} is booked, but changes nothing"
             self.counts["waited"] += outcome == "waiting"
-        expected = self.books.claims()
-        assert claims == expected, f"after {commit.message}\n{claims}\nbut expected\n{expected}"
-        told, waiting = self.books.waiting_files(), self._waiting_on(commit)
-        assert waiting == told, f"{waiting} wait, but expected {told}"
-        self._compare_instances(commit, records)
+        _assert_same(commit, claims, self.books.claims())
+        _assert_same(commit, self._waiting_on(commit), self.books.waiting_files())
+        self._compare_replicas(commit, records)
         if entry_of(commit).by_generator:
-            self._compare_running(commit)
+            services, links = _rendered(commit)
+            _assert_same(commit, services, self.books.services())
+            _assert_same(commit, links, self.books.links())
         self.books.chosen = {}
         self._claims, self._records = claims, records
         self._models.append(pickle.dumps(self.books))
 
-    def _compare_instances(
+    def _compare_replicas(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> None:
         entry, now = entry_of(commit), _made(commit) + timedelta(seconds=1)
@@ -188,18 +188,16 @@ class Oracle:
         for one in self.books.kept.keys() | records.keys():
             self.books.come_down(one, records.get(one, {}), now)
         if entry.by_generator:
-            running = self.books.demanded()
-            expected = sorted(
+            expected = [
                 (
                     "city" if one[1] == FURTHER else "perception",
                     one[0].partition("@")[2],
                     sorted(topic for _, topic in topics),
                     self.books.replicas(one),
                 )
-                for one, topics in running.items()
-            )
-            found = sorted(_rendered_instances(commit))
-            assert found == expected, f"after {commit.message}\n{found} run, not {expected}"
+                for one, topics in self.books.demanded().items()
+            ]
+            _assert_same(commit, sorted(_rendered_instances(commit)), sorted(expected))
 
     def _follow_overrides(self, commit: pygit2.Commit) -> None:
         """Update the model with the overrides of a commit; fail if one ended before its time."""
@@ -211,13 +209,6 @@ class Oracle:
             assert not is_new or (override.end and override.end <= latest), early
         self._ended = {one for one in overrides if one.name in ended}
         self.books.overrides = frozenset(overrides) - self._ended
-
-    def _compare_running(self, commit: pygit2.Commit) -> None:
-        services, links = _rendered(commit)
-        expected = self.books.services()
-        assert services == expected, f"after {commit.message}\n{services} run, not {expected}"
-        routes = self.books.links()
-        assert links == routes, f"after {commit.message}\n{links} are carried, not {routes}"
 
     def _time_of_own_work(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
@@ -237,10 +228,9 @@ class Oracle:
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
-        found = [plain_yaml.load(text) for text in texts]
         return {
             one["demand"]: (one["priority"], str(one["since"]), frozenset(one["requesters"]))
-            for one in found
+            for one in map(plain_yaml.load, texts)
         }
 
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
@@ -401,6 +391,10 @@ class Oracle:
         assert not late, f"did not end: {late}"
         (verdict,) = verification.verify(self.world.remote, [tip])
         assert verdict.holds, verdict
+
+
+def _assert_same(commit: pygit2.Commit, found: object, expected: object) -> None:
+    assert found == expected, f"after {commit.message}\n{found}\nbut expected\n{expected}"
 
 
 def _made(commit: pygit2.Commit) -> datetime:

@@ -65,18 +65,7 @@ def main() -> int:
 
 
 def as_line(counts: Counter[str]) -> str:
-    names = (
-        "histories",
-        "demands",
-        "commits",
-        "faults",
-        "waited",
-        "let_in",
-        "moved",
-        "scaled_down",
-        "failures",
-    )
-    return ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in names)
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
 
 
 if __name__ == "__main__":
