@@ -30,7 +30,7 @@ from pydantic import Field, model_validator
 from tests.kit import plain_yaml
 from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
-from tests.kit.config import skeleton, state_of
+from tests.kit.config import skeleton, state_of, texts_below
 from tests.kit.memory import NOW as START
 from tests.kit.memory import MemoryRepo, is_of_ledger, ledger_in
 
@@ -140,20 +140,12 @@ def configuration(
     appdefs: Iterable[str] = (), config: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
     files = skeleton_config()
-    overlays: list[tuple[str, Any]] = []
+    overlays = dict[str, Any]()
     for name in (*appdefs, "driver") if appdefs else ():
-        for path in sorted((_APPDEFS / name).rglob("*")):
-            if path.is_file():
-                files[f"appdefs/{path.relative_to(_APPDEFS).as_posix()}"] = path.read_text()
-        chart = {"folder": "appdefs/recorder/charts/recorder", "version": "0.1.0"}
-        overlays += [
-            ("registry/charts.yaml", {"charts": {"recorder": chart}}),
-            ("registry/images.yaml", {"images": {
-                image: {"repository": f"ghcr.io/example/{image}", "tag": "v1"}
-                for image in ("driver", "recorder")
-            }}),
-        ]  # fmt: skip
-    for path, above in (*overlays, *(config or {}).items()):
+        for path, text in texts_below(_APPDEFS / name).items():
+            files[f"appdefs/{name}/{path}"] = text
+        overlays = plain_yaml.load((_APPDEFS / "registry.yaml").read_text())
+    for path, above in (*overlays.items(), *(config or {}).items()):
         below = plain_yaml.load(files[path]) if path in files else {}
         files[path] = yaml.safe_dump(_laid_over(below, above), sort_keys=False)
     return files
@@ -201,13 +193,11 @@ class World(MemoryRepo):
     def do_what_is_due(self) -> list[str]:
         """Do what the generator does by itself; return the demands whose leases ended, in order."""
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
-        done = []
-        for demand in dict.fromkeys(claim.demand for claim in claims):
-            request = Expire(id=demand, demand=demand)
-            taken = self.take(request)
+        done = list(dict.fromkeys(claim.demand for claim in claims))
+        for demand in done:
+            taken = self.take(Expire(id=demand, demand=demand))
             assert isinstance(taken, Decision)
             assert taken.files, f"nothing of '{demand}' was released at {now}"
-            done.append(demand)
         self.scale_down(now)
         for node in self.config.drained_nodes:
             if self.state.ledger.applications_on.get(node):
@@ -230,14 +220,15 @@ class World(MemoryRepo):
             for entry in self.books()["services"].values()
         }
 
+    def connections(self, what: str) -> dict[str, list[str]]:
+        return {id: [*entry[what]] for id, entry in self.books()["connections"].items()}
+
     def leases(self) -> dict[str, datetime]:
-        found: dict[str, datetime] = {}
-        for claim in self.state.ledger:
-            if claim.lease:
-                found[claim.demand] = max(
-                    claim.lease.until, found.get(claim.demand, claim.lease.until)
-                )
-        return found
+        """Return, for each demand, the latest of its leases' recorded ends."""
+        leased = sorted(
+            (claim.lease.until, claim.demand) for claim in self.state.ledger if claim.lease
+        )
+        return {demand: until for until, demand in leased}
 
     def assert_sound(self) -> None:
         """Check that the files are exactly those of the ledger and of the ledger's releases."""
@@ -291,18 +282,15 @@ def _take(step: Step, world: World, place: str) -> None:
     compared = {
         "runs": world.runs,
         "waiting": world.waiting,
-        "connections": lambda: _of_connections(world, "requesters"),
-        "carries": lambda: _of_connections(world, "topics"),
+        "connections": lambda: world.connections("requesters"),
+        "carries": lambda: world.connections("topics"),
         "leases": lambda: {d: _since_start(end) for d, end in sorted(world.leases().items())},
     }
     for name, found in compared.items():
         wanted = getattr(step, name)
-        if wanted is not None:
-            assert found() == wanted, f"{place}: {name}"
+        assert wanted is None or found() == wanted, f"{place}: {name}"
     for name, words in (step.holds or {}).items():
-        texts = [
-            t for path, t in world.rendered().items() if path.rsplit("/", 1)[1].startswith(name)
-        ]
+        texts = [t for path, t in world.rendered().items() if Path(path).name.startswith(name)]
         assert len(texts) == 1, f"{place}: {len(texts)} releases are called {name}…"
         missing = [word for word in words if word not in texts[0]]
         assert not missing, f"{place}: {name} holds no {missing}:\n{texts[0]}"
@@ -327,33 +315,26 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
     if step.desired is not None and desired != sorted(step.desired):
         yield f"the desired state changes in another way: {desired}"
     if step.warns is not None:
-        fitting = len(taken.warnings) == len(step.warns) and all(
-            words in warning for words, warning in zip(step.warns, taken.warnings, strict=False)
-        )
-        if not fitting:
+        pairs = zip(step.warns, taken.warnings, strict=False)
+        fit = len(taken.warnings) == len(step.warns) and all(words in one for words, one in pairs)
+        if not fit:
             yield f"warns of {taken.warnings}"
 
 
 def same_faults(wanted: Iterable[ExpectedFault], found: Iterable[Fault]) -> bool:
-    wanted, left = list(wanted), list(found)
-    for fault in found:
-        fitting = next((one for one in wanted if one.fits(fault)), None)
-        if fitting is not None:
-            wanted.remove(fitting)
-            left.remove(fault)
-    return not wanted and not left
-
-
-def _of_connections(world: World, what: str) -> dict[str, list[str]]:
-    return {id: [*entry[what]] for id, entry in world.books()["connections"].items()}
+    left = list(found)
+    for one in wanted:
+        fitting = next((fault for fault in left if one.fits(fault)), None)
+        if fitting is None:
+            return False
+        left.remove(fitting)
+    return not left
 
 
 def _since_start(moment: datetime) -> str:
     """Return the duration from the scenario's start to ``moment``, like ``1h30m``."""
-    rest = int((moment - START).total_seconds())
-    parts = []
+    rest, text = int((moment - START).total_seconds()), ""
     for unit, seconds in (("h", 3600), ("m", 60), ("s", 1)):
         count, rest = divmod(rest, seconds)
-        if count:
-            parts.append(f"{count}{unit}")
-    return "".join(parts) or "0s"
+        text += f"{count}{unit}" if count else ""
+    return text or "0s"
