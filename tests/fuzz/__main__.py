@@ -89,9 +89,8 @@ class Run:
             error = self._error(value)
         if error is None:
             return
-        frames = [
-            one for one in traceback.extract_tb(error.__traceback__) if _is_ours(one.filename)
-        ]
+        stack = traceback.extract_tb(error.__traceback__)
+        frames = [one for one in stack if _is_ours(one.filename)]
         where = f"{Path(frames[-1].filename).stem}-{frames[-1].lineno}" if frames else ""
         name = f"{type(error).__name__}-{where}"
         data = value if isinstance(value, bytes) else repr(value).encode("utf-8", "replace")
@@ -121,15 +120,11 @@ class Run:
         words = {*_ODD, *re.findall(r"[\w./-]{2,30}", text)}
         dictionary = self.folder / "words"
         dictionary.write_text("".join(f'"{word}"\n' for word in sorted(words)))
-        options = {
-            "max_total_time": int(self.seconds),
-            "timeout": _WALL_S,
-            "rss_limit_mb": 0,
-            "max_len": _LONGEST_INPUT,
-            "dict": dictionary,
-            "artifact_prefix": f"{self.folder}/",
-        }
-        flags = [f"-{name}={value}" for name, value in options.items()]
+        flags = [
+            *(f"-max_total_time={self.seconds:.0f}", f"-timeout={_WALL_S}", "-rss_limit_mb=0"),
+            *(f"-max_len={_LONGEST_INPUT}", f"-dict={dictionary}"),
+            f"-artifact_prefix={self.folder}/",
+        ]
         atheris.Setup([sys.argv[0], *flags, str(corpus)], self.check)
         atheris.Fuzz()
 
