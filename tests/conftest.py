@@ -33,15 +33,12 @@ _ROOM_IN_MEMORY = 2 << 30
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line(
-        "markers",
+    for marker in (
         f"limit(seconds): fail the test when it takes longer (default {LONGEST_TEST_S:.0f})",
-    )
-    config.addinivalue_line("markers", "synced: flush files to the disk, as the program does")
-    config.addinivalue_line(
-        "markers",
+        "synced: flush files to the disk, as the program does",
         "nightly: waits for wall-clock time, compares times or takes long; not in the gate",
-    )
+    ):
+        config.addinivalue_line("markers", marker)
     if (unsteady := os.environ.get("UNSTEADY")) and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SecondTry(Path(unsteady)))
     # By default an example that takes 200 ms fails, and so do slow strategies. Any example may take
@@ -50,16 +47,11 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile("steady")
     sync.force(False)
     gc.disable()  # until everything is imported and collected
-    _keep_files_in_memory()
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _keep_files_in_memory() -> None:
-    """This saves time, because a whole run makes a third of a million files."""
     named = {"TMPDIR", "PYTEST_DEBUG_TEMPROOT"} & os.environ.keys()
     if not named and _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free >= _ROOM_IN_MEMORY:
-        os.environ["PYTEST_DEBUG_TEMPROOT"] = str(_MEMORY)
+        os.environ["PYTEST_DEBUG_TEMPROOT"] = str(_MEMORY)  # for a third of a million files
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

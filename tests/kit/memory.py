@@ -71,13 +71,13 @@ class MemoryRepo:
     def send(self, goal: object, now: datetime | None = None) -> Decision:
         decision = self.decide(goal, now)
         self.state = decision.state
-        for path, text in decision.files.items():
-            assert self.files.get(path) != text, f"written or removed without need: {path}"
-            if text is None:
-                del self.files[path]
-            else:
-                self.files[path] = text
+        self._write(decision.files)
         return decision
+
+    def _write(self, files: Mapping[str, str | None]) -> None:
+        for path, text in files.items():
+            assert self.files.get(path) != text, f"written or removed without need: {path}"
+            self.files.pop(path) if text is None else self.files.update({path: text})
 
     def scale_down(self, now: datetime) -> list[str]:
         """Remove the replicas that are due; return the names of the changed releases."""
@@ -85,9 +85,7 @@ class MemoryRepo:
         for instance in self.state.ledger.kept.due(now):
             self.state, change = scale_down(self.state, instance, now, self.files.get)
             names += [release.name for release in change.releases]
-            for path, text in change.files.items():
-                assert self.files.get(path) != text, f"written or removed without need: {path}"
-                self.files.pop(path) if text is None else self.files.update({path: text})
+            self._write(change.files)
         return names
 
     def take(self, goal: object, now: datetime | None = None) -> Decision | Refused:
@@ -106,11 +104,9 @@ class MemoryRepo:
         ]
 
     def forget_shutdowns(self) -> None:
-        shutdowns = self.state.ledger.shutdowns
-        self.state = replace(
-            self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
-        )
-        for digest in shutdowns.by_digest:
+        ledger = self.state.ledger
+        self.state = replace(self.state, ledger=replace(ledger, shutdowns=RecentShutdowns()))
+        for digest in ledger.shutdowns.by_digest:
             del self.files[records.shutdowns_path(digest)]
 
     def faults(self, goal: object) -> list[str]:
@@ -139,10 +135,9 @@ class MemoryRepo:
 
     def rendered(self) -> dict[str, str]:
         """Return the files below ``clusters/`` that demands added."""
+        added = self.files.keys() - self._initial.keys()
         return {
-            path: text
-            for path, text in self.files.items()
-            if path.startswith("clusters/") and path not in self._initial
+            p: text for p, text in self.files.items() if p in added and p.startswith("clusters/")
         }
 
     def objects(self, kind: str) -> dict[str, dict[str, Any]]:

@@ -20,9 +20,7 @@ _WRONG_TYPES: dict[str, Any] = {
     "a mapping": {"x": 1}, "a list": [1], "a number": 5, "a truth": True, "no value": None,
 }  # fmt: skip
 _OF_TYPE: dict[type, dict[str, Any]] = {
-    str: {
-        "empty": "", "too long": "x" * 2000, "another word": "Nonsense?",
-    },
+    str: {"empty": "", "too long": "x" * 2000, "another word": "Nonsense?"},
     bool: {},
     int: {"negative": -1, "zero": 0, "large": 10**30, "a fraction": 1.5},
     float: {"negative": -1.0, "large": 1e30},
@@ -89,15 +87,13 @@ def _mutations(document: Any, limits: Iterable[int]) -> Iterator[Mutation]:
             added = (*place, "zz")
             yield Mutation(added, "added", _replaced(document, place, more), None, added)
         if isinstance(place[-1], str):
-            holder = _at(document, place[:-1])
-            renamed = {k if k != place[-1] else "Zz?": v for k, v in holder.items()}
-            changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], "Zz?")
-            yield Mutation(place, "misspelt", changed, value, now)
-            own = re.sub("[A-Z]", lambda capital: f"_{capital[0].lower()}", place[-1])
-            if own != place[-1]:
-                renamed = {k if k != place[-1] else own: v for k, v in holder.items()}
-                changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], own)
-                yield Mutation(place, "the program's own name", changed, value, now)
+            holder, key = _at(document, place[:-1]), place[-1]
+            own = re.sub("[A-Z]", lambda capital: f"_{capital[0].lower()}", key)
+            for kind, name in (("misspelt", "Zz?"), ("the program's own name", own)):
+                if name != key:
+                    renamed = {k if k != key else name: v for k, v in holder.items()}
+                    changed = _replaced(document, place[:-1], renamed)
+                    yield Mutation(place, kind, changed, value, (*place[:-1], name))
 
 
 def _in_turn(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
@@ -183,32 +179,28 @@ class Form:
 
     def fields(self) -> set[str]:
         """Return all fields of all mappings in the schema, as ``Node.id``."""
-        return {f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]}
+        return {name for name, _ in self._options()}
 
     def limits(self) -> list[int]:
         """Return the numbers that just miss a field's range: minimum - 1 and maximum + 1."""
-        limits = set()
-        for part in self._parts():
-            for field in part["properties"].values():
-                for option in field.get("anyOf", [field]):
-                    limits |= {option[key] - 1 for key in ("minimum",) if key in option}
-                    limits |= {option[key] + 1 for key in ("maximum",) if key in option}
-        return sorted(limits)
+        beyond = (("minimum", -1), ("maximum", 1))
+        return sorted({o[key] + by for _, o in self._options() for key, by in beyond if key in o})
 
     def free(self) -> set[str]:
         """Return the fields whose value may be anything, or a mapping with any keys."""
         return {
-            f"{part['title']}.{name}"
-            for part in self._parts()
-            for name, field in part["properties"].items()
-            for option in field.get("anyOf", [field])
+            name
+            for name, option in self._options()
             if option.get("additionalProperties") is True
             or not {"type", "$ref", "const", "enum"} & option.keys()
         }
 
-    def _parts(self) -> list[Schema]:
-        parts = [self._schema, *self._schema.get("$defs", {}).values()]
-        return [part for part in parts if "properties" in part]
+    def _options(self) -> Iterator[tuple[str, Schema]]:
+        """Yield each field, as ``Node.id``, with each schema that its value may have."""
+        for part in (self._schema, *self._schema.get("$defs", {}).values()):
+            for name, field in part.get("properties", {}).items():
+                for option in field.get("anyOf", [field]):
+                    yield f"{part['title']}.{name}", option
 
     def fields_in(self, document: Any) -> set[str]:
         return set(self._used(document, self._schema))
