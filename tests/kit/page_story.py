@@ -16,6 +16,7 @@ from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 
 from tests.kit import goals
+from tests.kit.config import override
 from tests.kit.generator import book, wait_until
 from tests.kit.goals import Goal
 from tests.kit.http import kubeconfig
@@ -25,48 +26,31 @@ from tests.kit.repo import Person
 NAMESPACE = "perception"
 FAILING = "od-edge-vehicle00"
 FAULT = "Helm install failed: container detection: ImagePullBackOff: manifest unknown"
-DENIED = "vehicle03/edge"
-
 OVERRIDES = {
-    "roadworks": """apiVersion: demandops/v1
-kind: Override
-reason: The road is closed until the bridge is mended
-owner: traffic-control
-select: [{connections: [vehicle03/edge]}]
-deny: true
-""",
-    "old": """apiVersion: demandops/v1
-kind: Override
-reason: Left from a demonstration
-owner: Petra Platform
-select: [{services: [gone]}]
-replicas: 2
-""",
+    "roadworks": override(
+        {"connections": ["vehicle03/edge"]},
+        reason="The road is closed until the bridge is mended",
+        owner="traffic-control",
+        deny=True,
+    ),
+    "old": override(
+        {"services": ["gone"]},
+        reason="Left from a demonstration",
+        owner="Petra Platform",
+        replicas=2,
+    ),
 }
 
 
 def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
-    return {
-        "apiVersion": "demandops/v1",
-        "kind": "Demand",
-        "demand": id,
-        "requesters": [vehicle],
-        "lease": lease,
-        "connections": [
-            {
-                "id": f"{vehicle}/cloud",
-                "type": "mqtt",
-                "source": vehicle,
-                "target": "cloud",
-                "topics": [{"source": f"/vehicles/{vehicle}/ego_data"}],
-            }
-        ],
-    }
+    made = {"kind": "Demand", "demand": id, "requesters": [vehicle], "lease": lease}
+    topics = [{"source": f"/vehicles/{vehicle}/ego_data"}]
+    ends = {"type": "mqtt", "source": vehicle, "target": "cloud"}
+    return made | {"connections": [{"id": f"{vehicle}/cloud", "topics": topics} | ends]}
 
 
 def released(id: str, vehicle: str) -> Goal:
-    goal = leased(id, vehicle) | {"operation": "release"}
-    return {key: value for key, value in goal.items() if key not in ("lease", "connections")}
+    return {"kind": "Demand", "demand": id, "requesters": [vehicle], "operation": "release"}
 
 
 @dataclass
@@ -83,10 +67,10 @@ class Story:
         return self.server.url.rstrip("/")
 
     def wait_followed(self) -> None:
-        commit = str(self.generator.snapshot.commit)
-        wait_until(
-            lambda: self.follower.newest.commit_state.commit == commit, "the page has the commit"
-        )
+        def is_at() -> bool:
+            return self.follower.newest.commit_state.commit == str(self.generator.snapshot.commit)
+
+        wait_until(is_at, "the page has the newest commit")
 
     def settle(self, *, mended: bool = False) -> None:
         """Report the newest commit as applied; ``FAILING`` fails unless it is mended."""
@@ -116,20 +100,10 @@ def story(bare: Path, folder: Path) -> Iterator[Story]:
         stack.callback(server.close)
         told = Story(bare, generator, api, person, server, follower)
         person.override(**OVERRIDES)
-        wait_until(lambda: _denies(generator), "the override is in effect")
-        wait_until(lambda: _is_at(told), "the page has the newest commit")
+        wait_until(
+            lambda: "roadworks" in generator.snapshot.state.config.overrides, "it is in effect"
+        )
+        told.wait_followed()
         told.settle()
-        wait_until(lambda: _is_seen(told), "the page sees what fails")
+        wait_until(lambda: follower.newest.status(FAILING).health.failing, "the page sees it")
         yield told
-
-
-def _denies(generator: Generator) -> bool:
-    return "roadworks" in generator.snapshot.state.config.overrides
-
-
-def _is_at(told: Story) -> bool:
-    return told.follower.newest.commit_state.commit == str(told.generator.snapshot.commit)
-
-
-def _is_seen(told: Story) -> bool:
-    return told.follower.newest.status(FAILING).health.failing
