@@ -9,8 +9,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from email.message import Message
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import chain
 from pathlib import Path
 from typing import Any
+
+_CHUNKED = ("Transfer-Encoding", "chunked")
 
 
 @dataclass(frozen=True)
@@ -77,16 +80,18 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
             with lock:
                 served.calls.append(call)
                 given = served.answer(call)
+            is_whole = isinstance(given.body, bytes)
+            size = ("Content-Length", str(len(given.body))) if is_whole else _CHUNKED
             self.send_response(given.status)
-            for name, value in given.headers.items():
+            for name, value in (*given.headers.items(), size):
                 self.send_header(name, value)
-            whole = isinstance(given.body, bytes)
-            if whole:
-                self.send_header("Content-Length", str(len(given.body)))
             self.end_headers()
             with suppress(OSError):
-                for part in (given.body,) if whole else given.body:
-                    self.wfile.write(part)
+                if is_whole:
+                    self.wfile.write(given.body)
+                else:
+                    for part in chain(given.body, [b""]):
+                        self.wfile.write(b"%x\r\n%s\r\n" % (len(part), part))
 
         do_GET = do_POST = do_PUT = do_PATCH = do_DELETE = _serve
 

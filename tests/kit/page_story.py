@@ -104,6 +104,10 @@ def story(bare: Path, folder: Path) -> Iterator[Story]:
             lambda: "roadworks" in generator.snapshot.state.config.overrides, "it is in effect"
         )
         told.wait_followed()
-        told.settle()
-        wait_until(lambda: follower.newest.status(FAILING).health.failing, "the page sees it")
+
+        def is_seen() -> bool:
+            told.settle()  # again after each commit that the override brings about
+            return follower.newest.status(FAILING).health.failing
+
+        wait_until(is_seen, "the page sees what fails")
         yield told
