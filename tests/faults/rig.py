@@ -30,7 +30,7 @@ from uuid import NAMESPACE_OID, uuid5
 import yaml
 from demandops.base.runtime import Runtime
 
-from tests.kit.goals import Goal, numbered
+from tests.kit.goals import numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
 
 LIMIT_S = 8.0
@@ -64,10 +64,6 @@ class Strace:
 
     options: Sequence[str]
     at: str = "MainThread"
-
-    @property
-    def is_of_git(self) -> bool:
-        return self.at.split()[0] == GIT
 
 
 @dataclass(frozen=True)
@@ -179,7 +175,7 @@ class Rig:
 
     def goal_file(self, number: int) -> Path:
         file = self.scratch / f"{number}.yaml"
-        file.write_text(yaml.safe_dump(goal(number)))
+        file.write_text(yaml.safe_dump(numbered(number)))
         return file
 
     def book(self, number: int, strace: Strace | None = None, limit: float = 0) -> Ran:
@@ -197,7 +193,7 @@ class Rig:
         shutil.rmtree(traces, ignore_errors=True)
         traces.mkdir()
         environment = NO_GIT_CONFIG | {"DEMANDOPS_DATA_HOME": str(self.home)}
-        if strace is not None and strace.is_of_git:
+        if strace is not None and strace.at.split()[0] == GIT:
             environment |= {
                 "PATH": f"{self._git}:{os.environ['PATH']}",
                 "GIT_EXEC_PATH": str(self._git),
@@ -275,10 +271,6 @@ class Rig:
             texts["trace"] = "".join(f"{alone} {line}\n" for line in texts["trace"].splitlines())
         code = os.waitstatus_to_exitcode(status)
         return Ran(code, roles=roles, hangs=hangs, lingers=_lingers(), **texts)
-
-
-def goal(number: int) -> Goal:
-    return numbered(number)
 
 
 @cache

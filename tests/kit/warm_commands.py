@@ -81,9 +81,8 @@ class WarmCommands:
         self._process.communicate()
 
 
-def _import_all() -> None:
+def import_all() -> None:
     import demandops
-    import numpy  # noqa: F401 - ROS messages need it
 
     for module in pkgutil.walk_packages(demandops.__path__, "demandops."):
         importlib.import_module(module.name)
@@ -117,7 +116,9 @@ def _become(wanted: dict[str, Any]) -> None:
 
 
 def _fork_for_each_line() -> None:
-    _import_all()
+    import numpy  # noqa: F401 - ROS messages need it
+
+    import_all()
     assert len(list(Path("/proc/self/task").iterdir())) == 1, "an import has started a thread"
     gc.collect()
     gc.freeze()
