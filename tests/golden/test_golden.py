@@ -6,7 +6,7 @@ import pytest
 from demandops.decide.state import rendered_files
 from demandops.model.ledger.records import SHUTDOWNS_ROOT
 
-from tests.kit.golden import CASES, START, play, read, rendered, to_store
+from tests.kit.golden import CASES, START, play, read, rendered, to_store, whole
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -17,7 +17,7 @@ def test_every_step_gives_the_files_that_were_reviewed(case: str) -> None:
 @pytest.mark.parametrize("case", CASES)
 def test_the_ledger_and_the_configuration_alone_render_the_same_files(case: str) -> None:
     for step, repo in play(case):
-        files = rendered(case)[step]
+        files = whole(case)[step]
         without_ledger = {p: text for p, text in files.items() if not p.startswith("ledger/")}
         assert rendered_files(repo.state, files) == without_ledger
 
