@@ -101,7 +101,7 @@ coverage: system-test setup  ## Report what the tests cover, then what the core'
 	  $(addprefix --cov=demandops.,$(CORE)) --cov-fail-under=$(CORE_COVERAGE)
 
 # The long form tries every system call: make faults FAULTS=--long. It may take an hour on 2 busy
-# cores. If it was interrupted, FAULTS='--long --resume' continues it.
+# cores; FAULTS='--long --only WORD' tries a part of it.
 faults: system-faults setup  ## Kill generators; inject an error, a kill, a full disk or power loss at each system call of a demand; four minutes
 	@$(PY) -m pytest -q -n auto $(KILL_TESTS)
 	@$(PY) -m tests.faults $(FAULTS)

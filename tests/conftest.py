@@ -33,15 +33,12 @@ _ROOM_IN_MEMORY = 2 << 30
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    config.addinivalue_line(
-        "markers",
+    for marker in (
         f"limit(seconds): fail the test when it takes longer (default {LONGEST_TEST_S:.0f})",
-    )
-    config.addinivalue_line("markers", "synced: flush files to the disk, as the program does")
-    config.addinivalue_line(
-        "markers",
+        "synced: flush files to the disk, as the program does",
         "nightly: waits for wall-clock time, compares times or takes long; not in the gate",
-    )
+    ):
+        config.addinivalue_line("markers", marker)
     if (unsteady := os.environ.get("UNSTEADY")) and not hasattr(config, "workerinput"):
         config.pluginmanager.register(SecondTry(Path(unsteady)))
     # By default an example that takes 200 ms fails, and so do slow strategies. Any example may take
@@ -50,19 +47,11 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile("steady")
     sync.force(False)
     gc.disable()  # until everything is imported and collected
-    _keep_files_in_memory()
-    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
-def _keep_files_in_memory() -> None:
-    """Put the tests' temporary folders in memory if the memory has enough room.
-
-    This saves time, because a whole run makes a third of a million files.
-    """
     named = {"TMPDIR", "PYTEST_DEBUG_TEMPROOT"} & os.environ.keys()
     if not named and _MEMORY.is_dir() and shutil.disk_usage(_MEMORY).free >= _ROOM_IN_MEMORY:
-        os.environ["PYTEST_DEBUG_TEMPROOT"] = str(_MEMORY)
+        os.environ["PYTEST_DEBUG_TEMPROOT"] = str(_MEMORY)  # for a third of a million files
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # as in a background job of a shell
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -85,7 +74,6 @@ def pytest_xdist_auto_num_workers() -> int:
 
 @pytest.fixture(scope="session", autouse=True)
 def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Isolate the tests from the user's journals, clones, contexts and Git configuration."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path_factory.mktemp("home")))
         patch.setenv("XDG_CONFIG_HOME", str(tmp_path_factory.mktemp("config")))
@@ -98,7 +86,6 @@ def _isolated(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def data_home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Keep the journals and clones of each test in a folder of that test; return the folder."""
     home = tmp_path / "home"
     monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(home))
     return home
@@ -114,14 +101,12 @@ def synced(request: pytest.FixtureRequest) -> bool:
 
 @pytest.fixture
 def git_environment(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Make a person named Petra the author and committer of each commit."""
     for name, value in repo.GIT_ENVIRONMENT.items():
         monkeypatch.setenv(name, value)
 
 
 @pytest.fixture(autouse=True)
 def limited(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Fail a test that exceeds its time limit, and print the stack of every thread."""
     marker = request.node.get_closest_marker("limit")
     seconds = float(marker.args[0]) if marker else LONGEST_TEST_S
 
@@ -151,8 +136,6 @@ def bare_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def new_repo(bare_template: Path, tmp_path: Path, synced: bool) -> Callable[[str], Path]:
-    """Return a function that makes a bare state repo with a name and returns its path."""
-
     def make(name: str) -> Path:
         made = Path(shutil.copytree(bare_template, tmp_path / name))
         sync.force_in(made, synced)
@@ -168,7 +151,6 @@ def bare(new_repo: Callable[[str], Path]) -> Path:
 
 @pytest.fixture
 def state(bare: Path) -> GitRepo:
-    """The state repo `bare`, with methods that read its content."""
     return GitRepo(bare)
 
 
@@ -180,13 +162,11 @@ def address(request: pytest.FixtureRequest, bare: Path) -> str:
 
 @pytest.fixture
 def url(bare: Path) -> str:
-    """The URL of the state repo `bare`; it serves as a remote to clone, fetch from and push to."""
     return bare.as_uri()
 
 
 @pytest.fixture
 def person(bare: Path, tmp_path: Path) -> Person:
-    """A person with a clone of the state repo `bare`."""
     return Person(bare, tmp_path / "person")
 
 
@@ -197,7 +177,6 @@ def _checkout_template(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def checkout(_checkout_template: Path, tmp_path: Path) -> Path:
-    """A state repo with a working tree."""
     return Path(shutil.copytree(_checkout_template, tmp_path / "state-repo"))
 
 
@@ -213,14 +192,11 @@ def generator(bare: Path) -> Iterator[Generator]:
 
 @pytest.fixture
 def demandops(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Return a function that runs a command of `demandops` in this process."""
     return runner(capsys, monkeypatch)
 
 
 @pytest.fixture
 def request_json(demandops: Run, state: GitRepo) -> Callable[..., Ran]:
-    """Return a function that sends goals through ``demandops request --output json``."""
-
     def send(*goals: object, more: tuple[str, ...] = ()) -> Ran:
         text = yaml.safe_dump_all(goals, sort_keys=False, allow_unicode=True)
         return demandops(
@@ -239,7 +215,6 @@ def _all_drivers(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Drivers]:
 
 @pytest.fixture
 def drivers(_all_drivers: Drivers, git_environment: None, synced: bool) -> Iterator[Drivers]:
-    """Yield a starter of generator processes; after the test, kill those that still run."""
     _all_drivers.synced = synced
     yield _all_drivers
     _all_drivers.kill_runs()

@@ -13,80 +13,72 @@ import logging
 import os
 import sys
 import tempfile
+import time
 import traceback
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import dataclass
-from importlib import import_module
 from multiprocessing import current_process, get_context
 from pathlib import Path
-from pkgutil import walk_packages
 from typing import Any
 
-import demandops
 from demandops.cli import main as command_line
 
 from tests.faults import disk, injection, power_loss
 from tests.faults.injection import Result
 from tests.faults.invariants import DEMAND
-from tests.faults.progress import Passed, Progress
 from tests.faults.rig import Rig
+from tests.kit.warm_commands import import_all
 
 WORKERS = (os.cpu_count() or 1) + 1
 """One more than there are cores, because a worker that waits for a disk or a lock needs no core."""
 MEMORY = Path("/dev/shm")
 """A file system in memory, where a sync takes no time; strace still shows each sync."""
 OUT = Path(__file__).parents[2] / "build" / "faults.json"
-TRIED = OUT.with_name("faults-tried.jsonl")
+TELL_EVERY_S = 30
 _RIGS: dict[tuple[bool, bool], Rig] = {}
 _FOLDER, _SHORT = Path(), True
 
 
 @dataclass(frozen=True)
 class _Task:
-    """A part of the work; ``what`` has the arguments of the function that does this part."""
-
     part: str
     remote: bool
     what: tuple[Any, ...] = ()
 
 
 def main() -> int:
-    """Run the tasks and write the report; return 1 if a promise was broken, else 0."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--long", action="store_true", help="try every fault at every call")
     parser.add_argument("--only", default="", help="run only tasks whose text contains this")
-    parser.add_argument(
-        "--resume", action="store_true", help="go on with a run that was interrupted"
-    )
     chosen = parser.parse_args()
-    passed = Passed(TRIED, resume=chosen.resume)
     fast = MEMORY if MEMORY.is_dir() else None
     with tempfile.TemporaryDirectory(prefix="demandops-faults-", dir=fast) as folder:
         _prepare(Path(folder))
         tasks = [each for each in _tasks(Path(folder), chosen.long) if chosen.only in str(each)]
-        left = [each for each in tasks if str(each) not in passed.sound]
-        known = f", of which {len(tasks) - len(left)} were tried before" if chosen.resume else ""
-        print(f"{len(tasks)} tasks{known}", flush=True)
-        results = [one for each in tasks for one in passed.sound.get(str(each), [])]
-        progress = Progress(len(left))
+        print(f"{len(tasks)} tasks", flush=True)
+        began, told, results = time.monotonic(), 0.0, list[Result]()
         start = (Path(folder), not chosen.long)
         with get_context("fork").Pool(WORKERS, _start, start) as pool:
-            for task, found in pool.imap_unordered(_run, left):
+            for number, found in enumerate(pool.imap_unordered(_run, tasks), 1):
                 results += found
-                _tell_problems(found)
-                passed.add(task, found)
-                progress.add(found)
-    _report(results, progress.seconds)
-    passed.finish()
+                seconds = time.monotonic() - began
+                for result in found:
+                    for problem in result.problems:
+                        where = " ".join(result.where)
+                        print(f"VIOLATED {result.part} {where} {result.fault}: {problem}")
+                if seconds - told >= TELL_EVERY_S:
+                    told = seconds
+                    left = seconds / number * (len(tasks) - number)
+                    print(f"{number} tasks, {seconds:.0f} s; about {left:.0f} s to go", flush=True)
+    _report(results, time.monotonic() - began)
     return int(any(result.problems for result in results))
 
 
 def _prepare(folder: Path) -> None:
     """Import all modules, and compile templates and schemas, so that forked processes need not."""
-    for module in walk_packages(demandops.__path__, "demandops."):
-        import_module(module.name)
+    import_all()
     rig = Rig(folder / "first", remote=False)
     state = ("--state-repo", str(rig.state))
     for command in (("verify",), ("request", str(rig.goal_file(DEMAND)), "--dry-run")):
@@ -125,13 +117,12 @@ def _start(folder: Path, short: bool) -> None:
     _FOLDER, _SHORT = folder / current_process().name, short
 
 
-def _run(task: _Task) -> tuple[str, list[Result]]:
+def _run(task: _Task) -> list[Result]:
     try:
-        return str(task), _results(task)
+        return _results(task)
     except Exception as error:  # the other tasks' results must not be lost
         traceback.print_exc()
-        failed = Result(task.part, (str(task.what), "", ""), "", (f"not tried: {error!r}",))
-        return str(task), [failed]
+        return [Result(task.part, (str(task.what), "", ""), "", (f"not tried: {error!r}",))]
 
 
 def _results(task: _Task) -> list[Result]:
@@ -154,28 +145,19 @@ def _results(task: _Task) -> list[Result]:
     return [injection.run(rig, *task.what)]
 
 
-def _tell_problems(results: list[Result]) -> None:
-    for result in results:
-        for problem in result.problems:
-            where = " ".join(result.where)
-            print(f"VIOLATED {result.part} {where} {result.fault}: {problem}", flush=True)
-
-
 def _report(results: list[Result], seconds: float) -> None:
     by_class: dict[str, Counter[str]] = {}
     for result in results:
-        name = " ".join((result.part, *result.where))
         known = [f"known and open: {problem}" for problem in result.known]
         verdicts = [*result.problems, *known] or ["sound"]
-        by_class.setdefault(name, Counter()).update(verdicts)
+        by_class.setdefault(" ".join((result.part, *result.where)), Counter()).update(verdicts)
     OUT.parent.mkdir(exist_ok=True)
     in_all = json.loads(OUT.read_text()) if OUT.exists() else {}  # the file counts all runs
-    for name, verdicts in by_class.items():
-        in_all[name] = Counter(in_all.get(name, {})) + verdicts
-    OUT.write_text(json.dumps(in_all, indent=1, sort_keys=True))
     for name, verdicts in sorted(by_class.items()):
+        in_all[name] = Counter(in_all.get(name, {})) + verdicts
         told = ", ".join(f"{count} {verdict}" for verdict, count in sorted(verdicts.items()))
         print(f"{name}: {told}")
+    OUT.write_text(json.dumps(in_all, indent=1, sort_keys=True))
     wrong = sum(bool(result.problems) for result in results)
     known = sum(bool(result.known) for result in results)
     print(

@@ -24,17 +24,13 @@ _ROOM = ("no room", os.strerror(28))
 
 
 def may_mount() -> bool:
-    """Give this process and its children a mount namespace; return whether that worked."""
     if ctypes.CDLL(None).unshare(_OWN_MOUNTS) != 0:
         return False
     return subprocess.run(["mount", "--make-rprivate", "/"], check=False).returncode == 0
 
 
 def full(rig: Rig, folder: Path, blocks: int) -> Result:
-    """Book a demand while a folder's disk has ``blocks`` free blocks, then restart with more room.
-
-    Return the problems of both runs.
-    """
+    """Book a demand with ``blocks`` free blocks, then restart with more room."""
     rig.restore()
     with _small_disk(folder):
         filler = folder / "filler"
@@ -50,7 +46,6 @@ def full(rig: Rig, folder: Path, blocks: int) -> Result:
 
 @contextmanager
 def _small_disk(folder: Path) -> Iterator[None]:
-    """Put a folder on a small file system of its own until the ``with`` block ends."""
     aside = folder.rename(folder.with_name("aside"))
     folder.mkdir()
     options = f"size={_SIZE},mode=0700"
@@ -73,10 +68,7 @@ def interrupted(rig: Rig) -> None:
 
 
 def damage(rig: Rig, *, short: bool) -> Iterator[Result]:
-    """Damage one file of each class: change a byte, or cut the file.
-
-    Yield the result of the next start after each damage.
-    """
+    """Change a byte of one file of each class, or cut it; yield the result of the next start."""
     rig.restore()
     classes: dict[str, tuple[Path, int]] = {}
     for path in sorted(rig.folder.rglob("*")):

@@ -11,85 +11,36 @@ from pathlib import Path
 
 from tests.faults.invariants import DEMAND, after_fault, after_restart
 from tests.faults.rig import GIT, PLENTY_S, Ran, Rig, Strace
-from tests.faults.trace import Call, file_class, parse
+from tests.faults.trace import Call, calls_of, file_class, parse
 
 EVERYTHING = "trace=%file,%desc,%process"
-CANNOT_FAIL = {
-    "chdir",
-    "close",  # with an injected error, the file would stay open
-    "execve",
-    "fcntl",
-    "fstat",
-    "getcwd",
-    "ioctl",
-    "lseek",
-    "mmap",
-    "munmap",
-}
-"""Calls at which no fault is injected, because a disk's fault does not show in them."""
-CHANGES = {
-    "creat", "fallocate", "fchmod", "fdatasync", "fsync", "ftruncate", "link", "linkat", "mkdir",
-    "mkdirat", "chmod", "pwrite64", "rename", "renameat", "renameat2", "rmdir", "symlink", "sync",
-    "sync_file_range", "truncate", "unlink", "unlinkat", "write", "writev",
-}  # fmt: skip
-SYNCS = {"fsync", "fdatasync", "sync_file_range", "syncfs", "msync"}
-_BY_NAME = {
-    "access", "chmod", "creat", "link", "linkat", "lstat", "mkdir", "mkdirat", "newfstatat", "open",
-    "openat", "readlink", "rename", "renameat", "renameat2", "rmdir", "stat", "statx", "symlink",
-    "truncate", "unlink", "unlinkat",
-}  # fmt: skip
-_NEED_ROOM = {
-    "creat", "fallocate", "fdatasync", "fsync", "link", "linkat", "mkdir", "mkdirat", "pwrite64",
-    "rename", "renameat", "renameat2", "symlink", "write", "writev",
-}  # fmt: skip
-_INTERRUPTIBLE = {"flock", "fsync", "open", "openat", "pread64", "pwrite64", "read", "write"}
+SYNCS = calls_of("syncs")
 KILL = "SIGKILL"
 _SHORT = {False: ("EIO", "EACCES", "ENOSPC", KILL), True: ("EIO", KILL)}
 """The faults that a short run injects; the key says whether the state repo is remote."""
 
 _MISSED = "not reached"
 _TRIES = 8
-"""How often to repeat a fault that missed its call, because the number of a call varies.
-
-Before each repetition, the calls are counted again.
-"""
+"""How often to repeat a fault that missed its call, with calls counted anew; numbers vary."""
 _TRIES_ON_JOURNAL = 40
-"""How often to repeat a fault that missed its call on the journal.
-
-Either of the two threads in ``_OTHER_THREAD`` may journal a demand, so the repetitions alternate
-between the two. For such a fault, strace counts only calls on the journal (:func:`_counted`).
-"""
-_OTHER_THREAD = {
-    "demandops-journal": "demandops-writer",
-    "demandops-writer": "demandops-journal",
-}
+"""The same for calls on the journal, which either of two threads may make, so tries alternate."""
+_OTHER_THREAD = {"demandops-journal": "demandops-writer", "demandops-writer": "demandops-journal"}
 _KNOWN: dict[Path, list[Site]] = {}
 """The system calls that booking :data:`DEMAND` makes in a rig; the key is the rig's folder."""
 _WITHOUT_REASON = (
-    "failed to update ref",
-    "unpack",
-    "Killed",
-    "hung up",
-    "signal 9",
-    "has no branch",
-    "the server cannot read the branch",
-    "check the path in the address",
+    *("failed to update ref", "unpack", "Killed", "hung up", "signal 9", "has no branch"),
+    *("the server cannot read the branch", "check the path in the address"),
 )
-"""Words of messages that do not say why a process of git failed, be it here or at the server.
+"""Words of messages that do not say why a process of git failed, here or at the server.
 
-If a server cannot read its references, it may offer no reference, so the generator says that the
-repo "has no branch". Or the server offers a branch whose id has only zeros. If a server cannot read
-its folder, it says that the folder is no repository.
+A server that cannot read its references or folder offers no branch, or calls it no repository.
 """
 _HIDDEN = ("not a Git repository", "checked out", "cannot be read", "refresh packfiles")
 """Messages about files that libgit2 could not read; they give no reason."""
-
-
 _UNNOTICED = ("git receive-pack", "getdents64", "state.git/objects/tmp_objdir-incoming-*/??")
-"""The system call by which ``git receive-pack`` lists a folder of objects that it received.
+"""If this listing of received objects fails, Git believes that it is complete.
 
-If the call fails, Git believes that the list is complete, and may lose an object. The generator
-cannot see the loss. docs/reliability.md describes the loss under "Known and open".
+It may lose an object, which the generator cannot see: docs/reliability.md, "Known and open".
 """
 
 
@@ -109,42 +60,34 @@ class Site:
     creates: bool = False
     which: int = 0
     place: int = 0
-    """How many calls of the same class (:attr:`call_class`) came before this one."""
+    """How many calls of the same class came before this one."""
 
     @property
     def call_class(self) -> tuple[str, str, str, bool]:
-        """What calls of one class share: role, kind, class of file, and whether they create it."""
         return self.role, self.kind, self.file, self.creates
 
     @property
     def is_threads(self) -> bool:
-        """Whether a thread of the generator makes the call, not a process of git."""
         return not self.which
 
     @property
     def changes(self) -> bool:
-        """Whether the call changes or syncs a file."""
-        return self.kind in CHANGES or self.creates
+        return self.kind in calls_of("changes") or self.creates
 
     def faults(self) -> list[str]:
-        """Return the faults that can be injected at this call.
-
-        A kill ends the process before the call, so the disk is as the previous call left it.
-        """
+        """Return the faults to inject here; a kill leaves the disk as the previous call left it."""
         errors = ["EIO"]
-        if self.kind in _BY_NAME:
+        if self.kind in calls_of("by name"):
             errors.append("EACCES")
-        if self.kind in _NEED_ROOM or self.creates:
+        if self.kind in calls_of("needs room") or self.creates:
             errors.append("ENOSPC")
-        if self.kind in _INTERRUPTIBLE:
+        if self.kind in calls_of("interruptible"):
             errors.append("EINTR")
         return [*errors, KILL] if self.changes else errors
 
 
 @dataclass(frozen=True)
 class Job:
-    """One fault at one call, with or without a remote."""
-
     remote: bool
     site: Site
     fault: str
@@ -152,10 +95,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Result:
-    """The problems that a fault caused.
+    """The problems that a fault caused at a role's call on a class of file.
 
-    ``where`` has the thread or program, the call and the class of file. ``known`` has the problems
-    that docs/reliability.md lists as open. ``hangs``: a process did not end in time.
+    ``known`` has the problems that docs/reliability.md lists as open; ``hangs``: a process did
+    not end in time.
     """
 
     part: str
@@ -167,11 +110,7 @@ class Result:
 
 
 def sites(rig: Rig) -> list[Site]:
-    """Return the system calls that booking :data:`DEMAND` makes.
-
-    The demand is booked twice: strace traces the threads in one run, and git's processes in the
-    other.
-    """
+    """Return the calls that booking :data:`DEMAND` makes: first of threads, then of git."""
     options = ["-s", "64", "-e", EVERYTHING]
     rig.restore()
     ran = rig.must(rig.book(DEMAND, Strace(["-f", *options]), PLENTY_S))
@@ -189,11 +128,10 @@ def sites(rig: Rig) -> list[Site]:
 
 
 def _here(rig: Rig, site: Site) -> Site:
-    """Return a call with the number that :func:`sites` found for the call in this rig.
+    """Return a call with its number in this rig, because numbers differ between processes.
 
-    The number of a call differs between processes, because a process may read more or fewer files.
-    If the site's thread did not make the call, return a call of the same kind that another thread
-    made on the same class of file.
+    If the site's thread did not make the call, return a call of the same kind that another
+    thread made on the same class of file.
     """
     known = _KNOWN[rig.folder]
     same = [
@@ -216,10 +154,10 @@ def _is_of_journal(site: Site) -> bool:
 
 
 def _counted(rig: Rig, site: Site) -> tuple[int, list[str]]:
-    """Return the number of the call to inject at, and the options that limit what strace counts.
+    """Return the number of the call, and options that limit what strace counts.
 
-    For a thread's call on the journal, strace counts only calls on the journal, because the number
-    of other calls, such as calls that wake a thread, depends on timing.
+    On the journal it counts only the journal's calls, because the number of others depends on
+    timing.
     """
     if _is_of_journal(site):
         return site.place + 1, ["-P", str(next(rig.home.rglob("outbox.jsonl")))]
@@ -241,37 +179,33 @@ def _git_calls(rig: Rig, ran: Ran) -> Iterator[tuple[int, Call]]:
 def jobs(found: Iterable[Site], *, remote: bool, short: bool) -> list[Job]:
     """Return every fault at every call.
 
-    With ``short``, choose the last call of each class, and these of its faults:
-
-    - For a call that changes or syncs a file: the faults that ``_SHORT`` lists.
-    - For a call that only reads: EIO without a remote, no fault with a remote.
-
-    For syncs without a remote, choose the first call of the class too.
+    With ``short``, choose the last call of each class (and the first, for syncs without a
+    remote) and the faults of ``_SHORT``, and for reads only EIO without a remote.
     """
     classes: dict[tuple[str, str, str, bool], list[Site]] = {}
     for site in found:
-        if site.kind not in CANNOT_FAIL:
+        if site.kind not in calls_of("cannot fail"):
             classes.setdefault(site.call_class, []).append(site)
     made = []
     for group in classes.values():
-        chosen = group
-        if short and remote and not group[0].changes:
+        changes = group[0].changes
+        if short and remote and not changes:
             continue
+        chosen = group
         if short:
             is_sync = group[0].kind in SYNCS and not remote
             chosen = list(dict.fromkeys((group[0], group[-1]))) if is_sync else group[-1:]
-        for site in chosen:
-            faults = site.faults()
-            if short and not site.changes:
-                faults = ["EIO"]
-            elif short:
-                faults = [each for each in faults if each in _SHORT[remote]]
-            made += [Job(remote, site, fault) for fault in faults]
+        tried = _SHORT[remote] if changes else ("EIO",)
+        made += [
+            Job(remote, site, fault)
+            for site in chosen
+            for fault in site.faults()
+            if not short or fault in tried
+        ]
     return made
 
 
 def run(rig: Rig, job: Job) -> Result:
-    """Inject one fault; return the problems that it caused."""
     if rig.folder not in _KNOWN:
         sites(rig)
     site = _here(rig, job.site)
@@ -294,8 +228,8 @@ def run(rig: Rig, job: Job) -> Result:
 def _counted_anew(rig: Rig, wanted: Site, here: Site, *, only_here: bool) -> Site:
     """Book the demand without a fault; return the wanted call with its number in this run.
 
-    If ``only_here``, trace only the thread or process that makes the call, which is cheaper. If
-    the thread or process does not make the call this time, trace all threads and processes.
+    With ``only_here``, trace only its thread or process, which is cheaper, and all if it does
+    not make the call.
     """
     if only_here:
         before = sum(
@@ -318,7 +252,6 @@ def _at(site: Site) -> str:
 
 
 def _traces(site: Site) -> list[str]:
-    """Return strace's options to trace calls of the site's kind and calls that `parse` needs."""
     return ["-s64", "-e", f"trace={site.kind},chdir,execve,clone,clone3,fork,vfork"]
 
 

@@ -16,12 +16,10 @@ _OWN_FAULTS = ("fault of demandops", "internal error", "Traceback")
 
 
 def after_fault(ran: Ran, told: tuple[str, ...], *, unsound: bool) -> Iterator[str]:
-    """Yield each problem in how a process reacted to an injected fault.
+    """Yield each problem in a process's reaction to a fault.
 
-    Args:
-        ran: what the process did.
-        told: words; the process must print one of them if it did not book the demand.
-        unsound: whether a sync failed that the acknowledgement relies on.
+    If it booked nothing, it must print one of the words ``told``; ``unsound``: a sync failed on
+    which the acknowledgement relies.
     """
     if ran.hangs == "waits":
         if not ran.err.strip():
@@ -47,14 +45,9 @@ def after_restart(
 ) -> Iterator[str]:
     """Book another demand in a fresh process, and yield each problem of the state repo.
 
-    Do nothing if both hold: an earlier call found no problem in the same state of the disk, and no
-    child of the process with the fault still runs.
-
-    Args:
-        rig: the state repo.
-        ran: the process with the injected fault.
-        journaled: whether the journal has the demand, so a missing demand is a problem.
-        clones: whether `git fsck` also checks the clones.
+    Do nothing if the same state of the disk was found sound before, and no child of the process
+    ``ran`` still runs. ``journaled``: the demand must not be missing; ``clones``: `git fsck`
+    checks them too.
     """
     state = None
     if not ran.lingers:

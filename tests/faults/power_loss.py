@@ -25,20 +25,19 @@ _GONE = -2
 
 @dataclass(frozen=True)
 class _Name:
-    """A change of one entry of a folder: ``path`` gets a file or a folder, or is removed."""
+    """A change of an entry of a folder, safe when the folder is synced."""
 
     path: str
     node: int
 
     @property
     def scope(self) -> str | int:
-        """The folder whose sync makes the change safe."""
         return self.path.rpartition("/")[0]
 
 
 @dataclass(frozen=True)
 class _Data:
-    """A change of a file's content: bytes are written at an offset, or the file is cut there."""
+    """A change of a file, safe when the file is synced: bytes at an offset, or a cut."""
 
     node: int
     at: int
@@ -46,17 +45,12 @@ class _Data:
 
     @property
     def scope(self) -> str | int:
-        """The file whose sync makes the change safe."""
         return self.node
 
 
 @dataclass
 class _Change:
-    """A change by one call or by successive writes.
-
-    ``safe`` has the indices of the ``parts`` that survive a loss of power. ``lost`` has the indices
-    of the ``parts`` whose sync failed.
-    """
+    """A change by one call or by successive writes; indices of ``parts`` are safe or lost."""
 
     name: str
     parts: list[_Name | _Data]
@@ -65,13 +59,10 @@ class _Change:
 
     @property
     def is_safe(self) -> bool:
-        """Whether all parts survive a loss of power at any time."""
         return len(self.safe) == len(self.parts)
 
 
 class Disk:
-    """The changes that traced calls made to files below a folder, and which of them are safe."""
-
     def __init__(self, root: Path, *, always_safe: str = "") -> None:
         self.root = root
         self._always_safe = always_safe
@@ -164,10 +155,7 @@ class Disk:
         return _Name(path, node)
 
     def _sync(self, path: str, *, worked: bool) -> None:
-        """Mark the changes of a file or folder as safe, or as lost if the sync failed.
-
-        A later sync does not make a lost change safe.
-        """
+        """Mark changes as safe, or as lost if the sync failed; a later sync does not help."""
         node = self._names.get(path, _GONE)
         scope = path if node == _FOLDER else node
         for change in self.changes:
@@ -176,7 +164,6 @@ class Disk:
                     (change.safe if worked else change.lost).add(index)
 
     def states(self) -> Iterator[tuple[str, list[_Change]]]:
-        """Yield each state that the disk may have now: a title, and the missing changes."""
         unsafe = [change for change in self.changes if not change.is_safe]
         yield "nothing unsynced", unsafe
         yield "all", []
@@ -214,10 +201,7 @@ class Disk:
 
 
 def run(rig: Rig) -> Iterator[Result]:
-    """Book a demand, and yield the result of a restart for each disk that a power loss could leave.
-
-    The power is lost at each sync, and after the answer.
-    """
+    """Book a demand; restart from each disk that a power loss could leave at a sync or the end."""
     rig.restore()
     disk = Disk(rig.folder, always_safe=str(rig.state) if rig.remote else "")
     ran = rig.must(rig.book(DEMAND, Strace(_TRACE)))
@@ -251,10 +235,9 @@ def _lose(
 
 
 def failed_sync(rig: Rig, number: int) -> Result:
-    """Fail a sync of the branch or pack, start again, then lose power; nothing may be missing.
+    """Fail a sync, start again, then lose power.
 
-    After a failed sync, the next start can still read the data, but a power loss would remove it.
-    So the next start must write the data again.
+    The next start can still read what was not synced, but must write it again.
     """
     rig.restore()
     disk = Disk(rig.folder)

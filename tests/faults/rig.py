@@ -30,28 +30,22 @@ from uuid import NAMESPACE_OID, uuid5
 import yaml
 from demandops.base.runtime import Runtime
 
-from tests.kit.goals import Goal, numbered
+from tests.kit.goals import numbered
 from tests.kit.repo import NO_GIT_CONFIG, commits, git
 
 LIMIT_S = 8.0
-"""How many seconds after its start a process that books a demand gets SIGTERM.
-
-The process needs half a second, but it may have to wait for its disk. :meth:`Rig.is_slower` raises
-the limit on a busy machine.
-"""
+"""How many seconds a process that books a demand has until SIGTERM; it needs half a second."""
 PATIENCE = 20
 """The limit on a busy machine, as a multiple of the time that a demand without a fault took."""
 PLENTY_S = 300.0
 """How many seconds a command without a fault has; on a busy machine, one needed more than 60."""
 END_S = 8.0
-"""How many seconds after SIGTERM a process gets SIGKILL."""
 BEGIN = "/faults-begin"
 _FIRST_TIME = datetime(2026, 11, 1, tzinfo=timezone.utc)
-"""The time that the stopped clock of a rig's first process shows.
+"""The time of a rig's first process, of which each further one shows a minute more.
 
-The stopped clock of each further process shows one minute more. So each run of a demand makes the
-same commits. Its system calls keep their numbers, except for small differences, and a rig
-recognizes a state of the disk that it has met before (:meth:`Rig.fingerprint`).
+So each run makes the same commits and nearly the same calls, and a rig recognizes a disk
+(:meth:`Rig.fingerprint`).
 """
 _END_WITH_PARENT, _ADOPT_ORPHANS = 1, 36  # PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER
 _CHANCE = re.compile(
@@ -63,53 +57,18 @@ _CHANCE = re.compile(
 GIT = "git"
 """The value of ``Strace.at`` for all processes of git; each process gets a strace of its own."""
 
-_GIT = """#!/bin/sh
-# Runs one of git's programs, under strace if it is the process that is asked for.
-program=${0##*/}
-command=${program#git-}
-if [ "$program" = git ]; then
-  for command in "$@"; do case $command in -*) ;; *) break ;; esac; done
-fi
-if [ -n "$FAULTS_AT" ]; then
-  number=1
-  set -C  # so that > fails if the file exists; mkdir would do, but it would be a process
-  until true 2>/dev/null >"$FAULTS_TRACES/$command $number"; do number=$((number + 1)); done
-  case "$FAULTS_AT" in git | "git $command $number")
-    trace="$FAULTS_TRACES/$command $number"
-    pwd -P >"$trace.folder"
-    exec strace -y -o "$trace.calls" $FAULTS_STRACE "$FAULTS_EXEC/$program" "$@"
-    ;;
-  esac
-fi
-exec "$FAULTS_EXEC/$program" "$@"
-"""
-
 
 @dataclass(frozen=True)
 class Strace:
-    """The options of strace, and what strace traces.
-
-    ``at`` is the name of a thread, :data:`GIT` for all processes of git, or the command and the
-    number of one process of git, such as ``git push 1``.
-    """
+    """The options of strace, and whom it traces: a thread, :data:`GIT`, or ``git push 1``."""
 
     options: Sequence[str]
     at: str = "MainThread"
 
-    @property
-    def is_of_git(self) -> bool:
-        """Whether strace traces processes of git."""
-        return self.at.split()[0] == GIT
-
 
 @dataclass(frozen=True)
 class GitTrace:
-    """The calls of one process of git.
-
-    The processes of each ``command``, such as ``git push``, are numbered from 1: ``which`` is the
-    number of this process. ``folder`` is the working directory of the process, and ``text`` is the
-    output of strace.
-    """
+    """What strace printed of process number ``which`` of a git command."""
 
     command: str
     which: int
@@ -119,10 +78,7 @@ class GitTrace:
 
 @dataclass(frozen=True)
 class Ran:
-    """What a process did: its exit code, its output, its traces, and how it hung, if it hung.
-
-    ``lingers`` is true if a child of the process, such as ``git push``, outlived the process.
-    """
+    """What a process did; ``lingers``: a child such as ``git push`` outlived it."""
 
     code: int
     out: str
@@ -135,7 +91,6 @@ class Ran:
 
     @property
     def commit(self) -> str:
-        """The commit in which the demand is acknowledged, or empty."""
         if self.code:
             return ""
         with suppress(ValueError, KeyError, IndexError):
@@ -145,10 +100,7 @@ class Ran:
 
 
 class Rig:
-    """A state repo, and processes that book demands in it.
-
-    With ``remote`` the processes address the repo by its URL, otherwise by its folder.
-    """
+    """A state repo, addressed by its URL if ``remote``, and processes that book demands in it."""
 
     def __init__(self, folder: Path, *, remote: bool) -> None:
         self.folder, self.remote = folder / "here", remote
@@ -170,17 +122,14 @@ class Rig:
     def _wrap_git(self) -> None:
         """Replace git's programs, even those that git starts, by a script that can trace them."""
         wrapper, self._git = self.scratch / "wrapper", self.scratch / "git-core"
-        wrapper.write_text(_GIT)
+        wrapper.write_bytes(Path(__file__).with_name("git.sh").read_bytes())
         wrapper.chmod(0o755)
         self._git.mkdir()
         for program in _git_core().glob("git*"):
             (self._git / program.name).symlink_to(wrapper)
 
     def is_slower(self, number: int) -> bool:
-        """Book a demand that meets no fault, and return whether the limit had to be raised.
-
-        A process that seemed to hang may only have been slow on a busy machine.
-        """
+        """Book a demand without a fault; return whether the limit had to be raised."""
         began = time.monotonic()
         self.must(self.book(number, limit=PLENTY_S))
         before = self.limit
@@ -192,16 +141,13 @@ class Rig:
             lock.unlink()
 
     def must(self, ran: Ran) -> Ran:
-        """Return ``ran``; fail unless its exit code is 0."""
         assert ran.code == 0, f"{ran.code}: {ran.out}{ran.err}"
         return ran
 
     def save(self) -> None:
-        """Copy all files, for :meth:`restore`.
+        """Copy all files, for :meth:`restore`, with times in the order of their names.
 
-        Set the times of the copies one second apart, in the order of the files' names. Git opens
-        the newest pack first, so packs of the same age could be opened in a different order in
-        each rig.
+        Git opens the newest pack first, so packs of one age could be opened in any order.
         """
         shutil.rmtree(self._template, ignore_errors=True)
         shutil.copytree(self.folder, self._template, symlinks=True)
@@ -212,7 +158,6 @@ class Rig:
         self._runs_of_template = self._runs
 
     def restore(self) -> None:
-        """Bring back all files as they were at the last :meth:`save`."""
         shutil.rmtree(self.folder)
         shutil.copytree(self._template, self.folder, symlinks=True)
         self._runs = self._runs_of_template
@@ -229,13 +174,11 @@ class Rig:
         return told.hexdigest()
 
     def goal_file(self, number: int) -> Path:
-        """Write the demand with a number to a file, and return its path."""
         file = self.scratch / f"{number}.yaml"
-        file.write_text(yaml.safe_dump(goal(number)))
+        file.write_text(yaml.safe_dump(numbered(number)))
         return file
 
     def book(self, number: int, strace: Strace | None = None, limit: float = 0) -> Ran:
-        """Book the demand with a number; return what the process did."""
         file = str(self.goal_file(number))
         command = ("request", file, "--state-repo", self.address, "--output", "json")
         return self.demandops(*command, strace=strace, limit=limit or self.limit)
@@ -243,17 +186,14 @@ class Rig:
     def demandops(
         self, *command: str, strace: Strace | None = None, limit: float = PLENTY_S
     ) -> Ran:
-        """Run a command in a process of its own; return what the process did."""
         paths = {name: self.scratch / name for name in ("out", "err", "trace")}
         for path in paths.values():
             path.unlink(missing_ok=True)
         traces = self.scratch / "traces"
         shutil.rmtree(traces, ignore_errors=True)
         traces.mkdir()
-        environment = NO_GIT_CONFIG | {
-            "DEMANDOPS_DATA_HOME": str(self.home),
-        }
-        if strace is not None and strace.is_of_git:
+        environment = NO_GIT_CONFIG | {"DEMANDOPS_DATA_HOME": str(self.home)}
+        if strace is not None and strace.at.split()[0] == GIT:
             environment |= {
                 "PATH": f"{self._git}:{os.environ['PATH']}",
                 "GIT_EXEC_PATH": str(self._git),
@@ -287,10 +227,7 @@ class Rig:
         paths: dict[str, Path],
         limit: float,
     ) -> Ran:
-        """Wait for the end of a process; return what it did.
-
-        If ``strace`` names a thread, trace the thread from its start.
-        """
+        """Wait for the end of a process; trace the thread of ``strace`` from its start."""
         roles: dict[int, str] = {}
         alone = 0  # the only traced thread, if any; strace then writes no thread numbers
         tracer: subprocess.Popen[str] | None = None
@@ -334,11 +271,6 @@ class Rig:
             texts["trace"] = "".join(f"{alone} {line}\n" for line in texts["trace"].splitlines())
         code = os.waitstatus_to_exitcode(status)
         return Ran(code, roles=roles, hangs=hangs, lingers=_lingers(), **texts)
-
-
-def goal(number: int) -> Goal:
-    """Return the demand with a number; each demand has a requester of its own."""
-    return numbered(number)
 
 
 @cache
@@ -385,7 +317,6 @@ def _make_repeatable(now: datetime) -> None:
 
 
 def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int) -> None:
-    """Run the command line in this forked process, then end the process."""
     from demandops.cli import main
 
     code = 70
@@ -423,7 +354,6 @@ def _become(command: Sequence[str], out: Path, err: Path, tell: int, waits: int)
 
 
 def commits_by_demand(rig: Rig) -> dict[int, list[str]]:
-    """Map the number of each booked demand to its commits; more than one commit is a fault."""
     found: dict[int, list[str]] = {}
     for commit in commits(rig.state):
         name = commit.one("Request-Id")

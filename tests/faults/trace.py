@@ -7,20 +7,17 @@ import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+
+from tests.kit import plain_yaml
 
 _LINE = re.compile(r"(\d+) +(.*)")
 _CALL = re.compile(r"(\w+)\((.*)\) += (-?\d+|\?|0x[0-9a-f]+)(.*)", re.DOTALL)
 _TEXT = re.compile(r'"((?:[^"\\]|\\.)*)"')
 _FILE = re.compile(r"(?:AT_FDCWD|\d+)<((?:[^>\\]|\\.)*)>")
 _NAME_IN = re.compile(rf"{_FILE.pattern}, {_TEXT.pattern}")
-_AT = {
-    "execveat", "faccessat", "faccessat2", "fchmodat", "fchownat", "linkat", "mkdirat",
-    "newfstatat", "openat", "readlinkat", "renameat", "renameat2", "statx", "symlinkat",
-    "unlinkat", "utimensat",
-}  # fmt: skip
-"""The calls that name a file relative to an open folder."""
-_TWO_NAMES = {"link", "linkat", "rename", "renameat", "renameat2", "symlink"}
+_TRAITS = plain_yaml.load(Path(__file__).with_name("calls.yaml").read_text())
 _FORKS = ("clone", "clone3", "fork", "vfork")
 _RANDOM = (
     (re.compile(r"\b[0-9a-f]{2}/[0-9a-f]{38}\b"), "??/*"),
@@ -33,8 +30,6 @@ _RANDOM = (
 
 @dataclass(frozen=True)
 class Call:
-    """A system call; it is the ``n``-th call of its ``kind`` in a thread or process."""
-
     process: int
     role: str
     kind: str
@@ -45,14 +40,17 @@ class Call:
 
     @property
     def failed(self) -> bool:
-        """Whether the call returned an error, be it real or injected."""
         return self.result.startswith(("-1", "?"))
 
     @property
     def text(self) -> bytes:
-        """The bytes that the call wrote."""
         found = _TEXT.search(self.arguments)
         return _decoded(found[1]) if found else b""
+
+
+@cache
+def calls_of(trait: str) -> frozenset[str]:
+    return frozenset(kind for kind, traits in _TRAITS.items() if trait in traits)
 
 
 def file_class(path: str, root: Path) -> str:
@@ -66,8 +64,7 @@ def file_class(path: str, root: Path) -> str:
 def parse(text: str, roles: dict[int, str], root: Path, folder: str = "/") -> list[Call]:
     """Return the calls that touch a file below ``root``, in the order in which they ended.
 
-    ``roles`` has the names of threads and processes. Any other process is named after the program
-    that it executes. The first process starts in ``folder``.
+    ``roles`` names threads and processes; any other process is named after its program.
     """
     known, roles = set(roles), dict(roles)
     folders: dict[int, str] = {}
@@ -140,19 +137,18 @@ def _program(arguments: str, before: str) -> str:
 
 
 def _paths(kind: str, arguments: str, folder: str) -> list[str]:
-    """Return the paths of the files to which a call refers, by name or by an open file's number.
+    """Return the paths of a call's files, by name or by number.
 
-    A text in quotes may also be data that is read or written. Only the kind of the call shows
-    whether it is a name.
+    Only the kind of the call shows whether a text in quotes is a name or data.
     """
-    if kind in _AT:
+    if kind in calls_of("at a folder"):
         named = [Path(_name(base), _name(name)) for base, name in _NAME_IN.findall(arguments)]
     elif arguments.startswith('"'):
         named = [Path(folder, _name(name)) for name in _TEXT.findall(arguments)]
     else:
         numbered = map(_name, _FILE.findall(_TEXT.sub("", arguments)))
         return [path for path in numbered if path.startswith("/")]
-    return [str(path) for path in named[: 2 if kind in _TWO_NAMES else 1]]
+    return [str(path) for path in named[: 2 if kind in calls_of("two names") else 1]]
 
 
 def _name(text: str) -> str:

@@ -18,11 +18,7 @@ from hypothesis import strategies as st
 
 @dataclass(frozen=True)
 class Target:
-    """A check of any input; an exception that is not ``expected`` makes the input a finding.
-
-    A target that takes bytes has ``seeds``, which are sample inputs. Any other target has
-    ``values`` instead, a strategy that generates its inputs.
-    """
+    """A check of bytes like the ``seeds``, or of ``values``; other errors are findings."""
 
     check: Callable[[Any], object]
     seeds: tuple[bytes, ...] = ()
@@ -31,5 +27,4 @@ class Target:
 
     @property
     def name(self) -> str:
-        """The name of the target: the name of its check function, with ``-`` in place of ``_``."""
         return self.check.__name__.strip("_").replace("_", "-")

@@ -48,8 +48,6 @@ class TooSlow(BaseException):
 
 
 class Run:
-    """Runs a target in a process of its own."""
-
     def __init__(self, target: Target, seconds: float) -> None:
         self.target, self.seconds = target, seconds
         self.folder = FOLDER / target.name
@@ -58,7 +56,6 @@ class Run:
         self._kept: dict[str, int] = {}
 
     def __call__(self) -> None:
-        """Look for findings until the time is up, then end the process."""
         out = os.open(self.folder / "out", os.O_WRONLY | os.O_CREAT | os.O_APPEND)
         os.dup2(out, 1)
         os.dup2(out, 2)
@@ -92,9 +89,8 @@ class Run:
             error = self._error(value)
         if error is None:
             return
-        frames = [
-            one for one in traceback.extract_tb(error.__traceback__) if _is_ours(one.filename)
-        ]
+        stack = traceback.extract_tb(error.__traceback__)
+        frames = [one for one in stack if _is_ours(one.filename)]
         where = f"{Path(frames[-1].filename).stem}-{frames[-1].lineno}" if frames else ""
         name = f"{type(error).__name__}-{where}"
         data = value if isinstance(value, bytes) else repr(value).encode("utf-8", "replace")
@@ -124,15 +120,11 @@ class Run:
         words = {*_ODD, *re.findall(r"[\w./-]{2,30}", text)}
         dictionary = self.folder / "words"
         dictionary.write_text("".join(f'"{word}"\n' for word in sorted(words)))
-        options = {
-            "max_total_time": int(self.seconds),
-            "timeout": _WALL_S,
-            "rss_limit_mb": 0,
-            "max_len": _LONGEST_INPUT,
-            "dict": dictionary,
-            "artifact_prefix": f"{self.folder}/",
-        }
-        flags = [f"-{name}={value}" for name, value in options.items()]
+        flags = [
+            *(f"-max_total_time={self.seconds:.0f}", f"-timeout={_WALL_S}", "-rss_limit_mb=0"),
+            *(f"-max_len={_LONGEST_INPUT}", f"-dict={dictionary}"),
+            f"-artifact_prefix={self.folder}/",
+        ]
         atheris.Setup([sys.argv[0], *flags, str(corpus)], self.check)
         atheris.Fuzz()
 
@@ -152,10 +144,6 @@ class Run:
             some()
 
     def findings(self, exitcode: int | None) -> list[str]:
-        """Return the names of all findings.
-
-        If the process of the target ended with an ``exitcode`` other than 0, that is a finding too.
-        """
         found = sorted(path.name for path in self.folder.iterdir() if path.suffix == ".input")
         return found if exitcode == 0 else [*found, f"the process ended with {exitcode}; see out"]
 
@@ -169,8 +157,6 @@ def _is_ours(file: str) -> bool:
 
 
 def changed(seeds: tuple[bytes, ...]) -> st.SearchStrategy[bytes]:
-    """Return a strategy for the seeds with some bytes replaced, removed or doubled."""
-
     def change(seed: bytes, random: Random) -> bytes:
         data = bytearray(seed)
         for _ in range(random.randrange(1, 6)):
@@ -184,7 +170,6 @@ def changed(seeds: tuple[bytes, ...]) -> st.SearchStrategy[bytes]:
 
 
 def run(one: Run) -> list[str]:
-    """Run a target in a process of its own; return the paths of its findings."""
     shutil.rmtree(one.folder, ignore_errors=True)
     one.folder.mkdir(parents=True)
     process = get_context("fork").Process(target=one, daemon=True)
@@ -200,7 +185,6 @@ def run(one: Run) -> list[str]:
 
 
 def main(names: list[str]) -> int:
-    """Run the named targets, one per processor at a time; return 1 after a finding, else 0."""
     ours = ["demandops", "demandops_ros"]
     instrumented = atheris.instrument_imports(include=ours) if atheris else nullcontext()
     with instrumented, redirect_stderr(StringIO()):  # atheris prints each module's name

@@ -8,7 +8,8 @@ import socket
 import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
-from functools import cache
+from functools import cache, wraps
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -20,13 +21,12 @@ from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.cli import target
 from demandops.cli.actions.override import ends_at
+from demandops.cluster.health import ClusterDomain, ObjectName, health_reader
 from demandops.cluster.health import Target as ReleaseTarget
-from demandops.cluster.health import health_reader
 from demandops.decide.state import try_configuration
 from demandops.detect import rule_file
 from demandops.detect.detector import Detector, Want
 from demandops.detect.observations import MessageReader, Observation, Unreadable
-from demandops.detect.rule_file import RuleFile
 from demandops.model.config import override, policy
 from demandops.model.config.load import load
 from demandops.model.ledger import claim_file, records
@@ -41,16 +41,15 @@ from demandops_ros import messages
 from hypothesis import strategies as st
 
 from tests.fuzz import Target
-from tests.kit import detection, golden, rich
-from tests.kit.cluster import Letters, condition, deployment
+from tests.kit import golden, plain_yaml, rich
+from tests.kit.cluster import Letters
 from tests.kit.config import state_of
 from tests.kit.goals import EXPERIMENT
 from tests.kit.memory import NOW
-from tests.unit.cluster import test_argocd, test_flux
 from tests.unit.demand.test_fuzz import ANYTHING, KEY, TEXT, assert_told, outcome
 
-_PATHS = sorted(golden.GOLDEN.rglob("expected/**/*.yaml"))
-_BOOKED = [path for path in _PATHS if "ledger" in path.parts]
+_SEEDS = plain_yaml.load(Path(__file__).with_name("seeds.yaml").read_text())
+_BOOKED = sorted(golden.GOLDEN.rglob("expected/*/ledger/**/*.yaml"))
 _GOALS = [*EXPERIMENT, *golden.GOLDEN.glob("*/requests/*.yaml")]
 
 
@@ -59,19 +58,26 @@ def _text(data: bytes) -> str:
 
 
 def _bytes(paths: Iterable[Path], most: int = 20) -> tuple[bytes, ...]:
-    """Return the distinct contents of the files, at most ``most`` of them."""
     return tuple(dict.fromkeys(path.read_bytes() for path in paths))[:most]
 
 
-def _told(error: InvalidInput) -> None:
-    """Check that each fault names a file and says something."""
-    assert error.faults
-    assert all(found.file and found.message for found in error.faults), error.faults
+def names_its_faults(check: Callable[[Any], object]) -> Callable[[Any], object]:
+    """Return a check that also fails if a fault names no file or says nothing."""
+
+    @wraps(check)
+    def both(value: Any) -> None:
+        try:
+            check(value)
+        except InvalidInput as error:
+            assert error.faults
+            assert all(found.file and found.message for found in error.faults), error.faults
+            raise
+
+    return both
 
 
 @cache
 def _folder() -> Path:
-    """Return a new folder, and make it the working directory of this process."""
     folder = Path(tempfile.mkdtemp(prefix="demandops-fuzz-"))
     os.chdir(folder)
     return folder
@@ -102,9 +108,8 @@ def goal_as_data(data: Any) -> None:
 
 
 def _goals() -> st.SearchStrategy[Any]:
-    """Return a strategy for any data, and for valid goals in which parts are replaced."""
     models = [rich.reference_goal(), rich.own_goal()]
-    return st.one_of(ANYTHING, *(_near(model, st.one_of(ANYTHING, TEXT)) for model in models))
+    return st.one_of(ANYTHING, *(_near(model, ANYTHING | TEXT) for model in models))
 
 
 def _near(value: Any, other: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
@@ -120,7 +125,6 @@ def _near(value: Any, other: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
 
 
 def _message(kind: Callable[[], Any]) -> st.SearchStrategy[Any]:
-    """Return a strategy for messages of a type with any content."""
     known = {"string": TEXT.filter(str.isprintable), "boolean": st.booleans()}
     known |= {"double": st.floats(), "uint8": st.integers(0, 255)}
     known |= {"uint32": st.integers(0, 2**32 - 1), "int32": st.integers(-(2**31), 2**31 - 1)}
@@ -157,26 +161,23 @@ def _seeds_of(paths: list[str]) -> tuple[bytes, ...]:
     return tuple(bytes([number]) + _CONFIG[path].encode() for number, path in enumerate(paths))
 
 
+@names_its_faults
 def config_file(data: bytes) -> None:
-    try:
-        load(_CONFIG | {_FILES[data[0] % len(_FILES)] if data else "": _text(data[1:])})
-    except InvalidInput as error:
-        _told(error)
+    load(_CONFIG | {_FILES[data[0] % len(_FILES)] if data else "": _text(data[1:])})
 
 
+@names_its_faults
 def chart_file(data: bytes) -> None:
     _try({_CHARTS[data[0] % len(_CHARTS)] if data else "": _text(data[1:])})
 
 
+@names_its_faults
 def chart_values(file: tuple[str, Any]) -> None:
     _try({file[0]: json.dumps(file[1])})
 
 
 def _try(changed: dict[str, str]) -> None:
-    try:
-        try_configuration(state_of(load(_CONFIG | changed)))
-    except InvalidInput as error:
-        _told(error)
+    try_configuration(state_of(load(_CONFIG | changed)))
 
 
 def _changed_charts() -> st.SearchStrategy[tuple[str, Any]]:
@@ -199,15 +200,15 @@ def set_key(data: bytes) -> None:
     strict_yaml.set_key(_text(data), "renderVersion", 2)
 
 
+@names_its_faults
 def claim(data: bytes) -> None:
     text, path = _text(data), "ledger/applications/00/x/x.yaml"
     try:
         claim_file.read(text, path)
     except InvalidInput as error:
-        _told(error)
         (found, *_) = error.faults
         if not found.message.startswith("the ids in this file belong to "):
-            return
+            raise
         path = found.message.removeprefix("the ids in this file belong to ").partition(";")[0]
     read = claim_file.read(text, path)
     assert claim_file.read(claim_file.text_of(read), path) == read
@@ -239,47 +240,32 @@ def waiting_demand(data: bytes) -> None:
 # ---- files that only one person or one program reads ----
 
 
+@names_its_faults
 def contexts_file(data: bytes) -> None:
     os.environ["XDG_CONFIG_HOME"] = str(_folder())
     target.contexts_file().parent.mkdir(exist_ok=True)
     target.contexts_file().write_bytes(data)
-    try:
-        content = target.read_contexts()
-    except InvalidInput as error:
-        _told(error)
-        return
+    content = target.read_contexts()
     target.write_contexts(content)
     assert target.read_contexts() == content
 
 
+@names_its_faults
 def detector_rules(data: bytes) -> None:
     """Check that rules that can be read also compile, accept observations and form goals."""
-    try:
-        file = rule_file.read(_text(data), "rules.yaml")
-    except InvalidInput as error:
-        _told(error)
-        return
+    file = rule_file.read(_text(data), "rules.yaml")
     detector, wants = Detector(file, 0.0), list[Want]()
     for number, now in enumerate((0.0, 0.5, 2.0, 30.0, 1e5)):
-        seen = [
-            one
-            for source in file.sources
-            for entity in ("a", "b")
-            for one in _seen(file, source, entity, now, number)
-        ]
+        seen = list[Observation]()
+        for source, entity in product(file.sources, ("a", "b")):
+            with suppress(Unreadable):
+                message = _Message(number * 3.0)
+                seen.append(MessageReader(file, source).observation(message, entity, now))
         wants += [want for _, want in detector.step(seen[:20], now)]
     wants += detector.replace_rules(file, 1e5, 1.0)
     for want in wants[:5]:
         if want.goal is not None:
             goal_as_data(want.goal)
-
-
-def _seen(
-    file: RuleFile, source: str, entity: str, now: float, number: int
-) -> Iterable[Observation]:
-    """Yield the observation from a message in which every field has the same value."""
-    with suppress(Unreadable):
-        yield MessageReader(file, source).observation(_Message(number * 3.0), entity, now)
 
 
 class _Message(float):
@@ -299,86 +285,7 @@ def end_of_override(data: bytes) -> None:
     ends_at(_text(data))
 
 
-_WAITING = b"""apiVersion: demandops.ledger/v2
-kind: WaitingDemand
-demand: x
-request: x
-requesters:
-- vehicle00
-since: "2026-01-31T12:00:00.000000Z"
-priority: 5
-goal:
-  kind: Demand
-  demand: x
-  requesters: [vehicle00]
-  applications:
-  - id: x
-    type: object-detection-fusion
-    place: {role: edge}
-    inputs: {ego_data: [{topic: /ego, source: vehicle00}]}
-"""
-_CONTEXTS = b"""apiVersion: demandops/v1
-kind: Contexts
-current: fleet
-contexts:
-  fleet: {stateRepo: https://git.example/fleet.git, clusters: /etc/clusters.yaml, signingKey: /k}
-  other: {stateRepo: ../other}
-"""
-_SQUARE = [{"x": x, "y": y} for x, y in ((0, 0), (9, 0), (9, 9), (0, 9))]
-_AREA = {"source": "cars", "polygon": _SQUARE}
-_RULES = (
-    Path(__file__).parents[2].joinpath("examples/experiment/rules.yaml").read_bytes(),
-    *(
-        detection.text_of(detection.rule("r", **condition)).encode()
-        for condition in (
-            {"near": {"source": "cars", "point": {"x": 1, "y": 2}, "start": 5, "stop": 9}},
-            {"near": {**_AREA, "start": 5, "stop": 9}, "dwell": "1s", "retry": "5s"},
-            {"together": {"source": "cars", "other": "bikes", "start": 5, "stop": 9}},
-            {"count": {**_AREA, "start": 2, "stop": 1}},
-            {
-                "threshold": {
-                    "source": "batteries",
-                    "field": "percentage",
-                    "below": 3,
-                    "stop": 8,
-                }
-            },
-            {"schedule": {"start": "06:00", "stop": "22:00", "days": ["mon"], "zone": "UTC"}},
-        )
-    ),
-)
-_MARKER = (
-    b'apiVersion: demandops.ledger/v1\nkind: EndedOverride\noverride: x\nexpires: "2026-01-31T12:00'
-    b':00Z"\n'
-)
-_REPLICAS = b"""apiVersion: demandops.ledger/v2
-kind: KeptReplicas
-service: object-fusion
-node: edge
-keeps:
-- replicas: 3
-  until: "2026-01-31T12:00:00.000000Z"
-"""
-_SHUTDOWN = b"""apiVersion: demandops.ledger/v2
-kind: Shutdown
-digest: 0f0f0f0f0f0f0f0f0f0f
-request: x
-requesters:
-- vehicle00
-at: "2026-01-31T12:00:00.000000Z"
-"""
-
-
 # ---- what the generator keeps, and Git ----
-
-_PROPOSAL = {"branch": "demand/x", "commits": ["1" * 40], "base": "", "pushed": True, "link": ""}
-_ENTRY = {
-    "operation": "o",
-    "goal": {"id": "x"},
-    "received": "2026-01-31T12:00:00+00:00",
-    "base": "",
-}
-_LINES = [_ENTRY, {"done": "o"}, _ENTRY | {"operation": "p", "proposal": _PROPOSAL}]
 
 
 def journal_line(data: bytes) -> None:
@@ -402,20 +309,6 @@ def commit(data: bytes) -> None:
     assert entry.by_generator in (True, False)
     commit_log.author_of(found)
     revisions.format_time(entry.time)
-
-
-_COMMIT = b"""author petra <petra@example.org> 1769860800 +0100
-committer DemandOps generator <generator@demandops.invalid> 1769860800 +0000
-
-Join edge/fusion
-
-Why: request 'x', received 2026-01-31.
-
-Operation: join
-Operation-Id: op-1
-Requester: vehicle00
-Render-Version: 1
-"""
 
 
 def address(data: bytes) -> None:
@@ -447,8 +340,6 @@ def moment(data: bytes) -> None:
 
 
 # ---- servers and clusters ----
-
-_PULL = {"number": 1, "html_url": "https://x", "state": "open", "merged_at": None, "merged": False}
 
 
 def forge_answer(data: bytes) -> None:
@@ -485,9 +376,6 @@ def webhook(data: bytes) -> None:
     assert len(pushed) == before or b"secret" in data or b"ignature" in data.title(), data
 
 
-_PUSH = b"POST /push HTTP/1.1\r\nHost: x\r\nContent-Length: 2\r\nX-Gitlab-Token: %s\r\n\r\n{}"
-
-
 def webhook_address(data: bytes) -> None:
     text = _text(data)
     if any(char.isalpha() for char in text):
@@ -495,45 +383,15 @@ def webhook_address(data: bytes) -> None:
     PushWebhook(text, b"", lambda: None).close()
 
 
-_READY = [condition("Ready", "True", "done"), condition("Ready", "False", "no")]
-_OBJECTS: dict[Any, list[Any]] = {
-    ("Kustomization", "ns", "perception"): [
-        test_flux.kustomization("b", "b", one) for one in _READY
-    ],
-    ("GitRepository", "ns", "demandops"): [{"metadata": {}, "status": {"conditions": _READY[1:]}}],
-    ("HelmRelease", "ns", "od-edge"): [test_flux.release(one) for one in _READY],
-    ("Deployment", "ns", "od-edge"): [
-        deployment("od-edge", condition("Progressing", "False"), of="od-edge", availableReplicas=1)
-    ],
-    test_argocd.OVER: [
-        test_argocd.application(
-            test_argocd.FOLDER, sync=sync, at="b", operation=test_argocd.synced(phase, "b", "m")
-        )
-        for sync, phase in (("Synced", "Succeeded"), ("OutOfSync", "Failed"))
-    ],
-    test_argocd.CHILD: [
-        test_argocd.application(
-            test_argocd.source(),
-            sync="Synced",
-            at="b",
-            resources=({"kind": "Deployment", "namespace": "ns", "name": "od-edge"},),
-            conditions=({"type": "SyncError", "message": "m"},),
-            operation=test_argocd.synced(
-                "Failed",
-                "b",
-                of=test_argocd.source(),
-                resources=[{"kind": "Job", "name": "x", "status": "SyncFailed", "message": "m"}],
-            ),
-        )
-    ],
-}
+_OBJECTS = {tuple(one["place"]): one["reported"] for one in _SEEDS["cluster-objects"]}
+_PLACES = (
+    ClusterDomain("c-its", "perception", "ns"),
+    ClusterDomain("c-its", "perception", "ns", ObjectName("argocd", "demandops-perception")),
+)
 
 
 def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
-    """Return a strategy for what an API may report instead of ``value``.
-
-    In these values, parts are missing or null, and texts and numbers differ.
-    """
+    """Return a strategy for objects with parts missing or null, or with other texts and numbers"""
     if isinstance(value, dict):
         parts = {key: _reported(inner, is_top=False) for key, inner in value.items()}
         if not is_top:
@@ -549,7 +407,7 @@ def _reported(value: Any, *, is_top: bool = True) -> st.SearchStrategy[Any]:
 
 
 def cluster_objects(objects: dict[Any, Any]) -> None:
-    for place in (test_flux.PLACE, test_argocd.PLACE):
+    for place in _PLACES:
         reader = health_reader(place)
         for is_service, wanted in ((True, True), (True, False), (False, True), (False, False)):
             target = ReleaseTarget(place, "od-edge", is_service=is_service, wanted=wanted)
@@ -563,7 +421,13 @@ def cluster_objects(objects: dict[Any, Any]) -> None:
 _ALL_OBJECTS = st.fixed_dictionaries(
     {}, optional={key: st.one_of(map(_reported, some)) for key, some in _OBJECTS.items()}
 )
-_TOLD = (ValueError, TypeError, AssertionError, AttributeError, OverflowError)
+_LINES = [json.loads(line) for line in _SEEDS["journal-line"][0].splitlines()]
+_RULES = Path(__file__).parents[2] / "examples/experiment/rules.yaml"
+
+
+def _seeds(check: Callable[[bytes], object]) -> tuple[bytes, ...]:
+    return tuple(text.encode() for text in _SEEDS[check.__name__.replace("_", "-")])
+
 
 TARGETS = (
     Target(goal_as_yaml, _bytes(_GOALS)),
@@ -572,48 +436,19 @@ TARGETS = (
     Target(
         data_to_ros_message,
         values=_near(rich.own_goal(), ANYTHING) | st.dictionaries(KEY, ANYTHING),
-        expected=_TOLD,
+        expected=(ValueError, TypeError, AssertionError, AttributeError, OverflowError),
     ),
     Target(config_file, _seeds_of(_FILES)),
     Target(chart_file, _seeds_of(_CHARTS)),
     Target(chart_values, values=_changed_charts()),
     Target(set_key, tuple(_CONFIG[path].encode() for path in _FILES)),
     Target(claim, _bytes(path for path in _BOOKED if "shutdowns" not in path.parts)),
-    Target(marker, (_MARKER,)),
-    Target(shutdown, (_SHUTDOWN,)),
-    Target(replicas, (_REPLICAS,)),
-    Target(waiting_demand, (_WAITING,)),
-    Target(contexts_file, (_CONTEXTS,)),
-    Target(detector_rules, _RULES),
-    Target(
-        end_of_override,
-        (b"2h", b"3d", b"1h30m", b"2027-01-31T18:00:00Z"),
-        expected=(click.BadParameter,),
-    ),
-    Target(
-        journal_line,
-        (journal._sealed(_LINES, "")[0], *(json.dumps(one).encode() + b"\n" for one in _LINES)),
-    ),
-    Target(commit, (_COMMIT,)),
-    Target(
-        address,
-        tuple(
-            one.encode()
-            for one in ("https://a:b@x.org/y.git", "ext::sh", "git@x.org:y", "~/x", "repo.git")
-        ),
-    ),
-    Target(revision, (b"main~1", b"2h ago", b"2026-01-31T14:03Z", b"14:03", b"HEAD^{tree}")),
-    Target(
-        moment,
-        (
-            b"2026-01-31T12:00:00.000000Z",
-            b"2026-01-31T12:00:00+01:00",
-            b"1h30m",
-            b"0001-01-01T00:00:00+23:59",
-        ),
-    ),
-    Target(forge_answer, (json.dumps(_PULL).encode(),)),
-    Target(webhook, (_PUSH % b"secret", _PUSH % b"x", b"GET / HTTP/1.1\r\nHost: x\r\n\r\n")),
-    Target(webhook_address, (b"127.0.0.1:0", b"[::1]:0", b"0.0.0.0:80")),
+    *(Target(one, _seeds(one)) for one in (marker, shutdown, replicas, waiting_demand)),
+    Target(contexts_file, _seeds(contexts_file)),
+    Target(detector_rules, (*_seeds(detector_rules), _RULES.read_bytes())),
+    Target(end_of_override, _seeds(end_of_override), expected=(click.BadParameter,)),
+    Target(journal_line, (*_seeds(journal_line), journal._sealed(_LINES, "")[0])),
+    *(Target(one, _seeds(one)) for one in (commit, address, revision, moment, forge_answer)),
+    *(Target(one, _seeds(one)) for one in (webhook, webhook_address)),
     Target(cluster_objects, values=_ALL_OBJECTS),
 )

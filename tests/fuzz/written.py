@@ -7,6 +7,7 @@ import json
 import re
 import subprocess
 import tempfile
+from contextlib import suppress
 from datetime import datetime
 from functools import cache
 from pathlib import PurePosixPath
@@ -52,20 +53,8 @@ from tests.unit.repo.test_trailers import (
     test_every_id_is_read_back_by_git_and_by_us_as_it_was as message_is_read_back,
 )
 
-_SOME = [
-    *TRAPS,
-    *UNSEEN,
-    *TRICKY,
-    "../x",
-    "/x",
-    ".git",
-    "a.lock",
-    "-x",
-    "--x=y",
-    "@{",
-    "a~b",
-    "a" * 300,
-]
+_ODD_NAMES = ["../x", "/x", ".git", "a.lock", "-x", "--x=y", "@{", "a~b", "a" * 300]
+_SOME = [*TRAPS, *UNSEEN, *TRICKY, *_ODD_NAMES]
 TEXT = st.text(st.characters(codec="utf-8"), max_size=40) | st.sampled_from(_SOME)
 _LABEL = re.compile(r"([A-Za-z0-9]([A-Za-z0-9_.-]{0,61}[A-Za-z0-9])?)?")
 _LABEL_KEY = re.compile(
@@ -110,17 +99,21 @@ def _filled(given: tuple[int, list[str]]) -> tuple[dict[str, str], Any]:
             holder[key] = random.choice(texts)
     files[name] = yaml.safe_dump(data, allow_unicode=True)
     for old, new in renamed.items():  # an id is renamed everywhere
-        goal = json.loads(json.dumps(goal).replace(json.dumps(old), json.dumps(new)))
+        goal = _renamed(goal, old, new)
         for path in files:
             if path.startswith("inventory/"):
-                whole = _yaml(files[path])
-                whole = json.loads(json.dumps(whole).replace(json.dumps(old), json.dumps(new)))
+                whole = _renamed(_yaml(files[path]), old, new)
                 files[path] = yaml.safe_dump(whole, allow_unicode=True)
     goal["connections"][0]["type"] = random.choice(["mqtt", "zenoh", "ros"])
     return files, goal
 
 
+def _renamed(data: Any, old: str, new: str) -> Any:
+    return json.loads(json.dumps(data).replace(json.dumps(old), json.dumps(new)))
+
+
 def _strings(data: Any) -> list[tuple[Any, Any]]:
+    """Return the holder and the key of each text in a document."""
     found: list[tuple[Any, Any]] = []
     for key, value in list(data.items() if isinstance(data, dict) else enumerate(data)):
         if isinstance(value, str):
@@ -135,19 +128,13 @@ def rendered_file(given: tuple[dict[str, str], Any]) -> None:
     state = state_of(load(files))
     try_configuration(state)
     books = MemoryRepo(state=state)
-    for asked in (goal, {**_only(goal, "connections"), "demand": "b"}):
-        try:
+    for asked in (goal, {**copy.deepcopy(goal), "applications": [], "demand": "b"}):
+        with suppress(InvalidInput):
             books.send(asked)
-        except InvalidInput:
-            continue
     for path, text in books.files.items():
         _below_its_folder(path)
         for document in yaml.load_all(text, Loader=FAST):
             _fits_kubernetes(document)
-
-
-def _only(goal: Any, kept: str) -> Any:
-    return {**copy.deepcopy(goal), "applications": [], kept: copy.deepcopy(goal[kept])}
 
 
 def _fits_kubernetes(document: Any) -> None:
@@ -166,9 +153,8 @@ def _fits_kubernetes(document: Any) -> None:
     for container in (pod.get("spec") or {}).get("containers") or ():
         for word in container.get("args") or ():
             assert isinstance(word, str) and word.isprintable(), word
-            assert ":=" not in word or _LAUNCH.fullmatch(word) or word.startswith("params_file"), (
-                word
-            )
+            is_argument = ":=" in word and not word.startswith("params_file")
+            assert not is_argument or _LAUNCH.fullmatch(word), word
 
 
 def _below_its_folder(path: str) -> None:
@@ -252,24 +238,19 @@ def pull_request(words: tuple[str, list[str]]) -> None:
 _PAIR = st.tuples(TEXT, TEXT)
 _PATCH = st.dictionaries(TEXT, values, max_size=3).filter(lambda one: not _value_problem(one, 0))
 
+_NODES = st.lists(TEXT, min_size=1, max_size=2)
+_TEXTS = st.lists(TEXT, min_size=1, max_size=3)
+_IDS = st.lists(IDS, min_size=1, max_size=3, unique=True)
+
 TARGETS = (
     Target(text_in_yaml, values=TEXT),
     Target(value_in_yaml, values=values.filter(lambda value: not _value_problem(value, 0))),
     Target(claim_in_its_file, values=claims | joined_claims()),
-    Target(
-        rendered_file,
-        values=st.tuples(st.integers(), st.lists(TEXT, min_size=1, max_size=3)).map(_filled),
-    ),
-    Target(
-        override_by_command,
-        values=st.tuples(TEXT, TEXT, st.lists(TEXT, min_size=1, max_size=2), _PATCH),
-    ),
+    Target(rendered_file, values=st.tuples(st.integers(), _TEXTS).map(_filled)),
+    Target(override_by_command, values=st.tuples(TEXT, TEXT, _NODES, _PATCH)),
     Target(ledger_path, values=_PAIR),
     Target(name_of_object, values=_PAIR),
-    Target(
-        message_in_git,
-        values=st.tuples(st.lists(IDS, min_size=1, max_size=3, unique=True), IDS, IDS),
-    ),
+    Target(message_in_git, values=st.tuples(_IDS, IDS, IDS)),
     Target(author_in_git, values=st.tuples(TEXT, TEXT, st.datetimes())),
     Target(branch, values=_PAIR),
     Target(pull_request, values=st.tuples(TEXT, st.lists(IDS, max_size=2))),

@@ -21,14 +21,7 @@ def write_bag(
     plugin: StoragePlugin = StoragePlugin.MCAP,
     texts: Iterable[tuple[float, str, str]] = (),
 ) -> None:
-    """Write a bag of poses; each is a time in seconds since 1970, a vehicle, x and y.
-
-    Args:
-        path: the folder of the bag; it must not exist.
-        poses: in the order of time.
-        plugin: the storage format of the bag.
-        texts: string messages to write before the poses; each is a time, a topic and a text.
-    """
+    """Write a new bag of poses in the order of time, after the texts; times are in seconds."""
     new = _TYPES.types
     topics: dict[str, Any] = {}
     with Writer(path, version=9, storage_plugin=plugin) as writer:

@@ -30,7 +30,6 @@ new PerformanceObserver((list) => {
 
 @contextmanager
 def chromium() -> Iterator[Browser]:
-    """Run Chromium with a new profile for the length of a block; yield the browser."""
     program = shutil.which("chromium")
     assert program, "chromium is not installed; run setup/system page"
     with sync_playwright() as playwright:
@@ -65,7 +64,6 @@ class Visit:
         return self.page
 
     def longest_task_ms(self) -> float:
-        """Return the longest task of the main thread since the page was opened, in milliseconds."""
         self.page.wait_for_timeout(150)  # the observer reports tasks a moment later
         return float(self.page.evaluate("Math.max(0, ...window.longTasks)"))
 

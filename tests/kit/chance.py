@@ -22,7 +22,7 @@ TIMES = int(os.environ.get("DEMANDOPS_EXAMPLES", "1"))
 
 chances = st.randoms(use_true_random=False)
 visible = st.characters(exclude_categories=["C", "Z"], include_characters=" ")
-"""A strategy for the characters that an id may contain."""
+"""Characters that an id may contain."""
 
 
 def examples(count: int) -> Callable[[Any], Any]:

@@ -12,14 +12,11 @@ import pytest
 
 
 class Ran(NamedTuple):
-    """What a command returned and printed."""
-
     code: int
     out: str
     err: str
 
     def json(self) -> Any:
-        """Return the standard output, which must be one JSON document."""
         return json.loads(self.out)
 
 
@@ -27,7 +24,6 @@ Run = Callable[..., Ran]
 
 
 def runner(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
-    """Return a function that runs ``demandops`` in this process with the given arguments."""
     from demandops.cli.main import run
 
     def call(*args: str | Path, stdin: str | bytes = "") -> Ran:

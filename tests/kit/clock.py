@@ -39,16 +39,13 @@ class Clock(Runtime):
         return high if self._start else super().uniform(low, high)
 
     def condition(self) -> threading.Condition:
-        """Return a condition variable that often wakes waiting threads to look at the clock."""
         return _Impatient()
 
     @property
     def offset(self) -> float:
-        """The sum of all seconds by which ``set_by`` has set the wall clock."""
         return self._set
 
     def pass_(self, seconds: float) -> None:
-        """Let time pass on both clocks."""
         self._passed += seconds
 
     def set_by(self, seconds: float) -> None:

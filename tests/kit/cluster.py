@@ -7,20 +7,15 @@ from typing import Any
 
 
 class Letters:
-    """A stand-in for the Git history; the names of its commits are letters in alphabetical order.
-
-    ``changing`` lists what the commits change, as pairs of commit and path.
-    """
+    """A history of commits named by letters; ``changing`` has pairs of commit and changed path."""
 
     def __init__(self, changing: Iterable[tuple[str, str]] = ()) -> None:
         self._changing = list(changing)
 
     def includes(self, commit: str, other: str) -> bool:
-        """Return whether ``commit`` is ``other`` or comes after it."""
         return commit >= other
 
     def unchanged(self, commit: str, other: str, path: str) -> bool:
-        """Return whether two commits have the same content under ``path``."""
         first, last = sorted((commit, other))
         return not any(first < one <= last and path == changed for one, changed in self._changing)
 

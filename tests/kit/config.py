@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from itertools import product
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -31,20 +32,25 @@ def configuration(changed: Mapping[str, str | None] | None = None) -> dict[str, 
     return {path: text for path, text in files.items() if text is not None}
 
 
+@lru_cache
+def texts_below(folder: Path) -> dict[str, str]:
+    """Return the texts of all files in a folder, by their paths in it."""
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {path.relative_to(folder).as_posix(): path.read_text() for path in files}
+
+
 def state_of(config: Config, ledger: Ledger | None = None) -> State:
     """Return a state whose values are computed in this process."""
     return State(config, ledger or Ledger(), evaluate)
 
 
 def edited(path: str, old: str, new: str) -> dict[str, str]:
-    """Return path and text of a skeleton file in which ``new`` replaces the first ``old``."""
     text = skeleton()[path]
     assert old in text, f"{path} does not contain {old!r}"
     return {path: text.replace(old, new, 1)}
 
 
 def brokers(*nodes: str) -> dict[str, str]:
-    """Return path and text of an ``inventory/brokers.yaml`` with a broker on each given node."""
     entries = [{"node": node, "host": f"broker-{node}"} for node in nodes]
     head = {"apiVersion": "demandops/v1", "kind": "Brokers"}
     return {"inventory/brokers.yaml": yaml.safe_dump(head | {"brokers": entries})}

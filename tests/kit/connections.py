@@ -30,13 +30,7 @@ NO_BROKERS = yaml.safe_dump({"apiVersion": "demandops/v1", "kind": "Brokers", "b
 def state(
     images: str = ZENOH_IMAGE + ROS_IMAGE, *, brokers: bool = True, **nodes: dict[str, Any]
 ) -> State:
-    """Return a state without claims, in which some nodes of the skeleton have more fields.
-
-    Args:
-        images: lines to append to ``registry/images.yaml``.
-        brokers: whether the inventory has the skeleton's brokers or none.
-        nodes: the further fields of each node, by its id.
-    """
+    """Return a state without claims; ``nodes`` has further fields of the nodes of the skeleton."""
     inventory = plain_yaml.load(skeleton()["inventory/nodes.yaml"])
     for node in inventory["nodes"]:
         node.update(deepcopy(nodes.get(node["id"], {})))
@@ -83,7 +77,6 @@ def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def decided(before: State, demand: Mapping[str, Any]) -> State:
-    """Return the state after a demand in short form; raise :class:`Refused` if it is refused."""
     return MemoryRepo(state=before).decide(routes(demand)).state
 
 

@@ -19,7 +19,6 @@ SOURCES = {
 
 
 def demand(**fields: Any) -> dict[str, Any]:
-    """Return a demand template for a rule; it names the entities of the event."""
     return {"demand": "{rule}/{entity}", "requesters": ["{entity}"]} | fields
 
 
@@ -46,8 +45,6 @@ def at(time: float, entity: str, x: float, y: float = 0.0, source: str = "cars")
 
 
 class Run:
-    """An event engine and its newest state."""
-
     def __init__(
         self, *rules: dict[str, Any], now: float = 0.0, sources: dict[str, Any] = SOURCES
     ) -> None:

@@ -38,7 +38,6 @@ class Dialogue:
         os.close(self._master)
 
     def read_until(self, wanted: str) -> None:
-        """Read output until it contains ``wanted``; fail after ``PATIENCE_S``."""
         end = time.monotonic() + PATIENCE_S
         while wanted not in self.text:
             assert self._read(end - time.monotonic()), f"no {wanted!r} in:\n{self.text}"
@@ -71,10 +70,7 @@ class Dialogue:
         return True
 
     def _read(self, wait_s: float) -> bool:
-        """Append new output to ``text``.
-
-        Return False if no output comes within ``wait_s``, or if the output has ended.
-        """
+        """Append new output to ``text``; return False if none comes in time, or no more."""
         if not select.select([self._master], [], [], max(wait_s, 0))[0]:
             return False
         try:

@@ -19,8 +19,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable
 from concurrent.futures import Future, wait
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -39,43 +39,8 @@ Demand = dict[str, Any]
 
 
 def tell(**event: object) -> None:
-    """Report an event as one line on standard output, cut at 4000 characters.
-
-    A write of this size to a pipe is atomic, so lines of different threads do not mix.
-    """
+    # a write of this size to a pipe is atomic, so lines of different threads do not mix
     os.write(1, (json.dumps(event)[:4000] + "\n").encode())
-
-
-def die() -> None:
-    os.kill(os.getpid(), signal.SIGKILL)
-    threading.Event().wait()
-
-
-class _At:
-    """A callable whose n-th call does a last act and then kills this process."""
-
-    def __init__(self, times: int, last_act: Callable[[], object]) -> None:
-        self._left, self._last_act = times, last_act
-
-    def __call__(self) -> None:
-        self._left -= 1
-        if self._left <= 0:
-            self._last_act()
-            die()
-
-
-def _at(owner: type, name: str, point: Callable[[], None], *, after: bool) -> None:
-    known = getattr(owner, name)
-
-    def wrapped(*args: Any, **options: Any) -> Any:
-        if not after:
-            point()
-        result = known(*args, **options)
-        if after:
-            point()
-        return result
-
-    setattr(owner, name, wrapped)
 
 
 _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
@@ -89,30 +54,43 @@ _POINTS: dict[str, tuple[bool, list[tuple[type, str]]]] = {
     "proposed": (True, [(ProposalBranches, "put")]),
     "retracting": (False, [(ProposalBranches, "remove")]),
 }
-"""For each point: the functions at whose calls to kill the process, and when to kill it.
-
-The process is killed after the call (true) or before the call (false). :func:`arm` has one further
-point, ``withdrawn``.
-"""
+"""For each point: whether to kill the process after or before a call of one of the functions."""
 
 
 def arm(where: str, address: str) -> None:
+    """Let this process kill itself when it reaches a point for the n-th time."""
     point, _, times = where.partition(":")
-    lock = Path(address, "refs", "heads", "main.lock")
-    at = _At(int(times or 1), lock.touch if point == "locked" else lambda: None)
+    left = count(int(times or 1) - 1, -1)
+
+    def reach() -> None:
+        if next(left) <= 0:
+            if point == "locked":
+                Path(address, "refs", "heads", "main.lock").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+            threading.Event().wait()
+
     if point == "withdrawn":
-        Lanes.withdrawn = staticmethod(at)  # type: ignore[method-assign]
-    elif point:
-        after, calls = _POINTS[point]
-        for owner, name in calls:
-            _at(owner, name, at, after=after)
+        Lanes.withdrawn = staticmethod(reach)  # type: ignore[method-assign]
+        return
+    after, calls = _POINTS.get(point, (False, []))
+
+    def around(known: Any) -> Any:
+        def wrapped(*args: Any, **options: Any) -> Any:
+            if not after:
+                reach()
+            result = known(*args, **options)
+            if after:
+                reach()
+            return result
+
+        return wrapped
+
+    for owner, name in calls:
+        setattr(owner, name, around(getattr(owner, name)))
 
 
 class Lanes:
-    """Clients; each sends its next demand when its last one is answered.
-
-    A demand marked ``withdraw`` is withdrawn as soon as a demand of any lane is admitted.
-    """
+    """Clients; one marked ``withdraw`` is withdrawn once a demand of any lane is admitted."""
 
     @staticmethod
     def withdrawn() -> None:
@@ -163,8 +141,7 @@ class Lanes:
 
 
 def tell_answer(name: str, future: Future[Receipt]) -> None:
-    error = future.exception()
-    if error is not None:
+    if error := future.exception():
         tell(answer=name, outcome=type(error).__name__, text=str(error), commit="")
     else:
         tell(answer=name, outcome=future.result().outcome, text="", commit=future.result().commit)
@@ -176,8 +153,7 @@ def run(plan: dict[str, Any]) -> None:
     generator = Generator(plan["address"])
     tell(ready=os.getpid())
     lanes = Lanes(generator, plan["lanes"])
-    opening = plan["opening"]
-    if opening:
+    if opening := plan["opening"]:
         tell(sent=opening["name"])
         ticket = generator.submit(
             opening["goal"],

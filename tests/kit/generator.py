@@ -41,7 +41,6 @@ def wait_until_queued(tickets: Iterable[Ticket]) -> None:
 
 
 def book(generator: Generator, *goals: Goal) -> list[Receipt]:
-    """Book demands one after the other; return their receipts."""
     return [receipt(generator.submit(made)) for made in goals]
 
 
@@ -64,8 +63,6 @@ class Gate:
 
 @dataclass
 class Stages:
-    """A listener that records the stages of a demand and their texts."""
-
     told: list[tuple[str, str]] = field(default_factory=list)
 
     def __call__(self, stage: str, text: str) -> None:
@@ -84,8 +81,6 @@ def wait_until(true: Callable[[], object], what: str, timeout: float = PATIENCE_
 
 
 class Proposed:
-    """A submitted demand that needs approval, with its branch."""
-
     def __init__(self, generator: Generator, made: Any, operation: str | None = None) -> None:
         stages = Stages()
         self.told = stages.told

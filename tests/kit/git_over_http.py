@@ -18,46 +18,33 @@ _LOCK = threading.Lock()
 
 @dataclass
 class Faults:
-    """The faults of a server; a test may change them at any time."""
-
     away: bool = False
-    """Whether the server answers every request with 503."""
+    """Answer every request with 503."""
     pushes_to_refuse: int = 0
-    """How many of the next pushes the server refuses with ``status``."""
+    """How many of the next pushes to refuse with ``status``."""
     status: int = 503
     cut_answers: int = 0
-    """How many of the next pushes the server carries out without an answer."""
+    """How many of the next pushes to carry out without an answer."""
     away_after_cut: bool = False
-    """Whether a push without an answer also sets ``away``."""
     hang: threading.Event | None = None
     """An event for which the server waits before it handles a request; None to wait for nothing."""
     hanging: bool = False
-    """Whether a request has begun to wait for it."""
     cuts: Callable[[], bool] = lambda: False
-    """Returns whether to cut the connection.
-
-    The server calls it twice for each request: before it carries out the request, and before it
-    sends the answer.
-    """
+    """Whether to cut the connection; asked before carrying out a request and before answering."""
 
 
 @dataclass
 class Server:
-    """A running server: its URL, its faults, and counts of pushes, refusals and cuts."""
-
     url: str
     faults: Faults = field(default_factory=Faults)
     taken: int = 0
     """How many pushes the server carried out, with or without an answer."""
     refused: int = 0
-    """How many requests the server answered with an error because of a fault."""
     cut: int = 0
-    """How many connections ``Faults.cuts`` has cut."""
 
 
 @contextmanager
 def serving(root: Path, prefix: str = "") -> Iterator[Server]:
-    """Serve the bare repositories below ``root`` at ``<url>/<name>``."""
     server = Server("")
 
     class Serving(_Handler):

@@ -51,7 +51,6 @@ def application(
 
 
 def input_topic(topic: Topic) -> dict[str, str]:
-    """Return a topic as an application in a ``DeploymentRequest`` goal lists it."""
     return {"topic_name": topic[0], "source_node_id": topic[1]}
 
 
@@ -65,7 +64,6 @@ def connection(
     broker: str = "edge",
     type: int = 1,
 ) -> Item:
-    """Return a connection for a goal; by default, the target topics equal the source topics."""
     return {
         "id": id,
         "broker_node_id": broker,
@@ -85,16 +83,10 @@ def goal(
     id: str = "request",
     shutdown: bool = False,
 ) -> Goal:
-    return {
-        "id": id,
-        "apps": list(apps),
-        "connections": list(connections),
-        "shutdown": shutdown,
-    }
+    return {"id": id, "apps": list(apps), "connections": list(connections), "shutdown": shutdown}
 
 
 def perception(**changed: Any) -> Goal:
-    """Return a valid goal: perception on the edge, and a connection for its point cloud."""
     return goal([application()], [connection()]) | changed
 
 
@@ -120,14 +112,12 @@ def leave(number: int) -> Goal:
 
 
 def impossible() -> Goal:
-    """Return a demand that is always refused, because its node does not exist."""
     made = numbered(0)
     made["apps"][0]["header"]["node_id"] = "nowhere"
     return made
 
 
 def link(number: int, **more: Any) -> Goal:
-    """Return a goal with one connection; its ids, requester and topic contain ``number``."""
     item = connection(f"c{number}", who=[f"r{number}"], topics=[f"/t{number}"], broker="")
     return goal([], [item | more], id=f"request{number}")
 
@@ -135,7 +125,6 @@ def link(number: int, **more: Any) -> Goal:
 def put(
     demand: str, *who: str, topic: Topic = ("/ego", "vehicle00"), node: str = "edge", **more: Any
 ) -> Goal:
-    """Return a demand in our own format: one application with one input."""
     inputs = {"ego_data": [{"topic": topic[0], "source": topic[1]}]}
     item = {"id": f"edge/{demand[:100]}", "type": "object-detection-fusion", "node": node}
     item |= {"inputs": inputs} | ({"connect": more.pop("connect")} if "connect" in more else {})
@@ -144,6 +133,5 @@ def put(
 
 
 def experiment(step: int) -> Goal:
-    """Return the demand of a step of the paper's experiment; the first step is 1."""
     made: Goal = plain_yaml.load(EXPERIMENT[step - 1].read_text())
     return made

@@ -16,7 +16,7 @@ The folder of a step has these files:
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from functools import lru_cache
 from pathlib import Path
 
@@ -24,10 +24,10 @@ from demandops.base import strict_yaml
 from demandops.decide.state import State, rendered_files
 
 from tests.kit import goals
+from tests.kit.config import texts_below
 from tests.kit.memory import MemoryRepo
 
 Files = Mapping[str, str]
-"""Texts by path."""
 
 GOLDEN = Path(__file__).parents[1] / "golden"
 
@@ -53,7 +53,6 @@ DELETED = "DELETED"
 
 
 def requests_of(case: str) -> list[Path]:
-    """Return the request files of a case, in order."""
     if case in (EXPERIMENT, *FOLLOWING):
         return list(goals.EXPERIMENT)
     return sorted((GOLDEN / case / "requests").glob("*.yaml"))
@@ -61,9 +60,7 @@ def requests_of(case: str) -> list[Path]:
 
 def start(case: str) -> tuple[State, dict[str, str]]:
     """Return the state before the first request, and the files generated from it."""
-    overlay = GOLDEN / case / "state-repo"
-    files = {p.relative_to(overlay).as_posix(): p.read_text() for p in overlay.rglob("*.yaml")}
-    state = MemoryRepo(files).state
+    state = MemoryRepo(texts_below(GOLDEN / case / "state-repo")).state
     return state, rendered_files(state)
 
 
@@ -82,11 +79,13 @@ def rendered(case: str) -> Mapping[str, Files]:
     return {name: dict(repo.files) for name, repo in play(case)}
 
 
+whole = rendered
+
+
 # ---- what is stored ----
 
 
 def read(case: str) -> dict[str, dict[str, str]]:
-    """Return the texts of the files below ``expected/``, by step and then by path."""
     expected = GOLDEN / case / "expected"
     steps: dict[str, dict[str, str]] = {}
     for path in sorted(expected.rglob("*")):
@@ -96,38 +95,26 @@ def read(case: str) -> dict[str, dict[str, str]]:
     return steps
 
 
-@lru_cache
-def whole(case: str) -> Mapping[str, Files]:
-    """Return all expected files after each step; they follow from the stored changes."""
-    stored = read(case)
-    steps: dict[str, Files] = {}
-    files: dict[str, str] = {}
-    for step in (START, *(file.stem for file in requests_of(case))):
-        files = _applied(_base(case, step, files, whole), stored.get(step, {}))
-        steps[step] = files
-    return steps
-
-
 def to_store(case: str) -> dict[str, dict[str, str]]:
     """Return the files that ``expected/`` must have, by step; steps without a change are absent."""
     steps: dict[str, dict[str, str]] = {}
     before: Files = {}
     for step, files in rendered(case).items():
-        if change := _change(_base(case, step, before, rendered), files):
+        if change := _change(_base(case, step, before), files):
             steps[step] = change
         before = files
     return steps
 
 
-def _base(
-    case: str, step: str, before: Files, steps_of: Callable[[str], Mapping[str, Files]]
-) -> dict[str, str]:
+def _base(case: str, step: str, before: Files) -> dict[str, str]:
     """Return the files to which a step's stored change is applied."""
     if case == EXPERIMENT or (step != START and case not in FOLLOWING):
         return dict(before)
-    steps: dict[str, Files] = {"": {}, **steps_of(EXPERIMENT)}
+    steps: dict[str, Files] = {"": {}, **rendered(EXPERIMENT)}
     previous = list(steps)[list(steps).index(step) - 1]
-    return _applied(before, _change(steps[previous], steps[step]))
+    change = _change(steps[previous], steps[step])
+    gone = change.pop(DELETED, "").splitlines()
+    return {path: text for path, text in {**before, **change}.items() if path not in gone}
 
 
 def _change(before: Files, after: Files) -> dict[str, str]:
@@ -135,10 +122,3 @@ def _change(before: Files, after: Files) -> dict[str, str]:
     if gone := sorted(set(before) - set(after)):
         change[DELETED] = "".join(f"{path}\n" for path in gone)
     return change
-
-
-def _applied(before: Files, change: Files) -> dict[str, str]:
-    gone = change.get(DELETED, "").splitlines()
-    assert set(gone) <= set(before), f"{DELETED} lists files that do not exist before the step"
-    files = {**before, **change}
-    return {path: text for path, text in files.items() if path not in (DELETED, *gone)}

@@ -11,8 +11,6 @@ _APART = {"td", "th", "p", "li", "dt", "dd", "h1", "h2", "h3", "summary"}
 
 @dataclass
 class Element:
-    """An element: its attributes, the text in it at any depth, and its ancestors' tags."""
-
     tag: str
     attributes: dict[str, str]
     text: str = ""
@@ -62,10 +60,8 @@ class Page(HTMLParser):
 
     @property
     def text(self) -> str:
-        """The text of the ``main`` element; white space becomes one space."""
         (main,) = self.texts("main")
         return main
 
     def link(self, text: str) -> str:
-        """Return the address of the first link with this text."""
         return next(e.attributes["href"] for e in self.all("a") if e.text.strip() == text)

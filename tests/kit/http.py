@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from email.message import Message
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from itertools import chain
 from pathlib import Path
 from typing import Any
+
+_CHUNKED = ("Transfer-Encoding", "chunked")
 
 
 @dataclass(frozen=True)
@@ -27,7 +30,7 @@ class Call:
 @dataclass(frozen=True)
 class Answer:
     status: int = 200
-    body: bytes = b""
+    body: bytes | Iterable[bytes] = b""
     headers: dict[str, str] = field(default_factory=dict)
 
     @classmethod
@@ -39,8 +42,6 @@ class Answer:
 
 @dataclass
 class Server:
-    """A running server: its URL, the calls so far, and the function that answers the next calls."""
-
     answer: Callable[[Call], Answer] = lambda call: Answer()
     url: str = ""
     calls: list[Call] = field(default_factory=list)
@@ -52,7 +53,6 @@ class Server:
 
 @contextmanager
 def running(server: ThreadingHTTPServer) -> Iterator[str]:
-    """Run a server for the length of a block; yield its URL."""
     server.daemon_threads = True
     thread = threading.Thread(target=server.serve_forever, args=(0.02,), daemon=True)
     thread.start()
@@ -80,12 +80,18 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
             with lock:
                 served.calls.append(call)
                 given = served.answer(call)
+            is_whole = isinstance(given.body, bytes)
+            size = ("Content-Length", str(len(given.body))) if is_whole else _CHUNKED
             self.send_response(given.status)
-            for name, value in given.headers.items():
+            for name, value in (*given.headers.items(), size):
                 self.send_header(name, value)
-            self.send_header("Content-Length", str(len(given.body)))
             self.end_headers()
-            self.wfile.write(given.body)
+            with suppress(OSError):
+                if is_whole:
+                    self.wfile.write(given.body)
+                else:
+                    for part in chain(given.body, [b""]):
+                        self.wfile.write(b"%x\r\n%s\r\n" % (len(part), part))
 
         do_GET = do_POST = do_PUT = do_PATCH = do_DELETE = _serve
 
@@ -94,7 +100,6 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
 
 
 def kubeconfig(folder: Path, url: str) -> Path:
-    """Write a kubeconfig for the API server at ``url``; return its path."""
     config = {
         "apiVersion": "v1",
         "kind": "Config",

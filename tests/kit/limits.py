@@ -13,7 +13,6 @@ LONGEST_TEST_S = 600.0
 
 @contextmanager
 def files_end_at(size: int) -> Iterator[None]:
-    """Keep this process from writing files beyond a size, for the length of a block."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))  # Python ignores SIGXFSZ
     try:

@@ -66,37 +66,29 @@ class MemoryRepo:
         return self.state.config
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
-        """Decide a goal and leave the repo unchanged; raise :class:`Refused` if it is refused."""
         return decide(self.state, goal, now or self.now, self.files.get)
 
     def send(self, goal: object, now: datetime | None = None) -> Decision:
-        """Decide a goal and commit the decision; raise :class:`Refused` if it is refused."""
         decision = self.decide(goal, now)
         self.state = decision.state
-        for path, text in decision.files.items():
-            assert self.files.get(path) != text, f"written or removed without need: {path}"
-            if text is None:
-                del self.files[path]
-            else:
-                self.files[path] = text
+        self._write(decision.files)
         return decision
 
-    def scale_down(self, now: datetime) -> list[str]:
-        """Remove replicas that need not be kept any more at ``now``, as the generator does.
+    def _write(self, files: Mapping[str, str | None]) -> None:
+        for path, text in files.items():
+            assert self.files.get(path) != text, f"written or removed without need: {path}"
+            self.files.pop(path) if text is None else self.files.update({path: text})
 
-        Return the names of the changed releases.
-        """
+    def scale_down(self, now: datetime) -> list[str]:
+        """Remove the replicas that are due; return the names of the changed releases."""
         names = []
         for instance in self.state.ledger.kept.due(now):
             self.state, change = scale_down(self.state, instance, now, self.files.get)
             names += [release.name for release in change.releases]
-            for path, text in change.files.items():
-                assert self.files.get(path) != text, f"written or removed without need: {path}"
-                self.files.pop(path) if text is None else self.files.update({path: text})
+            self._write(change.files)
         return names
 
     def take(self, goal: object, now: datetime | None = None) -> Decision | Refused:
-        """Decide a goal and commit the decision; return the decision or the refusal."""
         before = dict(self.files), self.state
         try:
             return self.send(goal, now)
@@ -112,12 +104,9 @@ class MemoryRepo:
         ]
 
     def forget_shutdowns(self) -> None:
-        """Remove the recent shutdowns, so that a repeated shutdown counts as a new one."""
-        shutdowns = self.state.ledger.shutdowns
-        self.state = replace(
-            self.state, ledger=replace(self.state.ledger, shutdowns=RecentShutdowns())
-        )
-        for digest in shutdowns.by_digest:
+        ledger = self.state.ledger
+        self.state = replace(self.state, ledger=replace(ledger, shutdowns=RecentShutdowns()))
+        for digest in ledger.shutdowns.by_digest:
             del self.files[records.shutdowns_path(digest)]
 
     def faults(self, goal: object) -> list[str]:
@@ -127,11 +116,9 @@ class MemoryRepo:
         return [f"{fault.field}: {fault.message}" for fault in refusal.faults]
 
     def bookkeeping(self) -> dict[str, Any]:
-        """Return the bookkeeping as plain data; its commit id is empty."""
         return as_data(bookkeeping(self.state), "")
 
     def books(self) -> dict[str, Any]:
-        """Return the services and connections of the bookkeeping."""
         data = self.bookkeeping()
         return {"services": data["services"], "connections": data["connections"]}
 
@@ -140,7 +127,6 @@ class MemoryRepo:
         return in_model_words(self.bookkeeping(), object_lists(self.below("clusters").values()))
 
     def below(self, *roots: str) -> dict[str, str]:
-        """Return the files below these top-level folders, without READMEs."""
         return {
             path: text
             for path, text in self.files.items()
@@ -149,14 +135,12 @@ class MemoryRepo:
 
     def rendered(self) -> dict[str, str]:
         """Return the files below ``clusters/`` that demands added."""
+        added = self.files.keys() - self._initial.keys()
         return {
-            path: text
-            for path, text in self.files.items()
-            if path.startswith("clusters/") and path not in self._initial
+            p: text for p, text in self.files.items() if p in added and p.startswith("clusters/")
         }
 
     def objects(self, kind: str) -> dict[str, dict[str, Any]]:
-        """Return the objects of a kind in :meth:`rendered`, by name."""
         documents = [
             document
             for text in self.rendered().values()
@@ -169,7 +153,6 @@ class MemoryRepo:
 
 
 def rebuilt(claims: Iterable[Claim]) -> Ledger:
-    """Return a ledger with these claims, added one by one."""
     ledger = Ledger()
     for claim in claims:
         ledger = ledger.replace(claim.key, claim)
@@ -177,12 +160,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_of_ledger(path: str) -> bool:
-    """Return whether a file contains a claim, shutdowns, kept replicas or a waiting demand."""
-    roots = (
-        records.SHUTDOWNS_ROOT,
-        records.REPLICAS_ROOT,
-        records.WAITING_ROOT,
-    )
+    roots = (records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT, records.WAITING_ROOT)
     return bool(claim_file.kind_of(path)) or path.startswith(roots)
 
 
@@ -204,7 +182,6 @@ def outcome(taken: Decision | Refused) -> str:
 
 
 def books_after(goals: Iterable[Goal]) -> dict[str, Any]:
-    """Return the bookkeeping after ``goals``, decided one by one."""
     repo = MemoryRepo()
     for goal in goals:
         repo.send(goal)

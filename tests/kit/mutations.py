@@ -20,9 +20,7 @@ _WRONG_TYPES: dict[str, Any] = {
     "a mapping": {"x": 1}, "a list": [1], "a number": 5, "a truth": True, "no value": None,
 }  # fmt: skip
 _OF_TYPE: dict[type, dict[str, Any]] = {
-    str: {
-        "empty": "", "too long": "x" * 2000, "another word": "Nonsense?",
-    },
+    str: {"empty": "", "too long": "x" * 2000, "another word": "Nonsense?"},
     bool: {},
     int: {"negative": -1, "zero": 0, "large": 10**30, "a fraction": 1.5},
     float: {"negative": -1.0, "large": 1e30},
@@ -33,12 +31,7 @@ _SAME = {str: "text", bool: "a truth", int: "a number", list: "a list", dict: "a
 
 
 class Mutation(NamedTuple):
-    """A copy of a document with one mistake.
-
-    ``place`` is where the mistake is, ``kind`` names the mistake, and ``value`` is the former value
-    at ``place``. For a misspelt field, ``new_place`` has the new name; otherwise it equals
-    ``place``.
-    """
+    """A copy of a document with one mistake, and the value before it; a misspelt field moves."""
 
     place: Place
     kind: str
@@ -51,10 +44,7 @@ class Mutation(NamedTuple):
         return any(_overlaps(field, path(place)) for place in (self.place, self.new_place))
 
     def names(self) -> set[str]:
-        """Return the keys on the path to the mistake, and all texts in the former value.
-
-        A fault at another place must quote one of these names.
-        """
+        """Return keys and texts of which a fault at another place must quote one."""
         names = {str(part) for part in self.place}
         values = [self.value]
         while values:
@@ -73,12 +63,7 @@ def mutations(document: Any, limits: Iterable[int] = ()) -> Iterator[Mutation]:
 
 
 def _mutations(document: Any, limits: Iterable[int]) -> Iterator[Mutation]:
-    """Yield a mutation for each mistake at each place of a document.
-
-    ``limits`` are tried in place of whole numbers. To save time, a place gets only one value of a
-    wrong type, and a text gets only one control character; the next place gets the next type and
-    the next control character. With ``DEMANDOPS_EXAMPLES`` above 1, each place gets all of them.
-    """
+    """Yield mutations at each place; what is tried changes from place to place."""
     for turn, place in enumerate(places(document)):
         value = _at(document, place)
         wrong = {kind: new for kind, new in _WRONG_TYPES.items() if kind != _SAME.get(type(value))}
@@ -102,15 +87,13 @@ def _mutations(document: Any, limits: Iterable[int]) -> Iterator[Mutation]:
             added = (*place, "zz")
             yield Mutation(added, "added", _replaced(document, place, more), None, added)
         if isinstance(place[-1], str):
-            holder = _at(document, place[:-1])
-            renamed = {k if k != place[-1] else "Zz?": v for k, v in holder.items()}
-            changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], "Zz?")
-            yield Mutation(place, "misspelt", changed, value, now)
-            own = re.sub("[A-Z]", lambda capital: f"_{capital[0].lower()}", place[-1])
-            if own != place[-1]:
-                renamed = {k if k != place[-1] else own: v for k, v in holder.items()}
-                changed, now = _replaced(document, place[:-1], renamed), (*place[:-1], own)
-                yield Mutation(place, "the program's own name", changed, value, now)
+            holder, key = _at(document, place[:-1]), place[-1]
+            own = re.sub("[A-Z]", lambda capital: f"_{capital[0].lower()}", key)
+            for kind, name in (("misspelt", "Zz?"), ("the program's own name", own)):
+                if name != key:
+                    renamed = {k if k != key else name: v for k, v in holder.items()}
+                    changed = _replaced(document, place[:-1], renamed)
+                    yield Mutation(place, kind, changed, value, (*place[:-1], name))
 
 
 def _in_turn(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
@@ -120,7 +103,6 @@ def _in_turn(mistakes: dict[str, Any], turn: int) -> dict[str, Any]:
 
 
 def places(document: Any, place: Place = ()) -> Iterator[Place]:
-    """Yield the place of every value in a document, at any depth."""
     entries: Any = ()
     if isinstance(document, dict):
         entries = document.items()
@@ -193,37 +175,32 @@ class Form:
         self._validator = jsonschema_rs.validator_for(schema)
 
     def forbids(self, document: Any) -> bool:
-        """Return whether the schema rejects a document."""
         return not self._validator.is_valid(document)
 
     def fields(self) -> set[str]:
         """Return all fields of all mappings in the schema, as ``Node.id``."""
-        return {f"{part['title']}.{name}" for part in self._parts() for name in part["properties"]}
+        return {name for name, _ in self._options()}
 
     def limits(self) -> list[int]:
         """Return the numbers that just miss a field's range: minimum - 1 and maximum + 1."""
-        limits = set()
-        for part in self._parts():
-            for field in part["properties"].values():
-                for option in field.get("anyOf", [field]):
-                    limits |= {option[key] - 1 for key in ("minimum",) if key in option}
-                    limits |= {option[key] + 1 for key in ("maximum",) if key in option}
-        return sorted(limits)
+        beyond = (("minimum", -1), ("maximum", 1))
+        return sorted({o[key] + by for _, o in self._options() for key, by in beyond if key in o})
 
     def free(self) -> set[str]:
         """Return the fields whose value may be anything, or a mapping with any keys."""
         return {
-            f"{part['title']}.{name}"
-            for part in self._parts()
-            for name, field in part["properties"].items()
-            for option in field.get("anyOf", [field])
+            name
+            for name, option in self._options()
             if option.get("additionalProperties") is True
             or not {"type", "$ref", "const", "enum"} & option.keys()
         }
 
-    def _parts(self) -> list[Schema]:
-        parts = [self._schema, *self._schema.get("$defs", {}).values()]
-        return [part for part in parts if "properties" in part]
+    def _options(self) -> Iterator[tuple[str, Schema]]:
+        """Yield each field, as ``Node.id``, with each schema that its value may have."""
+        for part in (self._schema, *self._schema.get("$defs", {}).values()):
+            for name, field in part.get("properties", {}).items():
+                for option in field.get("anyOf", [field]):
+                    yield f"{part['title']}.{name}", option
 
     def fields_in(self, document: Any) -> set[str]:
         return set(self._used(document, self._schema))

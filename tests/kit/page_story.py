@@ -16,6 +16,7 @@ from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 
 from tests.kit import goals
+from tests.kit.config import override
 from tests.kit.generator import book, wait_until
 from tests.kit.goals import Goal
 from tests.kit.http import kubeconfig
@@ -25,56 +26,35 @@ from tests.kit.repo import Person
 NAMESPACE = "perception"
 FAILING = "od-edge-vehicle00"
 FAULT = "Helm install failed: container detection: ImagePullBackOff: manifest unknown"
-DENIED = "vehicle03/edge"
-
 OVERRIDES = {
-    "roadworks": """apiVersion: demandops/v1
-kind: Override
-reason: The road is closed until the bridge is mended
-owner: traffic-control
-select: [{connections: [vehicle03/edge]}]
-deny: true
-""",
-    "old": """apiVersion: demandops/v1
-kind: Override
-reason: Left from a demonstration
-owner: Petra Platform
-select: [{services: [gone]}]
-replicas: 2
-""",
+    "roadworks": override(
+        {"connections": ["vehicle03/edge"]},
+        reason="The road is closed until the bridge is mended",
+        owner="traffic-control",
+        deny=True,
+    ),
+    "old": override(
+        {"services": ["gone"]},
+        reason="Left from a demonstration",
+        owner="Petra Platform",
+        replicas=2,
+    ),
 }
 
 
 def leased(id: str, vehicle: str, lease: str = "30m") -> Goal:
-    """Return a demand for a connection from a vehicle to the cloud, with a lease."""
-    return {
-        "apiVersion": "demandops/v1",
-        "kind": "Demand",
-        "demand": id,
-        "requesters": [vehicle],
-        "lease": lease,
-        "connections": [
-            {
-                "id": f"{vehicle}/cloud",
-                "type": "mqtt",
-                "source": vehicle,
-                "target": "cloud",
-                "topics": [{"source": f"/vehicles/{vehicle}/ego_data"}],
-            }
-        ],
-    }
+    made = {"kind": "Demand", "demand": id, "requesters": [vehicle], "lease": lease}
+    topics = [{"source": f"/vehicles/{vehicle}/ego_data"}]
+    ends = {"type": "mqtt", "source": vehicle, "target": "cloud"}
+    return made | {"connections": [{"id": f"{vehicle}/cloud", "topics": topics} | ends]}
 
 
 def released(id: str, vehicle: str) -> Goal:
-    """Return the goal that releases the demand of :func:`leased`."""
-    goal = leased(id, vehicle) | {"operation": "release"}
-    return {key: value for key, value in goal.items() if key not in ("lease", "connections")}
+    return {"kind": "Demand", "demand": id, "requesters": [vehicle], "operation": "release"}
 
 
 @dataclass
 class Story:
-    """The fleet: its state repo, generator and API server, a person, and the web page."""
-
     bare: Path
     generator: Generator
     api: KubeApi
@@ -87,17 +67,13 @@ class Story:
         return self.server.url.rstrip("/")
 
     def wait_followed(self) -> None:
-        """Wait until the page has the newest commit."""
-        commit = str(self.generator.snapshot.commit)
-        wait_until(
-            lambda: self.follower.newest.commit_state.commit == commit, "the page has the commit"
-        )
+        def is_at() -> bool:
+            return self.follower.newest.commit_state.commit == str(self.generator.snapshot.commit)
+
+        wait_until(is_at, "the page has the newest commit")
 
     def settle(self, *, mended: bool = False) -> None:
-        """Make the API server report that the cluster has applied the newest commit.
-
-        The server reports the release ``FAILING`` as failed unless ``mended`` is true.
-        """
+        """Report the newest commit as applied; ``FAILING`` fails unless it is mended."""
         commit = str(self.generator.snapshot.commit)
         since = (datetime.now(timezone.utc) - timedelta(minutes=12)).strftime("%Y-%m-%dT%H:%M:%SZ")
         self.api.flux(NAMESPACE, "perception", commit)
@@ -111,7 +87,6 @@ class Story:
 
 @contextmanager
 def story(bare: Path, folder: Path) -> Iterator[Story]:
-    """Run the fleet and its page for the length of a block."""
     with ExitStack() as stack:
         api = stack.enter_context(kube_api())
         generator = Generator(str(bare), fetch_interval=0.2)
@@ -125,20 +100,14 @@ def story(bare: Path, folder: Path) -> Iterator[Story]:
         stack.callback(server.close)
         told = Story(bare, generator, api, person, server, follower)
         person.override(**OVERRIDES)
-        wait_until(lambda: _denies(generator), "the override is in effect")
-        wait_until(lambda: _is_at(told), "the page has the newest commit")
-        told.settle()
-        wait_until(lambda: _is_seen(told), "the page sees what fails")
+        wait_until(
+            lambda: "roadworks" in generator.snapshot.state.config.overrides, "it is in effect"
+        )
+        told.wait_followed()
+
+        def is_seen() -> bool:
+            told.settle()  # again after each commit that the override brings about
+            return follower.newest.status(FAILING).health.failing
+
+        wait_until(is_seen, "the page sees what fails")
         yield told
-
-
-def _denies(generator: Generator) -> bool:
-    return "roadworks" in generator.snapshot.state.config.overrides
-
-
-def _is_at(told: Story) -> bool:
-    return told.follower.newest.commit_state.commit == str(told.generator.snapshot.commit)
-
-
-def _is_seen(told: Story) -> bool:
-    return told.follower.newest.status(FAILING).health.failing

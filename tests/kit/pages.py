@@ -35,8 +35,6 @@ _COMMAND = re.compile(
 
 @dataclass(frozen=True)
 class Block:
-    """A block of code, and the comment before it."""
-
     line: int
     language: str
     title: str
@@ -45,7 +43,6 @@ class Block:
 
     @property
     def has_commands(self) -> bool:
-        """Whether the block contains shell commands for the reader to type."""
         if self.language:
             return self.language in _SHELL
         return any(_COMMAND.match(line) for line in self.text.splitlines())
@@ -101,7 +98,6 @@ def run(markdown: str, folder: Path, environment: Mapping[str, str]) -> None:
 
 
 def _commands(block: Block) -> Iterator[tuple[str, str | None]]:
-    """Yield each command of a block, with the output that the page shows for it, or None."""
     if block.language != "console":
         yield block.text, None
         return

@@ -15,5 +15,4 @@ def load(text: str) -> Any:
 
 
 def dump(data: Any) -> str:
-    """Return plain data as the text of one YAML document."""
     return str(yaml.dump(data, Dumper=_DUMPER))

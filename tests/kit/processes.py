@@ -31,18 +31,15 @@ def demand(name: str, made: Goal, operation: str | None = None) -> dict[str, Any
 
 @dataclass
 class Told:
-    """The events of a run, as its process reported them."""
-
     sent: list[str] = field(default_factory=list)
     answers: dict[str, dict[str, Any]] = field(default_factory=dict)
     withdrawn: list[str] = field(default_factory=list)
     finished: bool | None = None
     waits: dict[str, float] = field(default_factory=dict)
-    """The seconds from sending a demand to its answer, by the demand's name."""
+    """The seconds from each demand to its answer."""
     first: float = 0.0
-    """When the first demand was sent, by the monotonic clock."""
     last: float = 0.0
-    """When the last event came, by the monotonic clock."""
+    """When the first demand was sent, and the last event came."""
 
 
 class Run:
@@ -55,10 +52,7 @@ class Run:
         self.pid = 0
 
     def listen(self, on_ready: Callable[[], object] = lambda: None) -> Told:
-        """Return all events once the process ends.
-
-        ``on_ready`` is called when the process can take demands.
-        """
+        """Return all events at the end; ``on_ready`` is called when the process takes demands."""
         sent: dict[str, float] = {}
         with self._pipe.open() as lines:
             for line in lines:
@@ -90,8 +84,6 @@ class Run:
 
 
 class Drivers:
-    """Starts generators in processes of their own."""
-
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._runs: list[Run] = []
@@ -132,7 +124,6 @@ class Drivers:
         return self._runs[-1]
 
     def kill_runs(self) -> None:
-        """Kill the processes that a failed test did not end."""
         while self._runs:
             self._runs.pop().kill()
 
@@ -146,10 +137,7 @@ class Drivers:
 def listen_to_all(
     drivers: Drivers, runs: list[Run], on_ready: Callable[[], object] = lambda: None
 ) -> list[Told]:
-    """Return the events of all runs once all have ended; if that fails, kill the runs.
-
-    ``on_ready`` is called once, when all generators have started.
-    """
+    """Return the events of all runs at their end; ``on_ready`` is called when all have started."""
     waited_for = threading.Barrier(len(runs), on_ready)
     with ThreadPoolExecutor(len(runs)) as pool:
         try:

@@ -38,7 +38,6 @@ class Maker:
         return self._message(shutdown=kind > 17)
 
     def _again(self, kind: int) -> Goal:
-        """Return a recent put, the put with another lease, or a renewal of the put's demand."""
         known = self._random.choice(self._puts[-2:])
         if kind < 3:
             return {key: known[key] for key in ("kind", "demand", "requesters")} | {
@@ -117,13 +116,11 @@ MESSAGES = {
 
 
 def name_of(claim: Claim) -> Name:
-    """Return the name of a claim in the model of leases."""
     demand = MESSAGES.get(claim.demand, claim.demand)
     return demand, (claim.subject.kind.value, claim.subject.id)
 
 
 def claims_of(ledger: Iterable[Claim]) -> dict[Name, tuple[dict[str, Any], frozenset[str]]]:
-    """Return the holds and the requesters of each claim, in the form of ``Promises.claims``."""
     found = {}
     for claim in ledger:
         what: dict[str, Any]

@@ -36,9 +36,7 @@ NO_GIT_CONFIG = {
     "GIT_TERMINAL_PROMPT": "0",
     "LC_ALL": "C.UTF-8",
 }
-TEST_GIT_CONFIG = NO_GIT_CONFIG | {
-    "GIT_CONFIG_GLOBAL": str(Path(__file__).with_name("gitconfig")),
-}
+TEST_GIT_CONFIG = NO_GIT_CONFIG | {"GIT_CONFIG_GLOBAL": str(Path(__file__).with_name("gitconfig"))}
 GIT_ENVIRONMENT = TEST_GIT_CONFIG | {
     "GIT_AUTHOR_NAME": "Petra Platform",
     "GIT_AUTHOR_EMAIL": "petra@example.org",
@@ -49,10 +47,7 @@ GIT_ENVIRONMENT = TEST_GIT_CONFIG | {
 POLICY = "policy/access-domains.yaml"
 
 FORGER = (GENERATOR_NAME, GENERATOR_EMAIL, 1_770_000_000)
-"""The author of a forged commit: a person with the generator's name.
-
-Only the missing signature shows that the generator did not make the commit.
-"""
+"""A person with the generator's name; only the missing signature shows who made the commit."""
 
 
 def init(path: Path, *, bare: bool = True) -> Path:
@@ -61,7 +56,6 @@ def init(path: Path, *, bare: bool = True) -> Path:
 
 
 def git(folder: Path | str | GitRepo, *args: str, check: bool = True, **environment: str) -> str:
-    """Run git in a folder and return its output without the last line break."""
     done = subprocess.run(
         ["git", "-C", os.fspath(folder).removeprefix("file://"), *args],
         capture_output=True,
@@ -77,10 +71,6 @@ def git(folder: Path | str | GitRepo, *args: str, check: bool = True, **environm
 def write_tree(
     repo: pygit2.Repository, base: pygit2.Tree | None, files: Mapping[str, str | None]
 ) -> pygit2.Oid:
-    """Write a copy of the tree ``base`` in which ``files`` are changed; return the new tree's id.
-
-    The generator's code writes the copy.
-    """
     objects = NewObjects(repo)
     tree = trees.write(objects, base, files)
     with objects.packed(tree):
@@ -94,8 +84,6 @@ def _index(path: Path, revision: str) -> tuple[pygit2.Repository, pygit2.Index]:
 
 
 class GitRepo:
-    """A bare state repo of a test; its content is read with pygit2, not with the program's code."""
-
     def __init__(self, path: Path) -> None:
         self.path = path
 
@@ -107,7 +95,6 @@ class GitRepo:
         return str(self.path)
 
     def commits(self) -> list[str]:
-        """Return the messages of all commits, newest first."""
         repo = pygit2.Repository(str(self.path))
         return [commit.message for commit in repo.walk(self.tip)]
 
@@ -117,7 +104,6 @@ class GitRepo:
         return {e.path: repo[e.id].data.decode() for e in index if e.path.startswith(under)}
 
     def manifests(self) -> dict[str, str]:
-        """Return the text of each YAML file that a GitOps controller reads, by path."""
         return {p: text for p, text in self.files("clusters/").items() if p.endswith(".yaml")}
 
     def commit(
@@ -158,7 +144,6 @@ class Person:
         self._git("reset", "--quiet", "--hard", "origin/main")
 
     def read(self, path: str) -> str:
-        """Return the text of a file on the newest main."""
         return GitRepo(self.bare).files()[path]
 
     def change(
@@ -175,10 +160,7 @@ class Person:
         raise AssertionError("each of 100 attempts met a commit that was published first")
 
     def push(self, files: Mapping[str, str | None], message: str = "A person's change") -> str:
-        """Commit ``files`` in the clone, push, and return the commit.
-
-        The push fails if somebody else pushes meanwhile.
-        """
+        """Commit and push from the clone; this fails if somebody else pushes meanwhile."""
         self.fetch()
         for path, text in files.items():
             target = self.folder / path
@@ -193,17 +175,14 @@ class Person:
         return self._git("rev-parse", "HEAD")
 
     def edit(self, path: str, old: str, new: str) -> str:
-        """Replace a text in a file; return the commit's id."""
         text = self.read(path)
         assert old in text, f"{path} does not hold {old!r}"
         return self.change({path: text.replace(old, new)})
 
     def override(self, **named: str | None) -> str:
-        """Commit ``overrides/<name>.yaml`` files; ``None`` removes one. Return the commit's id."""
         return self.change({f"overrides/{name}.yaml": text for name, text in named.items()})
 
     def policy(self, **changed: Any) -> None:
-        """Set fields of every access domain in the policy."""
         data = plain_yaml.load(self.read(POLICY))
         for domain in data["domains"]:
             domain.update(changed)
@@ -272,7 +251,6 @@ def _commits(repo: Path, revisions: str) -> tuple[Commit, ...]:
 
 
 def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
-    """Install a script as a hook of a repository; return its path."""
     path = Path(os.fspath(repo), "hooks", name)
     path.parent.mkdir(exist_ok=True)
     path.write_text(f"#!/bin/sh\n{script}\n")
@@ -282,7 +260,6 @@ def hook(repo: Path | str | GitRepo, name: str, script: str) -> Path:
 
 @contextmanager
 def away(repo: Path) -> Iterator[None]:
-    """Rename a repository's folder for the length of a block, so that nobody finds it."""
     elsewhere = repo.rename(repo.with_name("away.git"))
     try:
         yield
@@ -295,7 +272,6 @@ def tip(repo: Path | str) -> str:
 
 
 def read(repo: Path, path: str) -> str:
-    """Return the text of a file on main; empty if there is none."""
     return GitRepo(repo).files(path).get(path, "")
 
 
@@ -307,12 +283,10 @@ def without_vehicle01(repo: Path) -> dict[str, str | None]:
 
 
 def operations(repo: Path) -> list[str]:
-    """Return the operation id of each demand's commit, oldest first."""
     return [found for commit in commits(repo) if (found := commit.one("Operation-Id"))]
 
 
 def branches(repo: Path) -> list[str]:
-    """Return the branches of demands that await approval."""
     return sorted(b for b in pygit2.Repository(str(repo)).branches.local if b.startswith("demand/"))
 
 
@@ -323,16 +297,12 @@ def books(repo: Path, revision: str = "main") -> dict[str, Any]:
 
 
 def claims(repo: Path, needle: str = "") -> list[str]:
-    """Return the paths of the claim files whose text contains ``needle``."""
     files = GitRepo(repo).files("ledger/")
     return [path for path, text in files.items() if "Claim\n" in text and needle in text]
 
 
 def differing(repo: Path, since: str | None = None) -> dict[str, tuple[str, ...]]:
-    """Return the differing files of each commit that `demandops verify` rejects, by its summary.
-
-    Only commits after ``since`` are verified, by default all after the first one.
-    """
+    """Return the differing files of each commit after ``since`` that `demandops verify` rejects."""
     with reader.opened(str(repo)) as opened:
         commits = opened.revisions(f"{since or root(repo)}..")
         verdicts = opened.verify(commits)
@@ -345,12 +315,7 @@ def root(repo: Path) -> str:
 
 
 def assert_sound(repo: Path, *, verify_last: int = 0) -> None:
-    """Check the objects, the history and the commits of a state repo.
-
-    Nothing may be missing or damaged, the history must be linear, no operation may be committed
-    twice, and the commits must pass `demandops verify`. Only the newest ``verify_last`` commits are
-    verified, because each takes a tenth of a second; 0 means all.
-    """
+    """Check objects, history, operations and the last ``verify_last`` commits (0 means all)."""
     fsck = subprocess.run(
         ["git", "-C", str(repo), "fsck", "--strict", "--no-dangling", "--no-progress"],
         capture_output=True,
@@ -375,10 +340,6 @@ has ended), a fourth join, a demand with a lease, and a shutdown.
 
 
 def first_version(path: Path, revision: str = "main") -> GitRepo:
-    """Return a bare copy of a state repo of DemandOps' first version.
-
-    Its ``main`` is at ``revision``.
-    """
     git(path.parent, "clone", "--quiet", "--bare", str(FIRST_VERSION), str(path))
     git(path, "update-ref", "refs/heads/main", f"{revision}^{{commit}}")
     return GitRepo(path)

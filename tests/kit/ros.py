@@ -15,7 +15,7 @@ import tempfile
 import time
 import uuid
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -49,7 +49,6 @@ _LAST = 100
 
 @contextmanager
 def reserved() -> Iterator[int]:
-    """Reserve an unused ROS domain and yield it; limit ROS to this machine."""
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     domains = list(range(1, _LAST + 1))
     random.shuffle(domains)
@@ -67,7 +66,6 @@ def reserved() -> Iterator[int]:
 
 
 def _is_free(domain: int) -> bool:
-    """Return whether the port of the domain's first participant is free."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.bind(("", 7400 + 250 * domain + 10))
@@ -87,7 +85,6 @@ class Served:
     domain: int
 
     def demandops(self, *args: str) -> str:
-        """Run a command on the state repo in this process; it must succeed. Return its output."""
         with redirect_stdout(io.StringIO()) as printed:
             assert run([*args, "--state-repo", self.state_repo]) == 0
         return printed.getvalue()
@@ -97,48 +94,21 @@ class Served:
         return data
 
     def wait_for(self, text: str, seconds: float = PATIENCE_S) -> None:
-        """Wait until the log contains ``text``.
-
-        If the text is late, or if the process ends without it, fail with :meth:`last_words`. The
-        time in which the process waits for a processor does not count. On a busy machine, a
-        start of two seconds once waited half a minute for a processor.
-        """
-        began = time.monotonic()
-        while True:
-            _, waited = self._scheduled(self.process.pid)
-            ended = self.process.poll() is not None
-            if text in self.log.read_text():
-                return
-            is_late = time.monotonic() - began - waited >= seconds
-            assert not (ended or is_late), f"the log does not say: {text}\n{self.last_words()}"
+        """Wait until the log contains ``text``; else fail with :meth:`last_words`."""
+        end = time.monotonic() + seconds
+        while text not in self.log.read_text():
+            is_over = self.process.poll() is not None or time.monotonic() > end
+            if is_over and text not in self.log.read_text():
+                raise AssertionError(f"the log does not say: {text}\n{self.last_words()}")
             time.sleep(0.05)
 
     def last_words(self) -> str:
-        """Return how the process ended, and its log.
-
-        A process that still runs is aborted. The result then also says what each thread was doing.
-        """
-        code, pid = self.process.poll(), self.process.pid
-        lines = [f"ended with {code}" if code is not None else f"runs as {pid}"]
+        """Return how the process ended, and its log; abort a process that still runs."""
+        code = self.process.poll()
         if code is None:
-            for task in sorted(Path(f"/proc/{pid}/task").iterdir()):
-                with suppress(OSError):  # a thread that has ended
-                    name, waits = ((task / file).read_text().strip() for file in ("comm", "wchan"))
-                    ran, waited = self._scheduled(int(task.name))
-                    times = f"ran {ran:.1f} s, waited {waited:.1f} s for a processor"
-                    lines.append(f"{name}: {times}, now in {waits}")
             self.process.send_signal(signal.SIGABRT)  # Python prints where each thread is
             self.process.wait(PATIENCE_S)
-        return "\n".join([*lines, self.log.read_text()])
-
-    def _scheduled(self, thread: int) -> tuple[float, float]:
-        """Return the seconds that a thread ran and waited for a processor; zeros if it ended."""
-        try:
-            path = Path(f"/proc/{self.process.pid}/task/{thread}/schedstat")
-            ran, waited, _ = map(int, path.read_text().split())
-        except (OSError, ValueError):  # the thread has ended
-            return 0.0, 0.0
-        return ran / 1e9, waited / 1e9
+        return f"ended with {code}\n{self.log.read_text()}"
 
     def stop(self, number: signal.Signals = signal.SIGINT) -> int:
         self.process.send_signal(number)
@@ -149,11 +119,7 @@ Serve = Callable[..., Served]
 
 
 class Servers:
-    """Starts `demandops serve` in one ROS domain.
-
-    With ``warm``, each command is a fork of a process that has imported its modules, so it starts
-    faster.
-    """
+    """Starts `demandops serve` in one ROS domain, with ``warm`` as forks, which start faster."""
 
     def __init__(
         self, folder: Path, domain: int, warm: WarmCommands | None = None, **environment: str
@@ -166,7 +132,6 @@ class Servers:
         return self.run(state_repo, "serve", "--state-repo", state_repo, *args)
 
     def run(self, state_repo: str, *words: str) -> Served:
-        """Start any command of ``demandops`` in the ROS domain."""
         log = self._folder / f"node-{len(self._started)}.log"
         environment = {
             **os.environ,
@@ -198,8 +163,6 @@ class Servers:
 
 @dataclass
 class Sent:
-    """A goal that was sent, and the server's answers so far."""
-
     at: float
     handle: Any = None
     accepted: bool | None = None
@@ -216,7 +179,6 @@ class Sent:
 
     @property
     def commit(self) -> str:
-        """The commit that the result names."""
         return self.message.splitlines()[0].split()[-1]
 
 
@@ -243,7 +205,6 @@ class Client:
         )
 
     def wait(self, condition: Callable[[], bool], seconds: float = PATIENCE_S) -> None:
-        """Spin until a condition is true; fail the test after ``seconds``."""
         end = time.monotonic() + seconds
         while not condition():
             assert time.monotonic() < end, "the condition did not hold in time"
@@ -253,7 +214,6 @@ class Client:
         return bool(self._client.server_is_ready())
 
     def ready(self) -> None:
-        """Wait until the node and this client have discovered each other."""
         self.wait(self.reaches_a_node)
         asked: list[Any] = []
         ask_at = 0.0
@@ -298,7 +258,6 @@ class Client:
         sent.status = STATUS[answer.status]
 
     def cancel(self, sent: Sent) -> bool:
-        """Cancel a goal; return whether the server agreed."""
         future = sent.handle.cancel_goal_async()
         self.wait(future.done)
         return bool(future.result().goals_canceling)

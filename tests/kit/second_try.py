@@ -17,8 +17,6 @@ _MOST = 20  # more failures have one cause, and their second run would take too 
 
 
 class SecondTry:
-    """A pytest plugin for a run that starts tests itself or through xdist's workers."""
-
     def __init__(self, unsteady: Path) -> None:
         self._unsteady = unsteady
         self._failed: dict[str, None] = {}

@@ -6,44 +6,33 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 
 import pytest
 
 
+@dataclass
 class Screen:
-    """All text that was printed on a terminal."""
+    """All text that was printed on a terminal, once its block has ended."""
 
-    def __init__(self) -> None:
-        self._parts: list[bytes] = []
-
-    def read(self, master: int) -> None:
-        """Read until the other end is closed; Linux then reports an I/O error."""
-        while True:
-            try:
-                part = os.read(master, 65536)
-            except OSError:
-                return
-            if not part:
-                return
-            self._parts.append(part)
-
-    @property
-    def text(self) -> str:
-        return b"".join(self._parts).decode().replace("\r\n", "\n")
+    text: str = ""
 
 
 @contextmanager
 def terminal(
     monkeypatch: pytest.MonkeyPatch, columns: int = 80, lines: int = 1000
 ) -> Iterator[Screen]:
-    """Make standard output a terminal for the length of a block; yield its screen.
-
-    The text of the screen is complete after the block.
-    """
+    """Make standard output a terminal for the length of a block."""
     master, slave = os.openpty()
-    screen = Screen()
-    reading = threading.Thread(target=screen.read, args=(master,))
+    screen, printed = Screen(), list[bytes]()
+
+    def read() -> None:
+        with suppress(OSError):  # how Linux reports that the other end is closed
+            while part := os.read(master, 65536):
+                printed.append(part)
+
+    reading = threading.Thread(target=read)
     reading.start()
     try:
         with monkeypatch.context() as patch, os.fdopen(slave, "w") as out:
@@ -55,3 +44,4 @@ def terminal(
     finally:
         reading.join()
         os.close(master)
+        screen.text = b"".join(printed).decode().replace("\r\n", "\n")

@@ -44,7 +44,6 @@ class Turns(Clock):
         return thread
 
     def wait(self, is_over: Callable[[], bool], timeout: float | None = None) -> None:
-        """Let other threads run until ``is_over`` returns true or the timeout has passed."""
         me = getcurrent()
         self._waiting[me] = (is_over, inf if timeout is None else self.monotonic() + timeout)
         self._turn = self._next()
@@ -54,7 +53,6 @@ class Turns(Clock):
                 self._turn = self._next()
 
     def stop(self, threads: Collection[greenlet]) -> None:
-        """Never run these threads again, as if their process had ended."""
         for thread in threads:
             self._waiting.pop(thread, None)
         while getcurrent() in threads:
@@ -69,10 +67,7 @@ class Turns(Clock):
             thread.throw()
 
     def _next(self) -> greenlet:
-        """Return a random thread that can go on.
-
-        If none can, move the clock to the next timeout, and return a thread whose timeout it is.
-        """
+        """Return a random thread that can go on, after the next timeout if none can."""
         free = [one for one, (is_over, _) in self._waiting.items() if is_over()]
         if not free:
             end = min(end for _, end in self._waiting.values())

@@ -29,13 +29,11 @@ class WarmCommand:
     """A forked command, with the members of `subprocess.Popen` that tests use."""
 
     def __init__(self, told: IO[str]) -> None:
-        """Read the command's process id from ``told``, which later gives its exit code."""
         self._told = told
         self.pid = int(told.readline())
         self.returncode: int | None = None
 
     def poll(self) -> int | None:
-        """Return the exit code, or None while the command runs."""
         return self._ended(0)
 
     def wait(self, timeout: float | None = None) -> int:
@@ -59,10 +57,7 @@ class WarmCommand:
 
 
 class WarmCommands:
-    """Starts commands as forks of a process that has imported their modules."""
-
     def __init__(self, folder: Path) -> None:
-        """Start the process that forks; put its pipes into ``folder``."""
         self._folder, self._started = folder, 0
         command = [sys.executable, "-m", "tests.kit.warm_commands"]
         self._process = subprocess.Popen(
@@ -73,7 +68,6 @@ class WarmCommands:
         )
 
     def start(self, words: Sequence[str], environment: Mapping[str, str], log: Path) -> WarmCommand:
-        """Start ``demandops`` with these words; its output and errors go to ``log``."""
         pipe = self._folder / f"command-{self._started}"
         self._started += 1
         os.mkfifo(pipe)
@@ -87,20 +81,15 @@ class WarmCommands:
         self._process.communicate()
 
 
-def _import_all() -> None:
+def import_all() -> None:
     import demandops
-    import numpy  # noqa: F401 - ROS messages need it
 
     for module in pkgutil.walk_packages(demandops.__path__, "demandops."):
         importlib.import_module(module.name)
 
 
 def _watch(wanted: dict[str, Any]) -> int:
-    """Fork a child for a command.
-
-    The child returns 0 at once. The parent waits until the child has ended, writes the child's
-    process id and exit code into the pipe that ``wanted`` names, and returns the process id.
-    """
+    """Return 0 in a new child; in the parent, report its id and exit code, and return its id."""
     with Path(wanted["pipe"]).open("w", buffering=1) as pipe:
         signal.signal(signal.SIGCHLD, signal.SIG_DFL)
         pid = os.fork()
@@ -113,7 +102,6 @@ def _watch(wanted: dict[str, Any]) -> int:
 
 
 def _become(wanted: dict[str, Any]) -> None:
-    """Run the command in this process and exit with its code."""
     nothing = os.open(os.devnull, os.O_RDONLY)
     log = os.open(wanted["log"], os.O_WRONLY | os.O_CREAT | os.O_APPEND)
     for old, new in ((nothing, 0), (log, 1), (log, 2)):
@@ -128,7 +116,9 @@ def _become(wanted: dict[str, Any]) -> None:
 
 
 def _fork_for_each_line() -> None:
-    _import_all()
+    import numpy  # noqa: F401 - ROS messages need it
+
+    import_all()
     assert len(list(Path("/proc/self/task").iterdir())) == 1, "an import has started a thread"
     gc.collect()
     gc.freeze()

@@ -16,10 +16,7 @@ from typing import Any, Literal
 Goal = dict[str, Any]
 Item = dict[str, Any]
 Demand = tuple[str, tuple[str, ...]]
-"""A demand: the request id and the sorted, distinct requesters of its joins.
-
-Each claim on a subject has a demand of its own.
-"""
+"""A request id, and the sorted, distinct requesters of its joins."""
 
 Subject = tuple[str, str]
 """A subject: its kind (``application`` or ``connection``) and its id."""
@@ -40,8 +37,6 @@ _BODY = "object_detection_fusion_app"
 
 @dataclass(frozen=True)
 class World:
-    """The part of the state repo's inventory that the bookkeeping needs."""
-
     nodes: frozenset[str]
     brokers: frozenset[str]
 
@@ -50,8 +45,7 @@ class World:
 class Result:
     """What became of a request.
 
-    ``not_held`` has each (id, topic, requester) that a shutdown lists although the requester does
-    not hold the topic. The topic is ``None`` if the shutdown lists no topics. ``touched`` has the
+    ``not_held`` has what a shutdown lists in vain, with None for no topic; ``touched`` has the
     claims that the request adds, changes or removes.
     """
 
@@ -62,7 +56,6 @@ class Result:
 
     @property
     def effective(self) -> bool:
-        """Whether the request must become a commit."""
         return self.outcome in ("booked", "released")
 
 
@@ -81,13 +74,10 @@ def requesters(item: Item) -> list[str]:
 
 
 def demand_of(goal: Goal, item: Item) -> Demand:
-    """Return the demand that an item belongs to; a demand has at most one claim on a subject."""
     return goal.get("id", ""), tuple(sorted(set(requesters(item))))
 
 
 class Books:
-    """The model: :meth:`take` handles a request, :meth:`view` returns who holds what."""
-
     def __init__(self, world: World) -> None:
         self.world = world
         self.claims: Claims = {}
@@ -97,8 +87,8 @@ class Books:
     def take(self, goal: Goal, pause: int = 1) -> Result:
         """Book or release a request as a whole, or refuse it as a whole.
 
-        ``pause`` is the number of seconds since the previous request. It is at least 1, so all
-        claims differ in age: a shutdown takes from the oldest claim first.
+        ``pause`` is at least a second, so claims differ in age: a shutdown takes from the
+        oldest first.
         """
         self.now += pause
         problem = next(self._inadmissible(goal), None)
@@ -159,7 +149,7 @@ class Books:
             yield "source and target topics do not pair"
         if connection.get("type", 0) not in _CONNECTION_TYPES:
             yield "no such type of connection"
-        if _two_targets(connection):
+        if len(dict(_pairs(connection))) < len(set(_pairs(connection))):
             yield "one source topic with two targets"
         if not joining:
             return
@@ -175,11 +165,7 @@ class Books:
             yield "no broker"
 
     def _broker(self, item: Item) -> str:
-        """Return the node of an item's broker, or an empty text if the item names no broker.
-
-        If the inventory has only one broker, return its node. If it has several, return the first
-        node with a broker among these: the named node, the target, the source.
-        """
+        """Return the broker of an item; "" if it names none."""
         asked, brokers = item.get("broker_node_id", ""), self.world.brokers
         ends = (item.get("target_node_id", ""), item.get("source_node_id", ""))
         found = [*brokers][:1] if len(brokers) == 1 else [n for n in (asked, *ends) if n in brokers]
@@ -190,7 +176,7 @@ class Books:
     def _join(self, goal: Goal) -> None:
         for item in _items(goal):
             claims = self.claims.setdefault(_subject(item), {})
-            fixed, broker, routes = _fixed(item), self._broker(item), _pairs(item)
+            fixed, broker, routes = _fixed(item), self._broker(item), dict(_pairs(item))
             for other in claims.values():
                 if other["fixed"] != fixed:
                     raise _Refused("another node, type or end")
@@ -201,13 +187,8 @@ class Books:
                     raise _Refused("the source topic has another target")
             demand = demand_of(goal, item)
             was = claims.get(demand, {"broker": "", "routes": {}, "holds": {}, "booked": self.now})
-            claim = {
-                "fixed": fixed,
-                "broker": was["broker"] or broker,
-                "routes": was["routes"] | routes,
-                "holds": deepcopy(was["holds"]),
-                "booked": was["booked"],
-            }
+            claim = deepcopy(was) | {"fixed": fixed, "broker": was["broker"] or broker}
+            claim["routes"] |= routes
             for topic in _topics(item):
                 claim["holds"].setdefault(topic, set()).update(demand[1])
             # the design leaves this open; here, a join that changes a claim sets its booking time
@@ -216,12 +197,10 @@ class Books:
     # Leaving: a shutdown takes one hold of each named requester on each listed topic
 
     def _shut_down(self, goal: Goal, found: Claims) -> Result:
-        """Take the holds that a shutdown lists.
+        """Take the holds that a shutdown lists from the claims ``found`` before it, each once.
 
-        ``found`` has the claims before the shutdown. If a hold is listed twice, both entries choose
-        the same claim in ``found``, so the hold is taken once. The design leaves one case open: a
-        shutdown with several requesters and no topics. In this model, each requester then gives up
-        its holds on one claim, which may be another claim for each requester.
+        The design leaves open a shutdown with several requesters and no topics: here, each
+        gives up its holds on one claim, which may be another for each.
         """
         # a shutdown repeats another one if it lists the same, in any order and any number of times
         said = frozenset(_said(item) for item in _items(goal))
@@ -232,19 +211,12 @@ class Books:
         for item in _items(goal):
             subject, demand = _subject(item), demand_of(goal, item)
             claims = {d: c for d, c in found.get(subject, {}).items() if _is_meant(c, item)}
-            first = sorted(
-                claims, key=lambda d: (d != demand, d[0] != demand[0], claims[d]["booked"])
-            )
+            ranked = [(d != demand, d[0] != demand[0], c["booked"], d) for d, c in claims.items()]
             for one in demand[1]:
-                theirs = [d for d in first if one in requesters_of(claims[d])]
-                asked: list[tuple[Topic | None, Demand | None]] = [
-                    (
-                        topic,
-                        next((d for d in theirs if one in claims[d]["holds"].get(topic, ())), None),
-                    )
-                    for topic in sorted(_topics(item))
-                ] or [(None, next(iter(theirs), None))]
-                for topic, giver in asked:
+                theirs = [d for *_, d in sorted(ranked) if one in requesters_of(claims[d])]
+                for topic in sorted(_topics(item)) or [None]:
+                    holding = (d for d in theirs if one in claims[d]["holds"].get(topic, ()))
+                    giver = next(holding if topic else iter(theirs), None)
                     if giver is None:
                         in_vain.append((subject[1], topic, one))
                     else:
@@ -273,51 +245,44 @@ class Books:
     # The view
 
     def services(self) -> dict[tuple[str, str, str], dict[str, Any]]:
-        """Return who requests each service; the key is the service, its node, and what it is for.
-
-        A detection is for one point cloud (``<source> <topic>``), a fusion for one application. An
-        object list of a fusion has the name of the point cloud from which it is made.
-        """
+        """Return who requests each service: (service, node, point cloud or application)."""
         found: dict[tuple[str, str, str], dict[str, Any]] = {}
+
+        def read(key: tuple[str, str, str], app: str, role: str, topic: str, who: set[str]) -> None:
+            new: dict[str, Any] = {"applications": set(), "inputs": {}, "requesters": set()}
+            entry = found.setdefault(key, new)
+            entry["applications"].add(app)
+            entry["requesters"] |= who
+            entry["inputs"].setdefault(role, {}).setdefault(topic, set()).update(who)
+
         for id_, claim in self._on("application"):
-            node, who = claim["fixed"]["node"], requesters_of(claim)
-            fusion = found.setdefault(("object-fusion", node, id_), _service())
-            _add(fusion, id_, who)
-            for (role, topic, source), holders in claim["holds"].items():
+            node = claim["fixed"]["node"]
+            for (role, topic, source), who in claim["holds"].items():
                 if role == "ego_data":
-                    _hold(fusion["inputs"]["ego_data"], topic, holders)
+                    read(("object-fusion", node, id_), id_, role, topic, who)
                     continue
                 cloud = f"{source} {topic}"
-                _hold(fusion["inputs"]["object_list"], cloud, holders)
-                detection = found.setdefault(("object-detection", node, cloud), _service())
-                _add(detection, id_, holders)
-                _hold(detection["inputs"]["point_cloud"], topic, holders)
-        return {key: _sorted(entry) for key, entry in found.items()}
+                read(("object-fusion", node, id_), id_, "object_list", cloud, who)
+                read(("object-detection", node, cloud), id_, "point_cloud", topic, who)
+        return _sorted(found)
 
     def connection_view(self) -> dict[str, dict[str, Any]]:
-        """Return who requests each connection, in the form of the bookkeeping's JSON."""
         found: dict[str, dict[str, Any]] = {}
         for id_, claim in self._on("connection"):
             ends = {end: claim["fixed"][end] for end in ("source", "target")}
             entry = found.setdefault(id_, {**ends, "topics": {}, "requesters": set()})
-            for (topic,), holders in claim["holds"].items():
-                _hold(entry["topics"], topic, holders)
-            entry["requesters"] |= requesters_of(claim)
-        return {
-            id_: entry
-            | {"topics": _lists(entry["topics"]), "requesters": sorted(entry["requesters"])}
-            for id_, entry in found.items()
-        }
+            for (topic,), who in claim["holds"].items():
+                entry["topics"].setdefault(topic, set()).update(who)
+                entry["requesters"] |= who
+        return _sorted(found)
 
     def _on(self, kind: str) -> Iterator[tuple[str, Claim]]:
         return ((id_, claim) for ((of, id_), _), claim in _flat(self.claims).items() if of == kind)
 
     def view(self) -> dict[str, Any]:
-        """Return services and connections, in the form of :func:`in_model_words`."""
         return {"services": self.services(), "connections": self.connection_view()}
 
     def holds(self) -> dict[tuple[Subject, Demand], dict[Topic, set[str]]]:
-        """Return who holds each topic, for each claim."""
         return {key: claim["holds"] for key, claim in _flat(self.claims).items()}
 
 
@@ -326,7 +291,6 @@ def _flat(claims: Claims) -> dict[tuple[Subject, Demand], Claim]:
 
 
 def requesters_of(claim: Claim) -> set[str]:
-    """Return the requesters that hold anything in a claim."""
     return {one for who in claim["holds"].values() for one in who}
 
 
@@ -343,10 +307,7 @@ def _subject(item: Item) -> Subject:
 
 
 def _fixed(item: Item) -> dict[str, Any]:
-    """Return the fields that all claims on a subject share: the node or the ends, and the type.
-
-    A field that a shutdown leaves out is an empty text.
-    """
+    """Return the fields that all claims on a subject share; "" if a shutdown leaves one out."""
     if "header" in item:
         return {"node": item["header"].get("node_id", ""), "type": item.get("type", 0)}
     ends = {end: item.get(f"{end}_node_id", "") for end in ("source", "target")}
@@ -359,12 +320,8 @@ def _is_meant(claim: Claim, item: Item) -> bool:
 
 
 def _topics(item: Item) -> set[Topic]:
-    """Return the topics of an item.
-
-    A connection's source topic has only one target, so it is enough to name the topic.
-    """
     if "header" not in item:
-        return {(source,) for source in _pairs(item)}
+        return {(source,) for source, _ in _pairs(item)}
     return {(role, topic, of) for role, topics in _inputs(item).items() for of, topic in topics}
 
 
@@ -384,56 +341,23 @@ def _inputs(app: Item) -> dict[str, set[tuple[str, str]]]:
     }
 
 
-def _pairs(connection: Item) -> dict[str, str]:
-    return dict(_absolute_pairs(connection))
-
-
-def _two_targets(connection: Item) -> bool:
-    pairs = set(_absolute_pairs(connection))
-    return len({source for source, _ in pairs}) < len(pairs)
-
-
-def _absolute_pairs(connection: Item) -> list[tuple[str, str]]:
-    sources, targets = connection.get("source_topics", []), connection.get("target_topics", [])
+def _pairs(item: Item) -> list[tuple[str, str]]:
+    sources, targets = item.get("source_topics", []), item.get("target_topics", [])
     pairs = zip(sources, targets, strict=False)  # a request whose topics do not pair is refused
     return [(absolute(source), absolute(target)) for source, target in pairs]
 
 
-def _service() -> dict[str, Any]:
-    inputs: dict[str, dict[str, set[str]]] = {"ego_data": {}, "object_list": {}, "point_cloud": {}}
-    return {"applications": set(), "inputs": inputs, "requesters": set()}
-
-
-def _add(entry: dict[str, Any], application: str, who: Iterable[str]) -> None:
-    entry["applications"].add(application)
-    entry["requesters"].update(who)
-
-
-def _hold(topics: dict[str, set[str]], topic: str, who: Iterable[str]) -> None:
-    topics.setdefault(topic, set()).update(who)
-
-
-def _lists(topics: Mapping[str, set[str]]) -> dict[str, list[str]]:
-    return {topic: sorted(who) for topic, who in sorted(topics.items())}
-
-
-def _sorted(entry: dict[str, Any]) -> dict[str, Any]:
-    return {
-        "applications": sorted(entry["applications"]),
-        "inputs": {role: _lists(topics) for role, topics in entry["inputs"].items() if topics},
-        "requesters": sorted(entry["requesters"]),
-    }
+def _sorted(value: Any) -> Any:
+    """Return plain data in which sets have become sorted lists."""
+    if isinstance(value, dict):
+        return {key: _sorted(inner) for key, inner in value.items()}
+    return sorted(value) if isinstance(value, set) else value
 
 
 def in_model_words(
     data: Mapping[str, Any], object_lists: Mapping[tuple[str, str], str]
 ) -> dict[str, Any]:
-    """Return the program's bookkeeping in the form of :meth:`Books.view`.
-
-    Args:
-        data: ``services`` and ``connections`` as ``demandops bookkeeping --output json`` prints.
-        object_lists: the result of :func:`object_lists` for the rendered releases.
-    """
+    """Return the program's bookkeeping as :meth:`Books.view` gives it."""
     services = {}
     for entry in data["services"].values():
         node = entry["node"]
@@ -451,10 +375,8 @@ def in_model_words(
                 object_lists.get((node, topic), f"published by nobody: {topic}"): who
                 for topic, who in inputs["object_list"].items()
             }
-        services[key] = {
-            "applications": entry["applications"],
-            "inputs": inputs,
-            "requesters": entry["requesters"],
+        services[key] = {name: entry[name] for name in ("applications", "requesters")} | {
+            "inputs": inputs
         }
     told = ("source", "target", "topics", "requesters")
     connections = {
@@ -464,10 +386,7 @@ def in_model_words(
 
 
 def object_lists(manifests: Iterable[str]) -> dict[tuple[str, str], str]:
-    """Return a map from (node, topic of an object list) to the point cloud that it is made from.
-
-    ``manifests`` are the rendered releases.
-    """
+    """Map (node, topic of an object list) to the point cloud that releases make it from."""
     found: dict[tuple[str, str], str] = {}
     for text in manifests:
         published = re.search(r"objectListTopic: (\S+)", text)

@@ -7,13 +7,14 @@ requests often concern the same ones.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from copy import deepcopy
 from random import Random
 from typing import Any, TypeVar
 
 from tests.kit.goals import (
     CLOUD,
+    EGO,
     STATION_CLOUD,
     Goal,
     Item,
@@ -31,11 +32,7 @@ STATION = "station00"
 VEHICLES = ("vehicle00", "vehicle01", "vehicle02", "vehicle03")
 PARTIES = (*VEHICLES, STATION)
 
-SKELETON = World(
-    nodes=frozenset({*PARTIES, "edge", "cloud"}),
-    brokers=frozenset({"edge", "cloud"}),
-)
-"""The nodes and brokers in the inventory that ``demandops init`` writes."""
+SKELETON = World(nodes=frozenset({*PARTIES, "edge", "cloud"}), brokers=frozenset({"edge", "cloud"}))
 
 REQUESTS = ("station00/collective-perception-intersection", "again", "")
 
@@ -46,59 +43,45 @@ APPLICATIONS = {
 }
 """The node of each application; the first two share detections and have nearly the same name."""
 
-CLOUDS = (
-    STATION_CLOUD,
-    CLOUD,
-    ("/vehicles/vehicle00/drivers/rear/pointcloud", "vehicle00"),
-    ("/shared/points", "vehicle01"),
-    ("/shared/points", "vehicle02"),
-)
+REAR: Topic = ("/vehicles/vehicle00/drivers/rear/pointcloud", "vehicle00")
+_SHARED = [("/shared/points", "vehicle01"), ("/shared/points", "vehicle02")]
+CLOUDS = (STATION_CLOUD, CLOUD, REAR, *_SHARED)
 """Point clouds: the usual ones, a second one of vehicle00, and one name that two vehicles use."""
 
+_LIDAR, _EGO_01 = "/stations/station00/drivers/lidar/pointcloud", "/vehicles/vehicle01/ego_data"
+_TOPICS_00 = {EGO[0]: EGO[0], CLOUD[0]: CLOUD[0], REAR[0]: "/rear"}
 CONNECTIONS: dict[str, tuple[str, str, str, dict[str, str]]] = {
-    "vehicle00/edge": (
-        "vehicle00",
-        "edge",
-        "edge",
-        {
-            "/vehicles/vehicle00/ego_data": "/vehicles/vehicle00/ego_data",
-            CLOUD[0]: CLOUD[0],
-            "/vehicles/vehicle00/drivers/rear/pointcloud": "/rear",
-        },
-    ),
-    "station00/edge": (
-        STATION,
-        "edge",
-        "",
-        {"/stations/station00/drivers/lidar/pointcloud": STATION_CLOUD[0], "/status": "/status"},
-    ),
+    "vehicle00/edge": ("vehicle00", "edge", "edge", _TOPICS_00),
+    "station00/edge": (STATION, "edge", "", {_LIDAR: STATION_CLOUD[0], "/status": "/status"}),
     "station00_edge": (STATION, "cloud", "cloud", {"/status": "/stations/status"}),
-    "vehicle01/edge": (
-        "vehicle01",
-        "edge",
-        "",
-        {"/vehicles/vehicle01/ego_data": "/vehicles/vehicle01/ego_data"},
-    ),
+    "vehicle01/edge": ("vehicle01", "edge", "", {_EGO_01: _EGO_01}),
 }
 """Source, target, broker and topics of each connection."""
 
+_JOINED_CONNECTION = {
+    "broker_node_id": (12, ("", "cloud", "edge", "vehicle00")),
+    "target_node_id": (24, ("cloud", "edge", "vehicle03", "nowhere")),
+    "source_node_id": (24, ("vehicle02", "neverland")),
+    "type": (40, (0, 2, 7)),
+}
+_LEFT_CONNECTION = {
+    "target_node_id": (10, ("", "cloud", "vehicle03", "nowhere")),
+    "source_node_id": (10, ("", "vehicle02", "neverland")),
+    "broker_node_id": (10, ("", "cloud", "nowhere")),
+    "type": (10, (0, 2, 7)),
+}
+
 
 def ego(vehicle: str) -> Topic:
-    """Return the topic of a vehicle's usual ego data."""
     return f"/vehicles/{vehicle}/ego_data", vehicle
 
 
 def shutdown_of(joined: Goal) -> Goal:
-    """Return the shutdown that lists the same as a join."""
     return {**deepcopy(joined), "shutdown": True}
 
 
 class Maker:
-    """Makes random requests.
-
-    The requests of a ``calm`` maker never contradict each other, so all of them can be booked
-    together.
-    """
+    """Makes random requests; those of a ``calm`` maker never contradict each other."""
 
     def __init__(self, random: Random, *, calm: bool = False) -> None:
         self._random = random
@@ -107,11 +90,9 @@ class Maker:
         self.left: list[Goal] = []
 
     def sequence(self, length: int) -> list[Goal]:
-        """Return random requests, each made by :meth:`any`."""
         return [self.any() for _ in range(length)]
 
     def any(self) -> Goal:
-        """Return a join, a repeated join, a shutdown or a repeated shutdown."""
         if not self.joined or self._random.randrange(2) == 0:
             return self.join()
         if self._odds(6):
@@ -125,9 +106,8 @@ class Maker:
         return self.left[-1]
 
     def join(self, request: str | None = None, who: Sequence[str] | None = None) -> Goal:
-        """Return a join of one to four subjects, mostly with the same requesters for all."""
         random = self._random
-        people = list(who) if who is not None else self._people()
+        people = self._people() if who is None else list(who)
         apps = [self._application(people) for _ in range(random.randrange(3))]
         connections = [
             self._connection(people) for _ in range(random.randrange(0 if apps else 1, 3))
@@ -210,59 +190,36 @@ class Maker:
         return [first, STATION if first != STATION else self._pick(VEHICLES)]
 
     def _disturb(self, made: Goal) -> None:
-        """Sometimes make a part of the goal contradict other goals or make no sense."""
         for app in made["apps"]:
-            self._disturb_application(app)
+            body = app["object_detection_fusion_app"]
+            self._change(app["header"], {"node_id": (16, ("cloud", "edge", "nowhere"))})
+            self._change(body, {"requester_ids": (40, ([],))})
+            self._change(app, {"type": (40, (2,))})
+            if self._odds(40):
+                body["ego_data_topics"], body["pointcloud_topics"] = [], []
+            for topic in (*body["ego_data_topics"], *body["pointcloud_topics"]):
+                if self._odds(15):
+                    topic["topic_name"] = topic["topic_name"].lstrip("/")
+                self._change(topic, {"source_node_id": (60, ("vehicle03", "nowhere"))})
         for item in made["connections"]:
-            self._disturb_connection(item)
+            self._change(item, _JOINED_CONNECTION)
+            if self._odds(20):
+                item["target_topics"][0] = "/elsewhere"
+            self._change(item, {"requester_ids": (48, ([],))})
+            if self._odds(40):
+                item["target_topics"] = item["target_topics"][1:]
+            if self._odds(40):
+                item["source_topics"], item["target_topics"] = [], []
         if self._odds(16):  # all applications or all connections get other requesters
             self._name(self._pick(["apps", "connections"]), made, self._people())
-        if self._odds(20):
-            made["apps"] += deepcopy(made["apps"])
-        if self._odds(20):
-            made["connections"] += deepcopy(made["connections"])
+        for kind in ("apps", "connections"):
+            if self._odds(20):
+                made[kind] += deepcopy(made[kind])
         if self._odds(60):
             made["apps"], made["connections"] = [], []
 
-    def _disturb_application(self, app: Item) -> None:
-        body = app["object_detection_fusion_app"]
-        if self._odds(16):
-            app["header"]["node_id"] = self._pick(["cloud", "edge", "nowhere"])
-        if self._odds(40):
-            body["requester_ids"] = []
-        if self._odds(40):
-            app["type"] = 2
-        if self._odds(40):
-            body["ego_data_topics"], body["pointcloud_topics"] = [], []
-        for topic in (*body["ego_data_topics"], *body["pointcloud_topics"]):
-            if self._odds(15):
-                topic["topic_name"] = topic["topic_name"].lstrip("/")
-            if self._odds(60):
-                topic["source_node_id"] = self._pick(["vehicle03", "nowhere"])
-
-    def _disturb_connection(self, item: Item) -> None:
-        self._disturb_ends(item)
-        if self._odds(20):
-            item["target_topics"][0] = "/elsewhere"
-        if self._odds(48):
-            item["requester_ids"] = []
-        if self._odds(40):
-            item["target_topics"] = item["target_topics"][1:]
-        if self._odds(40):
-            item["source_topics"], item["target_topics"] = [], []
-
-    def _disturb_ends(self, item: Item) -> None:
-        if self._odds(12):
-            item["broker_node_id"] = self._pick(["", "cloud", "edge", "vehicle00"])
-        if self._odds(24):
-            item["target_node_id"] = self._pick(["cloud", "edge", "vehicle03", "nowhere"])
-        if self._odds(24):
-            item["source_node_id"] = self._pick(["vehicle02", "neverland"])
-        if self._odds(40):
-            item["type"] = self._pick([0, 2, 7])
-
     def _ask_others(self, made: Goal) -> None:
-        """Change the requesters of a goal: keep only the first one, replace all, or add some."""
+        """Keep only the first requester, replace all, or add some."""
         people = self._people()
         for kind in ("apps", "connections"):
             named = [one for item in made[kind] for one in requesters(item)]
@@ -281,33 +238,27 @@ class Maker:
             elif self._odds(4):
                 body[field] = []
         if self._odds(8):
-            body["pointcloud_topics"] = [
-                *body["pointcloud_topics"],
-                input_topic(self._pick(CLOUDS)),
-            ]
-        if self._odds(10):
-            app["header"]["node_id"] = self._pick(["", "cloud", "edge", "nowhere"])
-        if self._odds(20):
-            app["type"] = self._pick([0, 2])
+            body["pointcloud_topics"] += [input_topic(self._pick(CLOUDS))]
+        self._change(app["header"], {"node_id": (10, ("", "cloud", "edge", "nowhere"))})
+        self._change(app, {"type": (20, (0, 2))})
 
     def _leave_connection(self, item: Item) -> None:
         if self._odds(4):
             keep = self._random.randrange(2)
             item["source_topics"] = item["source_topics"][:keep]
             item["target_topics"] = item["target_topics"][:keep]
-        if self._odds(10):
-            item["target_node_id"] = self._pick(["", "cloud", "vehicle03", "nowhere"])
-        if self._odds(10):
-            item["source_node_id"] = self._pick(["", "vehicle02", "neverland"])
-        if self._odds(10):
-            item["broker_node_id"] = self._pick(["", "cloud", "nowhere"])
-        if self._odds(10):
-            item["type"] = self._pick([0, 2, 7])
+        self._change(item, _LEFT_CONNECTION)
         if self._odds(10) and item["target_topics"]:
             item["target_topics"][0] = "/elsewhere"
         if self._odds(10):
             item["source_topics"] = [*item["source_topics"], "/never/asked"]
             item["target_topics"] = [*item["target_topics"], "/never/asked"]
+
+    def _change(self, item: Item, changes: Mapping[str, tuple[int, Sequence[Any]]]) -> None:
+        """Change each field once in so many times to one of the given values."""
+        for field, (against, values) in changes.items():
+            if self._odds(against):
+                item[field] = self._pick(values)
 
     # Chance
 
@@ -323,5 +274,4 @@ class Maker:
 
 
 def summary(made: Goal) -> dict[str, Any]:
-    """Return a goal without empty lists and false values, for the output of a failed test."""
     return {key: value for key, value in made.items() if value not in ([], False)}

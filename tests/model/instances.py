@@ -16,8 +16,7 @@ from tests.model.leases import Goal
 from tests.model.places import Outcome, Places
 
 TALLY = "tally"
-"""The type of the applications with separate instances; they need a replica per topic, but no
-more than ``MOST``."""
+"""The type with separate instances, which need a replica per topic, and ``MOST`` at most."""
 DEFAULT, NEXT = "1.0.0", "1.1.0"
 HALL, FIRST, FURTHER = "hall", "hall@perception", "hall@city"
 """A node in two access domains, its name in the first one, and its name in the further one."""
@@ -31,26 +30,17 @@ MOST = 3
 KEPT_FOR = timedelta(seconds=120)
 
 Instance = tuple[str, str]
-"""An instance: the id of an application, and its node."""
+"""An application's id, and its node."""
 
 
 @dataclass
 class Instances(Places):
-    """Extends the model of places by separate instances and by kept replicas.
-
-    ``testing`` is the version of the channel ``testing``. ``kept`` has the instances that keep more
-    replicas than they need. For example, ``kept[one] == {3: t}`` if ``one`` keeps its third replica
-    until ``t``.
-    """
+    """Adds separate instances; ``kept[one] == {3: t}`` if one keeps a third replica until ``t``."""
 
     testing: str = NEXT
     kept: dict[Instance, dict[int, datetime]] = field(default_factory=dict)
 
     def take(self, goal: Goal, now: int, received: str = "") -> Outcome:
-        """Apply a goal as a whole or refuse it as a whole; return the outcome.
-
-        ``received`` is the time at which the generator received the goal.
-        """
         before = self.demanded()
         app: dict[str, Any] = next(iter(goal.get("applications", [])), {})
         if app.get("type") == TALLY:
@@ -84,7 +74,6 @@ class Instances(Places):
         return app | {"id": id, "node": node, "version": asked}
 
     def demanded(self) -> dict[Instance, frozenset[Any]]:
-        """Return each demanded instance and its topics."""
         found: dict[Instance, frozenset[Any]] = {}
         for subjects in self.held.values():
             for (_, id), held in subjects.items():
@@ -94,10 +83,7 @@ class Instances(Places):
         return found
 
     def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Keep replicas that the goal has made superfluous, until ``KEPT_FOR`` after ``now``.
-
-        ``before`` has the topics of each instance before the goal.
-        """
+        """Keep replicas that have become superfluous, until ``KEPT_FOR`` after ``now``."""
         after = self.demanded()
         for one in before.keys() | after.keys():
             least, had = needed(after.get(one, ())), needed(before.get(one, ()))
@@ -106,10 +92,7 @@ class Instances(Places):
                 self.kept[one] = kept
 
     def come_down(self, one: Instance, record: Mapping[int, datetime], now: datetime) -> None:
-        """Replace the replicas that an instance keeps by those of the program's ``record``.
-
-        First check that ``record`` lacks only replicas whose time is over at ``now``.
-        """
+        """Take over the program's ``record``, which may lack only what is over."""
         least = needed(self.demanded().get(one, ()))
         kept, told = _ends(self.kept.get(one, {}), least), _ends(record, least)
         for number in kept.keys() - told.keys():

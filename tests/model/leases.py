@@ -17,23 +17,21 @@ Subject = tuple[str, str]
 """A subject: its kind (``applications`` or ``connections``) and its id."""
 
 BY_MESSAGE = "by message: "
-"""The prefix of the name of a demand that comes from a ``DeploymentRequest`` goal."""
+"""Begins the name of a demand by a ``DeploymentRequest`` goal."""
 
 REPEATS_WITHIN_S = 15 * 60
 
 
 def name_by_message(request: str, who: Iterable[str]) -> str:
-    """Return the name of the demand that comes from a ``DeploymentRequest`` goal."""
     return f"{BY_MESSAGE}{request} {sorted(who)}"
 
 
 @dataclass
 class Held:
-    """The hold of a demand on a subject, and its lease.
+    """The hold of a demand on a subject.
 
-    ``seconds`` is the lease, and ``promised`` is the last renewal plus the lease; both are None for
-    a demand without an end. A demand that comes from a ``DeploymentRequest`` goal also has
-    ``holders`` (who holds each topic), ``request`` (the id of the goal) and ``booked`` (the time).
+    ``promised`` is the last renewal plus the lease of ``seconds``; ``holders``, ``request`` and
+    ``booked`` belong to a ``DeploymentRequest`` goal.
     """
 
     what: dict[str, Any]
@@ -45,29 +43,20 @@ class Held:
     booked: int = 0
 
     def same(self, other: Held | None) -> bool:
-        """Return whether ``other`` is the same hold, except for its times."""
         if other is None:
             return False
         mine = (self.what, self.requesters, self.seconds, self.holders)
         return mine == (other.what, other.requesters, other.seconds, other.holders)
 
     def holds(self) -> dict[str, dict[str, frozenset[str]]]:
-        """Return ``{"holds": …}``, which maps each topic of a connection to its requesters.
-
-        All requesters hold a topic unless ``holders`` names some of them. For an application, the
-        result is empty.
-        """
+        """Return who holds each topic of a connection: all, unless ``holders`` names some."""
         topics = self.what.get("topics")
         return {"holds": dict.fromkeys(topics, self.requesters) | self.holders} if topics else {}
 
 
 @dataclass
 class Promises:
-    """The model: the hold of each demand on each subject, with its lease.
-
-    ``slack`` is how many seconds after the end of its lease a demand may be released. ``default``
-    is the lease of a demand that names none.
-    """
+    """Each demand's holds, which may go ``slack`` seconds after the end of their lease."""
 
     slack: int
     default: int | None = None
@@ -77,10 +66,10 @@ class Promises:
     )
 
     def take(self, goal: Goal, now: int) -> Outcome:
-        """Apply a goal as a whole or refuse it as a whole; return the outcome.
+        """Apply or refuse a goal as a whole.
 
-        The outcome is ``unchanged`` if a renewal only prolongs leases. The generator then makes a
-        commit only if the recorded end changes, which depends on the slack.
+        ``unchanged`` may be a renewal, which makes a commit only if the recorded end
+        changes, which depends on the slack.
         """
         if goal.get("kind") == "Demand":
             return self._own(goal, now)
@@ -192,32 +181,25 @@ class Promises:
 
     def _take(self, names: list[str], one: str, subject: Subject, topics: frozenset[str]) -> bool:
         theirs = [
-            (name, self.held[name][subject])
+            (name, held)
             for name in names
-            if one in self.held.get(name, {}).get(subject, Held({}, frozenset())).requesters
+            if (held := self.held.get(name, {}).get(subject)) and one in held.requesters
         ]
-        givers = [
-            next(
-                (
-                    (name, held, topic)
-                    for name, held in theirs
-                    if one in held.holders.get(topic, ())
-                ),
-                None,
-            )
-            for topic in topics
-        ]
-        if theirs and not topics:
-            name, held = theirs[0]
-            givers = [(name, held, topic) for topic in held.holders]
-        for name, held, topic in filter(None, givers):
+        listed = topics or frozenset(*[held.holders for _, held in theirs[:1]])
+        has_taken = False
+        for topic in listed:
+            holding = ((n, held) for n, held in theirs if one in held.holders.get(topic, ()))
+            name, held = next(holding if topics else iter(theirs), ("", Held({}, frozenset())))
+            if not name:
+                continue
+            has_taken = True
             held.holders[topic] -= {one}
             if not held.holders[topic]:
                 del held.holders[topic], held.what["topics"][topic]
             held.requesters = frozenset().union(*held.holders.values())
             if not held.holders:
                 self._drop(name, subject)
-        return any(givers)
+        return has_taken
 
     def _drop(self, demand: str, subject: Subject) -> None:
         del self.held[demand][subject]
@@ -228,13 +210,6 @@ class Promises:
 
     def may_go(self, now: int) -> set[tuple[str, Subject]]:
         """Return the holds whose leases are over at ``now``; the generator may release them."""
-        return self._over(now)
-
-    def must_go(self, now: int) -> set[tuple[str, Subject]]:
-        """Return the holds that a check must release at ``now``, because their slack is over."""
-        return self._over(now - self.slack)
-
-    def _over(self, now: int) -> set[tuple[str, Subject]]:
         return {
             (demand, subject)
             for demand, subjects in self.held.items()
@@ -242,18 +217,17 @@ class Promises:
             if held.promised is not None and held.promised < now
         }
 
+    def must_go(self, now: int) -> set[tuple[str, Subject]]:
+        """Return the holds that a check must release at ``now``, because their slack is over."""
+        return self.may_go(now - self.slack)
+
     def gone(self, released: Iterable[tuple[str, Subject]]) -> None:
-        """Forget the holds that were released at the end of their leases."""
         for demand, subject in released:
             self._drop(demand, subject)
 
     # the view
 
     def claims(self) -> dict[tuple[str, Subject], tuple[dict[str, Any], frozenset[str]]]:
-        """Return the content and the requesters of each demand's hold on each subject.
-
-        For a connection, ``holds`` in the content has the requesters that hold each topic.
-        """
         return {
             (demand, subject): (deepcopy(held.what) | held.holds(), held.requesters)
             for demand, subjects in self.held.items()
@@ -262,10 +236,7 @@ class Promises:
 
 
 def _subjects(goal: Goal) -> dict[Subject, dict[str, Any]]:
-    """Return each subject that a put lists, with the content that it demands.
-
-    The puts of these tests list no subject twice, and the program derives no connections from them.
-    """
+    """Return what a put demands of each subject; no connections are derived."""
     found: dict[Subject, dict[str, Any]] = {}
     for app in goal.get("applications", []):
         inputs = {

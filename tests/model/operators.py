@@ -18,10 +18,10 @@ _WHOLE = [""]
 
 @dataclass
 class Resource:
-    """A custom resource: its last request, and the requesters that its operator counts.
+    """A custom resource with the requesters that its operator counts.
 
-    ``is_stuck`` is true while the operator fails on the resource. ``is_uncounted`` is true for a
-    fusion on which the operator failed before, because the operator counts nothing for it any more.
+    The operator ``is_stuck`` while it fails on the resource, and afterwards counts nothing for
+    a fusion.
     """
 
     spec: object
@@ -31,8 +31,6 @@ class Resource:
 
 
 class Operators:
-    """The model: :meth:`take` counts a goal, and :meth:`books` returns the counted requesters."""
-
     def __init__(self) -> None:
         self._resources: dict[str, Resource] = {}
 
@@ -46,10 +44,7 @@ class Operators:
         }
 
     def take(self, goal: Goal) -> set[str]:
-        """Count a goal as the reference's operators do; return why DemandOps may count differently.
-
-        Each reason is the name of a row in docs/reference.md.
-        """
+        """Count a goal; return the rows of docs/reference.md that explain differences."""
         leaves = goal.get("shutdown", False)
         found = set[str]()
         for app in goal.get("apps", []):

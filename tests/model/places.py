@@ -21,36 +21,26 @@ Outcome = Literal["booked", "released", "unchanged", "refused", "waiting", "wait
 
 @dataclass(frozen=True)
 class Waiting:
-    """A waiting demand: its priority, the start of its wait, its requesters and its goal."""
-
     priority: int
     since: str
     who: frozenset[str]
     goal: Goal
 
     def turn(self, demand: str) -> tuple[int, str, str]:
-        """Return the sort key for the order in which waiting demands get room."""
         return -self.priority, self.since, demand
 
 
 @dataclass
 class Places(Promises):
-    """The model of leases, with demands that wait for room on ``nodes``.
-
-    ``drained`` nodes get no applications.
-    """
+    """Adds demands that wait for room on ``nodes``; ``drained`` nodes get no applications."""
 
     nodes: frozenset[str] = frozenset()
     drained: frozenset[str] = frozenset()
     waiting: dict[str, Waiting] = field(default_factory=dict)
     chosen: Mapping[Subject, str] = field(default_factory=dict)
-    """The node that the generator has chosen for each application; empty while it is not known."""
+    """The node that the generator has chosen for each application, if known."""
 
     def take(self, goal: Goal, now: int, received: str = "") -> Outcome:  # type: ignore[override]
-        """Apply a goal as a whole or refuse it as a whole; return the outcome.
-
-        ``received`` is the time at which the generator received the goal.
-        """
         demand, who = goal.get("demand", ""), frozenset(goal.get("requesters", ()))
         waits = self.waiting.get(demand)
         if waits and goal.get("operation", "put") != "put":
@@ -79,11 +69,7 @@ class Places(Promises):
         return "waits" if self.waiting[demand] == waits else "waiting"
 
     def _put_again(self, goal: Goal, now: int, held: tuple[Subject, leases.Held]) -> Outcome:
-        """Apply a put to a demand that already has a node; return the outcome.
-
-        The application stays on its node unless the node is drained. Then the application needs
-        another free node.
-        """
+        """Apply a put to a demand that has a node, where it stays unless the node is drained."""
         subject, what = held
         node = what.what["node"]
         if not what.requesters & {*goal["requesters"]}:
@@ -108,24 +94,19 @@ class Places(Promises):
         return self.waiting[demand].turn(demand)
 
     def free(self) -> frozenset[str]:
-        """Return the nodes that have room and are not drained."""
         taken = {
             held.what.get("node") for subjects in self.held.values() for held in subjects.values()
         }
         return self.nodes - self.drained - taken
 
     def book_waiting(self, demand: str, now: int) -> None:
-        """Book the waiting demand that is first in turn; fail if ``demand`` is another one.
-
-        ``now`` is the earliest time at which the generator can have booked it.
-        """
+        """Book the demand that must be first in turn; ``now`` is the earliest time for it."""
         assert demand in self.waiting, f"{demand} is booked, and did not wait"
         first = min(self.waiting, key=self._turn)
         assert demand == first, f"{demand} is booked before {first}"
         assert self._place(demand, self.waiting[demand].goal, now) == "booked"
 
     def moved(self, demand: str, subject: Subject) -> None:
-        """Move an application from a drained node to the node that the generator has chosen."""
         held = self.held[demand][subject]
         assert held.what["node"] in self.drained, f"{subject} moved off a node that is not drained"
         node = self._chosen_node(subject)
@@ -135,12 +116,10 @@ class Places(Promises):
         self.drained = self.drained | {node} if drained else self.drained - {node}
 
     def waiting_files(self) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return priority, start of the wait, and requesters of each waiting demand, by name."""
         return {name: (one.priority, one.since, one.who) for name, one in self.waiting.items()}
 
 
 def lacks_node(goal: Goal) -> bool:
-    """Return whether the generator must choose the node of a goal's application."""
     apps: list[dict[str, Any]] = goal.get("applications", [])
     return any("place" in app for app in apps)
 

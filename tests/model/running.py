@@ -22,11 +22,10 @@ from tests.model.places import Outcome
 FUSION = "object-detection-fusion"
 
 Service = tuple[str, str]
-"""A service: the id of its application, and its node."""
+"""An application's id, and its node."""
 Link = tuple[str, str, str]
-"""A connection: its id, its source and its target."""
+"""A connection's id, source and target."""
 CITY_QUOTA = 1
-"""How many claims a requester may have in the domain ``city``."""
 
 
 @dataclass(frozen=True)
@@ -56,16 +55,12 @@ class Override:
 
 @dataclass
 class Running(Instances):
-    """Extends the model of instances by what runs; ``overrides`` are those in effect."""
+    """Adds what runs, and the overrides in effect."""
 
     overrides: frozenset[Override] = frozenset()
 
     def take(self, goal: Goal, now: int, received: str = "") -> Outcome:
-        """Apply a goal as a whole or refuse it as a whole; return the outcome.
-
-        A goal is refused that demands something new of a denied connection, or more claims in the
-        domain ``city`` than a requester may have there.
-        """
+        """Refuse also what is new for a denied connection, or beyond ``CITY_QUOTA``."""
         denied = {one["id"] for one in goal.get("connections", ())} & self.denied()
         tallies = any(one.get("type") == TALLY for one in goal.get("applications", ()))
         if goal.get("shutdown") or not (denied or tallies):
@@ -82,21 +77,17 @@ class Running(Instances):
         return outcome
 
     def content(self, demand: str) -> dict[Subject, tuple[dict[str, Any], frozenset[str]]]:
-        """Return what a demand holds on each subject, and for whom, without the leases."""
         held = self.held.get(demand, {})
         return {subject: (deepcopy(one.what), one.requesters) for subject, one in held.items()}
 
     def _claims_in_city(self) -> Counter[str]:
-        """Return the number of each requester's claims in the domain ``city``."""
         here = (held for _, _, held in self._each("applications") if held.what["node"] == FURTHER)
         return Counter(name for held in here for name in held.requesters)
 
     def denied(self) -> frozenset[str]:
-        """Return the connections that overrides deny."""
         return frozenset().union(*(one.connections for one in self.overrides))
 
     def _holds(self, connections: set[str]) -> dict[Any, Any]:
-        """Return who holds what of some connections, without the leases."""
         return {
             (demand, subject): (dict(held.what), held.requesters, dict(held.holders))
             for demand, subject, held in self._each("connections")
@@ -112,7 +103,6 @@ class Running(Instances):
         ]
 
     def services(self) -> dict[Service, tuple[list[str], int]]:
-        """Return the topics that each service reads, and its number of replicas."""
         topics: dict[Service, set[str]] = {}
         for _, id, held in self._each("applications"):
             if held.what["type"] == FUSION:
@@ -125,7 +115,6 @@ class Running(Instances):
         return max(found)[1] or 0 if found else 1
 
     def links(self) -> dict[Link, dict[str, str]]:
-        """Return, for each connection that is not denied, the target of each source topic."""
         routes: dict[Link, dict[str, str]] = {}
         for _, id, held in self._each("connections"):
             if id not in self.denied():

@@ -36,7 +36,6 @@ class Mutant:
         return f"{'/'.join(self.path.parts[-2:])}:{max(self.lines)} ({self.number}) {self.text}"
 
     def tree(self) -> ast.Module:
-        """Return the mutated module."""
         module = ast.parse(self.path.read_text())
         _, _, put = next(islice(_each(module, frozenset()), self.number, None))
         put()
@@ -44,7 +43,6 @@ class Mutant:
 
 
 def mutants(path: Path) -> list[Mutant]:
-    """Return all mutants of a module, in the order of its syntax tree."""
     found = enumerate(_each(ast.parse(path.read_text()), frozenset()))
     return [Mutant(path, number, text, lines) for number, (text, lines, _) in found]
 
@@ -65,7 +63,6 @@ def _each(parent: ast.AST, lines: frozenset[int]) -> Iterator[tuple[str, frozens
 
 
 def _changes(node: ast.AST) -> Iterator[ast.AST]:
-    """Yield a changed copy of a node for each change."""
     new: Any = deepcopy(node)
     match new:
         case ast.Expr(value=ast.Constant()) | ast.If(test=ast.Name(id="TYPE_CHECKING")):

@@ -74,7 +74,6 @@ class Reached:
 
     @lru_cache(maxsize=1024)  # noqa: B019 - there is one object
     def _in(self, path: Path) -> tuple[dict[int, set[str]], Counter[str]]:
-        """Return the tests that reach each line of a module, and how many lines each reaches."""
         found = self._data.contexts_by_lineno(str(path)).items()
         by_line = {line: {one.partition("|")[0] for one in by if one} for line, by in found}
         return by_line, Counter(test for tests in by_line.values() for test in tests)
@@ -125,7 +124,6 @@ def warm_up() -> None:
 
 
 def start(mutant: Mutant | None, tests: list[str]) -> int:
-    """Start tests in a fork, with a mutant in place of its module; return the process id."""
     if pid := os.fork():
         return pid
     code = 1

@@ -30,7 +30,7 @@ from pydantic import Field, model_validator
 from tests.kit import plain_yaml
 from tests.kit.clock import Clock
 from tests.kit.config import configuration as skeleton_config
-from tests.kit.config import skeleton, state_of
+from tests.kit.config import skeleton, state_of, texts_below
 from tests.kit.memory import NOW as START
 from tests.kit.memory import MemoryRepo, is_of_ledger, ledger_in
 
@@ -42,8 +42,6 @@ _APPDEFS = HERE.parent / "appdefs"
 
 
 class ExpectedFault(FrozenModel):
-    """An expected fault: its code, file and field, and words that its message contains."""
-
     code: str = "invalid"
     file: str = ""
     field: str = ""
@@ -63,10 +61,9 @@ _CHECKS = (
 class Step(FrozenModel):
     """An event of a scenario, and its expected effects; an effect that is None is not compared.
 
-    ``config`` changes the configuration from this step on, like a person's commit. ``after`` lets
-    time pass. ``clock`` moves only the wall clock, by a duration that may be negative. ``restart``
-    discards the generator's memory. ``expires`` lists the demands that the generator releases after
-    these changes, in order. In a step without ``expires``, the generator must release none.
+    ``config`` changes files as a person does, ``clock`` sets only the wall clock, ``restart``
+    discards the generator's memory, and ``expires`` lists the demands that it then releases, in
+    order.
     """
 
     why: str = ""
@@ -103,12 +100,10 @@ class Step(FrozenModel):
 
 
 class Scenario(FrozenModel):
-    """A whole scenario.
+    """A scenario.
 
-    ``config`` changes the files that ``demandops init`` writes. A mapping in ``config`` is merged
-    into the file's mapping, and any other value replaces the file's value. ``appdefs`` names
-    folders of ``tests/appdefs`` to add. ``invalid`` lists the faults that the configuration must
-    have.
+    ``config`` is merged into what ``demandops init`` writes, ``appdefs`` are of tests/appdefs,
+    and ``invalid`` lists the faults that the configuration must have.
     """
 
     must: str = Field(min_length=1)
@@ -125,7 +120,6 @@ class Scenario(FrozenModel):
 
 
 def read(text: str, file: str) -> Scenario:
-    """Parse a scenario; raise ``InvalidInput`` if it is not valid or checks nothing."""
     return parse_file(Scenario, text, file)
 
 
@@ -145,22 +139,13 @@ def _laid_over(below: Any, above: Any) -> Any:
 def configuration(
     appdefs: Iterable[str] = (), config: Mapping[str, Mapping[str, Any]] | None = None
 ) -> dict[str, str]:
-    """Return the files of a configuration with these appdefs and changes, by path."""
     files = skeleton_config()
-    overlays: list[tuple[str, Any]] = []
+    overlays = dict[str, Any]()
     for name in (*appdefs, "driver") if appdefs else ():
-        for path in sorted((_APPDEFS / name).rglob("*")):
-            if path.is_file():
-                files[f"appdefs/{path.relative_to(_APPDEFS).as_posix()}"] = path.read_text()
-        chart = {"folder": "appdefs/recorder/charts/recorder", "version": "0.1.0"}
-        overlays += [
-            ("registry/charts.yaml", {"charts": {"recorder": chart}}),
-            ("registry/images.yaml", {"images": {
-                image: {"repository": f"ghcr.io/example/{image}", "tag": "v1"}
-                for image in ("driver", "recorder")
-            }}),
-        ]  # fmt: skip
-    for path, above in (*overlays, *(config or {}).items()):
+        for path, text in texts_below(_APPDEFS / name).items():
+            files[f"appdefs/{name}/{path}"] = text
+        overlays = plain_yaml.load((_APPDEFS / "registry.yaml").read_text())
+    for path, above in (*overlays.items(), *(config or {}).items()):
         below = plain_yaml.load(files[path]) if path in files else {}
         files[path] = yaml.safe_dump(_laid_over(below, above), sort_keys=False)
     return files
@@ -170,8 +155,6 @@ def configuration(
 
 
 class World(MemoryRepo):
-    """A state repo in memory, with the clock and the memory of one generator."""
-
     def __init__(self, state: State, config: Mapping[str, str]) -> None:
         super().__init__(state=state)
         self.clock = Clock(START)
@@ -180,7 +163,6 @@ class World(MemoryRepo):
         self.restart()
 
     def configure(self, state: State, config: Mapping[str, str]) -> None:
-        """Replace the configuration, and write the files that the generator derives from it."""
         before = self.state.ledger
         self.state = replace(state, ledger=self.state.ledger)
         moved = following_overrides(self.state)
@@ -194,12 +176,10 @@ class World(MemoryRepo):
         self.files = {**self._initial, **ledger, **rendered_files(self.state)}
 
     def restart(self) -> None:
-        """Discard the generator's memory: its lease clock and its rate limits."""
         self._lease_clock = LeaseExpiry(self.clock)
         self._throttle = RateLimit()
 
     def decide(self, goal: object, now: datetime | None = None) -> Decision:
-        """Return the decision on a goal; the state repo stays unchanged."""
         self._sent += 1
         operation, now = f"hand-in-{self._sent}", now or self.clock.now()
         return decide(
@@ -211,19 +191,13 @@ class World(MemoryRepo):
         )
 
     def do_what_is_due(self) -> list[str]:
-        """Release the demands whose leases have ended; return their ids in order.
-
-        Then do what the generator also does by itself: remove replicas that it need not keep any
-        longer, move placed applications away from drained nodes, and try to book waiting demands.
-        """
+        """Do what the generator does by itself; return the demands whose leases ended, in order."""
         now, claims = self._lease_clock.ended_claims(self.state.ledger)
-        done = []
-        for demand in dict.fromkeys(claim.demand for claim in claims):
-            request = Expire(id=demand, demand=demand)
-            taken = self.take(request)
+        done = list(dict.fromkeys(claim.demand for claim in claims))
+        for demand in done:
+            taken = self.take(Expire(id=demand, demand=demand))
             assert isinstance(taken, Decision)
             assert taken.files, f"nothing of '{demand}' was released at {now}"
-            done.append(demand)
         self.scale_down(now)
         for node in self.config.drained_nodes:
             if self.state.ledger.applications_on.get(node):
@@ -232,13 +206,11 @@ class World(MemoryRepo):
         return done
 
     def book_waiting(self) -> None:
-        """Try to book each waiting demand, in the order of the queue."""
         for waiting in in_turn(self.state.ledger.waiting):
             taken = self.take(dict(waiting.goal))
             assert isinstance(taken, Decision), taken
 
     def waiting(self) -> list[str]:
-        """Return the ids of the waiting demands, in the order of the queue."""
         return [one.demand for one in in_turn(self.state.ledger.waiting)]
 
     def runs(self) -> dict[str, list[str]]:
@@ -248,15 +220,15 @@ class World(MemoryRepo):
             for entry in self.books()["services"].values()
         }
 
+    def connections(self, what: str) -> dict[str, list[str]]:
+        return {id: [*entry[what]] for id, entry in self.books()["connections"].items()}
+
     def leases(self) -> dict[str, datetime]:
         """Return, for each demand, the latest of its leases' recorded ends."""
-        found: dict[str, datetime] = {}
-        for claim in self.state.ledger:
-            if claim.lease:
-                found[claim.demand] = max(
-                    claim.lease.until, found.get(claim.demand, claim.lease.until)
-                )
-        return found
+        leased = sorted(
+            (claim.lease.until, claim.demand) for claim in self.state.ledger if claim.lease
+        )
+        return {demand: until for until, demand in leased}
 
     def assert_sound(self) -> None:
         """Check that the files are exactly those of the ledger and of the ledger's releases."""
@@ -278,7 +250,6 @@ def _purpose(entry: Mapping[str, Any]) -> str:
 
 
 def run(scenario: Scenario) -> None:
-    """Run all steps; raise an AssertionError if a step has other effects than it expects."""
     files = configuration(scenario.appdefs, scenario.config)
     world = World(state_of(load(files)), files)
     for number, step in enumerate(scenario.steps, 1):
@@ -311,25 +282,21 @@ def _take(step: Step, world: World, place: str) -> None:
     compared = {
         "runs": world.runs,
         "waiting": world.waiting,
-        "connections": lambda: _of_connections(world, "requesters"),
-        "carries": lambda: _of_connections(world, "topics"),
+        "connections": lambda: world.connections("requesters"),
+        "carries": lambda: world.connections("topics"),
         "leases": lambda: {d: _since_start(end) for d, end in sorted(world.leases().items())},
     }
     for name, found in compared.items():
         wanted = getattr(step, name)
-        if wanted is not None:
-            assert found() == wanted, f"{place}: {name}"
+        assert wanted is None or found() == wanted, f"{place}: {name}"
     for name, words in (step.holds or {}).items():
-        texts = [
-            t for path, t in world.rendered().items() if path.rsplit("/", 1)[1].startswith(name)
-        ]
+        texts = [t for path, t in world.rendered().items() if Path(path).name.startswith(name)]
         assert len(texts) == 1, f"{place}: {len(texts)} releases are called {name}…"
         missing = [word for word in words if word not in texts[0]]
         assert not missing, f"{place}: {name} holds no {missing}:\n{texts[0]}"
 
 
 def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
-    """Yield each difference between the decision on a demand and the step's expectation."""
     if isinstance(taken, Refused):
         told = "\n".join(f"{found.code}: {found}" for found in taken.faults)
         if step.refused is None:
@@ -348,34 +315,26 @@ def _sent(step: Step, taken: Decision | Refused) -> Iterator[str]:
     if step.desired is not None and desired != sorted(step.desired):
         yield f"the desired state changes in another way: {desired}"
     if step.warns is not None:
-        fitting = len(taken.warnings) == len(step.warns) and all(
-            words in warning for words, warning in zip(step.warns, taken.warnings, strict=False)
-        )
-        if not fitting:
+        pairs = zip(step.warns, taken.warnings, strict=False)
+        fit = len(taken.warnings) == len(step.warns) and all(words in one for words, one in pairs)
+        if not fit:
             yield f"warns of {taken.warnings}"
 
 
 def same_faults(wanted: Iterable[ExpectedFault], found: Iterable[Fault]) -> bool:
-    """Return whether the faults found are the expected ones, each once, in any order."""
-    wanted, left = list(wanted), list(found)
-    for fault in found:
-        fitting = next((one for one in wanted if one.fits(fault)), None)
-        if fitting is not None:
-            wanted.remove(fitting)
-            left.remove(fault)
-    return not wanted and not left
-
-
-def _of_connections(world: World, what: str) -> dict[str, list[str]]:
-    return {id: [*entry[what]] for id, entry in world.books()["connections"].items()}
+    left = list(found)
+    for one in wanted:
+        fitting = next((fault for fault in left if one.fits(fault)), None)
+        if fitting is None:
+            return False
+        left.remove(fitting)
+    return not left
 
 
 def _since_start(moment: datetime) -> str:
     """Return the duration from the scenario's start to ``moment``, like ``1h30m``."""
-    rest = int((moment - START).total_seconds())
-    parts = []
+    rest, text = int((moment - START).total_seconds()), ""
     for unit, seconds in (("h", 3600), ("m", 60), ("s", 1)):
         count, rest = divmod(rest, seconds)
-        if count:
-            parts.append(f"{count}{unit}")
-    return "".join(parts) or "0s"
+        text += f"{count}{unit}" if count else ""
+    return text or "0s"

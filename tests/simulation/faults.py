@@ -6,9 +6,10 @@ another of its kind. :data:`FAULTS` lists them all.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from datetime import timedelta
+from inspect import getattr_static
 from typing import Any
 
 from demandops.base.errors import InvalidInput
@@ -24,7 +25,6 @@ from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning import overrides, planner, release_keys
 from demandops.model.config.appdef import Scaling
 from demandops.model.config.config import Config
-from demandops.model.config.override import by_rank
 from demandops.model.demand.claim import Claim, Lease
 from demandops.model.ledger import claim_file, ledger
 from demandops.model.ledger.records import RecentShutdowns, Wait, WaitingDemand
@@ -43,497 +43,343 @@ from demandops.serve.timing.expiry import LeaseExpiry, ScaleDown
 from demandops.serve.timing.own_work import Draining, WaitingTurns
 from demandops.serve.worker import Worker
 
-Patch = Callable[[Any, str, Any], None]
+Wrong = Callable[..., Any]
+"""A wrong function or property; its first argument is the right one, whose arguments follow."""
+
+
+@dataclass
+class Fault:
+    """Wrong code in some places; ``seed`` found it at once when it was written."""
+
+    seed: int
+    parts: list[tuple[Any, str, Wrong]] = field(default_factory=list)
+
+    def plant(self, patch: Callable[[Any, str, Any], None]) -> None:
+        for owner, name, wrong in self.parts:
+            patch(owner, name, _instead_of(getattr_static(owner, name), wrong))
+
+
+def _instead_of(right: Any, wrong: Wrong) -> Any:
+    if isinstance(right, property):
+        return property(lambda one: wrong(right.fget, one))
+    return lambda *given, **named: wrong(right, *given, **named)
+
+
+FAULTS: dict[str, Fault] = {}
+
+
+def plant(title: str, seed: int, owner: Any, name: str, wrong: Wrong) -> None:
+    """Add a fault, or a part of one; ``name`` is what is wrong in a module or class."""
+    FAULTS.setdefault(title, Fault(seed)).parts.append((owner, name, wrong))
+
+
+def wrong(seed: int, owner: Any, name: str) -> Callable[[Wrong], Wrong]:
+    """Add the decorated function as a fault, or as a part of one."""
+
+    def add(made: Wrong) -> Wrong:
+        plant(made.__name__, seed, owner, name, made)
+        return made
+
+    return add
+
+
+def nothing(*_: Any, **more: Any) -> None:
+    """Leave out what the right function does."""
+
+
+def itself(_: Any, one: Any, *more: Any) -> Any:
+    return one
+
+
+def first_only(right: Wrong, *given: Any) -> Any:
+    return [*right(*given)][:1]
+
+
+def in_reverse(right: Wrong, *given: Any) -> Any:
+    return right(*given)[::-1]
+
 
 # ---- booking ----
 
 
-def keep_former_requesters(patch: Patch) -> None:
-    book = booking.book
-
-    def kept(ledger: Any, one: Any, request: str, key: Any, current: Any, now: Any) -> Any:
-        former = current.requesters if current else ()
-        one = replace(one, requesters=(*one.requesters, *former))
-        return book(ledger, one, request, key, current, now)
-
-    patch(booking, "book", kept)
+@wrong(7, booking, "book")
+def keep_former_requesters(
+    book: Any, ledger: Any, one: Any, request: str, key: Any, current: Any, now: Any
+) -> Any:
+    former = current.requesters if current else ()
+    one = replace(one, requesters=(*one.requesters, *former))
+    return book(ledger, one, request, key, current, now)
 
 
-def let_strangers_change_a_demand(patch: Patch) -> None:
-    patch(booking, "refuse_other_owners", lambda *_: None)
+plant("let_strangers_change_a_demand", 1, booking, "refuse_other_owners", nothing)
+plant("release_only_the_first_claim", 17, booking, "owned_claims", first_only)
+plant("replace_what_was_joined", 2, Claim, "extending", itself)
+plant("commit_what_is_booked_already", 8, Claim, "after_booking", itself)
+plant("grant_one_claim_too_many", 4, quotas, "_held", lambda held, *given: held(*given) - 1)
+plant("take_a_repeat_for_another_shutdown", 16, RecentShutdowns, "earlier", nothing)
 
 
-def release_only_the_first_claim(patch: Patch) -> None:
-    owned = booking.owned_claims
-    patch(booking, "owned_claims", lambda *given: owned(*given)[:1])
+@wrong(5, Lease, "renewed")
+def take_back_promised_leases(_: Any, lease: Any, term: Any, now: Any) -> Any:
+    return term.lease_from(now)
 
 
-def replace_what_was_joined(patch: Patch) -> None:
-    patch(Claim, "extending", lambda claim, current: claim)
+plant("lose_renewals", 3, Lease, "renewed", itself)
 
 
-def commit_what_is_booked_already(patch: Patch) -> None:
-    patch(Claim, "after_booking", lambda claim, current: claim)
+@wrong(3, LeaseExpiry, "_has_ended")
+def end_leases_by_the_wall_clock(_: Any, expiry: Any, claim: Any, now: Any) -> bool:
+    return claim.lease is not None
 
 
-def grant_one_claim_too_many(patch: Patch) -> None:
-    patch(quotas, "_held", lambda *given, held=quotas._held: held(*given) - 1)
+plant("come_down_at_once", 8, planner, "_steps", lambda *_: ())
+plant("come_down_early", 1, Scaling, "kept_for", lambda *_: timedelta(seconds=60))
+plant("never_come_down", 15, ScaleDown, "is_due", nothing)
+plant("never_come_down", 15, ScaleDown, "end_due", nothing)
+plant("share_one_instance", 1, admitted_request, "_separated", itself)
 
 
-def take_a_repeat_for_another_shutdown(patch: Patch) -> None:
-    patch(RecentShutdowns, "earlier", lambda *_: None)
+@wrong(4, admitted_request, "_separated")
+def move_instances_with_the_channel(separated: Any, app: Any, config: Any) -> Any:
+    return replace(separated(app, config), version=app.version)
 
 
-def take_back_promised_leases(patch: Patch) -> None:
-    patch(Lease, "renewed", lambda lease, term, now: term.lease_from(now))
+@wrong(22, admitted_request, "_separated")
+def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: Any) -> Any:
+    made = separated(app, config)
+    return made if made.separate else app
 
 
-def lose_renewals(patch: Patch) -> None:
-    patch(Lease, "renewed", lambda lease, term, now: lease)
+plant("take_the_first_domain", 1, Config, "nodes_of", lambda _, config, node: (node,))
 
 
-def end_leases_by_the_wall_clock(patch: Patch) -> None:
-    patch(LeaseExpiry, "_has_ended", lambda expiry, claim, now: claim.lease is not None)
-
-
-def come_down_at_once(patch: Patch) -> None:
-    patch(planner, "_steps", lambda *_: ())
-
-
-def come_down_early(patch: Patch) -> None:
-    patch(Scaling, "kept_for", property(lambda _: timedelta(seconds=60)))
-
-
-def never_come_down(patch: Patch) -> None:
-    patch(ScaleDown, "is_due", lambda *_: False)
-    patch(ScaleDown, "end_due", lambda *_: None)
-
-
-def share_one_instance(patch: Patch) -> None:
-    patch(admitted_request, "_separated", lambda app, config: app)
-
-
-def move_instances_with_the_channel(patch: Patch) -> None:
-    separated = admitted_request._separated
-
-    def by_name(app: Any, config: Any) -> Any:
-        made = separated(app, config)
-        return replace(made, version=app.version)
-
-    patch(admitted_request, "_separated", by_name)
-
-
-def keep_the_channel_of_the_default_version(patch: Patch) -> None:
-    separated = admitted_request._separated
-
-    def by_name(app: Any, config: Any) -> Any:
-        made = separated(app, config)
-        return made if made.separate else app
-
-    patch(admitted_request, "_separated", by_name)
-
-
-def take_the_first_domain(patch: Patch) -> None:
-    patch(Config, "nodes_of", lambda config, node: (node,))
-
-
-def forget_what_is_booked_in_a_domain(patch: Patch) -> None:
-    chosen = admitted_request._chosen
-    patch(
-        admitted_request,
-        "_chosen",
-        lambda one, booked, *more: chosen(one, {}, *more),
-    )
+@wrong(100, admitted_request, "_chosen")
+def forget_what_is_booked_in_a_domain(chosen: Any, one: Any, booked: Any, *more: Any) -> Any:
+    return chosen(one, {}, *more)
 
 
 # ---- routes ----
 
 
-def carry_only_the_first_demands_routes(patch: Patch) -> None:
-    topics = planner.connection_topics
-    patch(planner, "connection_topics", lambda claims: topics([*claims][:1]))
+@wrong(0, planner, "connection_topics")
+def carry_only_the_first_demands_routes(topics: Any, claims: Any) -> Any:
+    return topics([*claims][:1])
 
 
-def name_a_shared_route_twice(patch: Patch) -> None:
-    def each(routes: Iterable[Any]) -> tuple[Any, ...]:
-        return tuple(sorted(routes, key=lambda one: one.source))
-
-    patch(connection, "merged_routes", each)
+@wrong(0, connection, "merged_routes")
+def name_a_shared_route_twice(_: Any, routes: Any) -> Any:
+    return tuple(sorted(routes, key=lambda one: one.source))
 
 
-def deliver_under_the_source_topic(patch: Patch) -> None:
-    patch(Route, "written_topic", property(lambda one: one.source))
+plant("deliver_under_the_source_topic", 6, Route, "written_topic", lambda _, one: one.source)
+plant("send_a_source_topic_to_two_targets", 6, booking, "_route_conflicts", lambda *_: ())
 
 
-def send_a_source_topic_to_two_targets(patch: Patch) -> None:
-    patch(booking, "_route_conflicts", lambda *_: ())
+@wrong(0, decision, "affected_keys")
+def leave_the_clients_of_a_released_connection(
+    affected: Any, before: Any, after: Any, changes: Any
+) -> Any:
+    left = [one for one in changes if one.after or one.before.is_on_application]
+    return affected(before, after, left)
 
 
-def leave_the_clients_of_a_released_connection(patch: Patch) -> None:
-    affected = decision.affected_keys
-
-    def kept(before: Any, after: Any, changes: Iterable[Any]) -> Any:
-        left = [one for one in changes if one.after or one.before.is_on_application]
-        return affected(before, after, left)
-
-    patch(decision, "affected_keys", kept)
-
-
-def leave_the_far_end(patch: Patch) -> None:
-    keys = release_keys._client_keys
-    patch(release_keys, "_client_keys", lambda world, claim: [*keys(world, claim)][:1])
+plant("leave_the_far_end", 0, release_keys, "_client_keys", first_only)
 
 
 # ---- placement ----
 
-
-def let_the_last_in_first(patch: Patch) -> None:
-    in_turn = own_work.in_turn
-    patch(own_work, "in_turn", lambda waiting: in_turn(waiting)[::-1])
+plant("let_the_last_in_first", 6, own_work, "in_turn", in_reverse)
+plant("ignore_priorities", 44, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
 
 
-def ignore_priorities(patch: Patch) -> None:
-    patch(WaitingDemand, "turn", property(lambda one: (one.since, one.demand)))
+@wrong(13, decision, "admitted")
+def begin_the_wait_anew(admitted: Any, state: Any, goal: Any, now: Any, *more: Any) -> Any:
+    request = admitted(state, goal, now, *more)
+    if isinstance(request, Wait) and request.waiting is not None:
+        return replace(request, waiting=replace(request.waiting, since=now))
+    return request
 
 
-def begin_the_wait_anew(patch: Patch) -> None:
-    admitted = decision.admitted
-
-    def anew(state: Any, *more: Any) -> Any:
-        request = admitted(state, *more)
-        if isinstance(request, Wait) and request.waiting is not None:
-            return replace(request, waiting=replace(request.waiting, since=more[1]))
-        return request
-
-    patch(decision, "admitted", anew)
+plant("forget_those_that_wait", 6, WaitingTurns, "is_due", nothing)
+plant("let_others_overtake_in_a_batch", 13, WaitingTurns, "follow", nothing)
+plant("leave_drained_nodes_full", 4, Draining, "is_due", nothing)
+plant("leave_drained_nodes_full", 4, Draining, "move_due", nothing)
+plant("place_on_drained_nodes", 3, Choice, "_closed", lambda *_: "")
+plant("choose_anew_for_a_placed_demand", 0, placement, "_booked", nothing)
+plant("count_no_room", 3, Choice, "_shortage", lambda *_: [])
+plant("count_no_room", 3, Room, "is_full", nothing)
 
 
-def forget_those_that_wait(patch: Patch) -> None:
-    patch(WaitingTurns, "is_due", lambda *_: False)
-
-
-def let_others_overtake_in_a_batch(patch: Patch) -> None:
-    patch(WaitingTurns, "follow", lambda *_: None)
-
-
-def leave_drained_nodes_full(patch: Patch) -> None:
-    patch(Draining, "is_due", lambda *_: False)
-    patch(Draining, "move_due", lambda *_: None)
-
-
-def place_on_drained_nodes(patch: Patch) -> None:
-    patch(Choice, "_closed", lambda *_: "")
-
-
-def choose_anew_for_a_placed_demand(patch: Patch) -> None:
-    patch(placement, "_booked", lambda *_: None)
-
-
-def count_no_room(patch: Patch) -> None:
-    patch(Choice, "_shortage", lambda *_: [])
-    patch(Room, "is_full", lambda *_: False)
-
-
-def count_released_room_as_taken(patch: Patch) -> None:
-    plus = Usage.plus
-    patch(
-        Usage,
-        "plus",
-        lambda usage, more: plus(usage, {need: n for need, n in more.items() if n > 0}),
-    )
+@wrong(0, Usage, "plus")
+def count_released_room_as_taken(plus: Any, usage: Any, more: Any) -> Any:
+    return plus(usage, {need: n for need, n in more.items() if n > 0})
 
 
 # ---- overrides ----
 
 
-def apply_no_override_to_what_a_demand_changes(patch: Patch) -> None:
-    build = changeset.build_changeset
-
-    def without(before: Any, after: Any, *more: Any) -> Any:
-        object.__setattr__(after, "overrides", ())
-        return build(before, after, *more)
-
-    patch(changeset, "build_changeset", without)
+@wrong(8, changeset, "build_changeset")
+def apply_no_override_to_what_a_demand_changes(
+    build: Any, before: Any, after: Any, *more: Any
+) -> Any:
+    object.__setattr__(after, "overrides", ())
+    return build(before, after, *more)
 
 
-def apply_overrides_only_to_new_demands(patch: Patch) -> None:
-    followed = CommitBatch._followed
-
-    def subjects_only(batch: CommitBatch, advance: Any, before: Any, now: Any) -> Any:
-        return followed(batch, replace(advance, config_changed=False), before, now)
-
-    patch(CommitBatch, "_followed", subjects_only)
+@wrong(1, CommitBatch, "_followed")
+def apply_overrides_only_to_new_demands(followed: Any, batch: Any, advance: Any, *more: Any) -> Any:
+    return followed(batch, replace(advance, config_changed=False), *more)
 
 
-def let_the_lowest_priority_win(patch: Patch) -> None:
-    patch(ledger, "by_rank", lambda overrides: by_rank(overrides)[::-1])
+plant("let_the_lowest_priority_win", 63, ledger, "by_rank", in_reverse)
 
 
-def override_all_nodes(patch: Patch) -> None:
-    fits = overrides.fits
-
-    def anywhere(selector: Any, traits: Any, config: Any) -> bool:
-        return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
-
-    patch(overrides, "fits", anywhere)
+@wrong(8, overrides, "fits")
+def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bool:
+    return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
 
-def run_what_is_denied(patch: Patch) -> None:
-    for module in (planner, release_keys):
-        patch(module, "without_suspended", lambda one: one)
+plant("run_what_is_denied", 26, planner, "without_suspended", itself)
+plant("run_what_is_denied", 26, release_keys, "without_suspended", itself)
+plant("book_what_is_denied", 6, quotas, "denial_faults", lambda *_: ())
 
 
-def book_what_is_denied(patch: Patch) -> None:
-    patch(quotas, "denial_faults", lambda *_: ())
-
-
-def end_overrides_early(patch: Patch) -> None:
-    for module in (expiry, relocation):
-        expired = module.expired_overrides
-        patch(
-            module,
-            "expired_overrides",
-            lambda one, now, expired=expired: expired(one, now + timedelta(minutes=2)),
-        )
+@wrong(6, expiry, "expired_overrides")
+@wrong(6, relocation, "expired_overrides")
+def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
+    return expired(one, now + timedelta(minutes=2))
 
 
 # ---- publishing ----
 
 
-def acknowledge_before_publishing(patch: Patch) -> None:
-    publish = Worker._publish_commits
-
-    def early(worker: Worker, commits: CommitBatch, results: list[Any], certain: int) -> bool:
-        worker._demands.answer([pair for pair in results if isinstance(pair[1], Receipt)])
-        return publish(worker, commits, results, certain)
-
-    patch(Worker, "_publish_commits", early)
+@wrong(0, Worker, "_publish_commits")
+def acknowledge_before_publishing(
+    publish: Any, worker: Any, commits: Any, results: Any, *more: Any
+) -> bool:
+    worker._demands.answer([pair for pair in results if isinstance(pair[1], Receipt)])
+    return publish(worker, commits, results, *more)
 
 
-def refuse_before_publishing(patch: Patch) -> None:
-    publish = Worker._publish_commits
-
-    def early(worker: Worker, commits: CommitBatch, results: list[Any], certain: int) -> bool:
-        worker._demands.answer([pair for pair in results if isinstance(pair[1], InvalidInput)])
-        return publish(worker, commits, results, certain)
-
-    patch(Worker, "_publish_commits", early)
+@wrong(0, Worker, "_publish_commits")
+def refuse_before_publishing(
+    publish: Any, worker: Any, commits: Any, results: Any, *more: Any
+) -> bool:
+    worker._demands.answer([pair for pair in results if isinstance(pair[1], InvalidInput)])
+    return publish(worker, commits, results, *more)
 
 
-def follow_nothing(patch: Patch) -> None:
-    def follow(batch: CommitBatch, advance: Any, before: object, now: object) -> None:
-        batch.head = advance.snapshot
-
-    patch(CommitBatch, "follow", follow)
+@wrong(0, CommitBatch, "follow")
+def follow_nothing(_: Any, batch: Any, advance: Any, *more: Any) -> None:
+    batch.head = advance.snapshot
 
 
-def push_on_any_tip(patch: Patch) -> None:
-    publish = RemoteRepository.publish
-    patch(
-        RemoteRepository,
-        "publish",
-        lambda made, expected, commit: publish(made, made.refresh(), commit),
-    )
+@wrong(1, RemoteRepository, "publish")
+def push_on_any_tip(publish: Any, made: Any, expected: Any, commit: Any) -> Any:
+    return publish(made, made.refresh(), commit)
 
 
-def put_a_commit_on_the_wrong_parent(patch: Patch) -> None:
-    commit_files = CommitBatch.commit_files
-
-    def on_the_start(batch: CommitBatch, *given: Any) -> Any:
-        batch.head = batch.head.with_commit(batch.start.commit, batch.head.state)
-        return commit_files(batch, *given)
-
-    patch(CommitBatch, "commit_files", on_the_start)
+@wrong(0, CommitBatch, "commit_files")
+def put_a_commit_on_the_wrong_parent(commit_files: Any, batch: Any, *given: Any) -> Any:
+    batch.head = batch.head.with_commit(batch.start.commit, batch.head.state)
+    return commit_files(batch, *given)
 
 
-def remove_no_file(patch: Patch) -> None:
-    commit_files = CommitBatch.commit_files
-
-    def without(batch: CommitBatch, files: Any, *given: Any) -> Any:
-        kept = {path: text for path, text in files.items() if text is not None}
-        return commit_files(batch, kept, *given)
-
-    patch(CommitBatch, "commit_files", without)
+@wrong(0, CommitBatch, "commit_files")
+def remove_no_file(commit_files: Any, batch: Any, files: Any, *given: Any) -> Any:
+    kept = {path: text for path, text in files.items() if text is not None}
+    return commit_files(batch, kept, *given)
 
 
-def decide_on_a_stale_tip(patch: Patch) -> None:
-    attempt = Worker._attempt
-
-    def fresh(worker: Worker, *given: Any) -> Any:
-        worker._tip_is_fresh = True
-        return attempt(worker, *given)
-
-    patch(Worker, "_attempt", fresh)
+@wrong(2, Worker, "_attempt")
+def decide_on_a_stale_tip(attempt: Any, worker: Any, *given: Any) -> Any:
+    worker._tip_is_fresh = True
+    return attempt(worker, *given)
 
 
-def drop_what_a_batch_has_left(patch: Patch) -> None:
-    patch(Demands, "put_back", lambda demands, batch, *more: batch.clear())
+plant("drop_what_a_batch_has_left", 0, Demands, "put_back", lambda *given: given[2].clear())
 
 
-def bring_back_what_was_deleted(patch: Patch) -> None:
-    follow = CommitBatch.follow
-
-    def undo(batch: CommitBatch, advance: Any, before: Any, now: Any) -> None:
-        ledger, files = advance.snapshot.state.ledger, {}
-        for claim in before.state.ledger:
-            if ledger.get(claim.key) is None:
-                ledger = ledger.replace(claim.key, claim)
-                files[claim_file.path_of(claim.key)] = claim_file.text_of(claim)
-        follow(batch, advance, before, now)
-        if files:
-            author = batch._objects[advance.snapshot.commit].author
-            state = replace(batch.head.state, ledger=ledger)
-            batch.commit_files(files, state, "Undo\n\nRender-Version: 2\n", author, now)
-
-    patch(CommitBatch, "follow", undo)
+@wrong(0, CommitBatch, "follow")
+def bring_back_what_was_deleted(
+    follow: Any, batch: Any, advance: Any, before: Any, now: Any
+) -> None:
+    ledger, files = advance.snapshot.state.ledger, {}
+    for claim in before.state.ledger:
+        if ledger.get(claim.key) is None:
+            ledger = ledger.replace(claim.key, claim)
+            files[claim_file.path_of(claim.key)] = claim_file.text_of(claim)
+    follow(batch, advance, before, now)
+    if files:
+        author = batch._objects[advance.snapshot.commit].author
+        state = replace(batch.head.state, ledger=ledger)
+        batch.commit_files(files, state, "Undo\n\nRender-Version: 2\n", author, now)
 
 
-def book_again_what_was_approved(patch: Patch) -> None:
-    receipt = Approvals._receipt
-
-    def twice(made: Approvals, ticket: Any, decision: Any, snapshot: Any, recorded: Any) -> Receipt:
-        if isinstance(decision, Decision):
-            batch = CommitBatch(made._repository, snapshot)
-            text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 2\n"
-            author = batch._objects[snapshot.commit].author
-            batch.commit_files(decision.files, decision.state, text, author, made._runtime.now())
-            batch.publish()
-        return receipt(made, ticket, decision, snapshot, recorded)
-
-    patch(Approvals, "_receipt", twice)
+@wrong(0, Approvals, "_receipt")
+def book_again_what_was_approved(
+    receipt: Any, made: Any, ticket: Any, decision: Any, snapshot: Any, recorded: Any
+) -> Receipt:
+    if isinstance(decision, Decision):
+        batch = CommitBatch(made._repository, snapshot)
+        text = f"Again\n\nOperation-Id: {ticket.operation}\nRender-Version: 2\n"
+        author = batch._objects[snapshot.commit].author
+        batch.commit_files(decision.files, decision.state, text, author, made._runtime.now())
+        batch.publish()
+    return receipt(made, ticket, decision, snapshot, recorded)
 
 
-def turn_down_what_waits(patch: Patch) -> None:
-    patch(ProposalBranches, "put", lambda *_: "")
+plant("turn_down_what_waits", 0, ProposalBranches, "put", lambda *_: "")
 
 
 # ---- restart ----
 
 
-def forget_the_journal(patch: Patch) -> None:
-    patch(journal, "read", lambda path: {})
+plant("forget_the_journal", 1, journal, "read", lambda *_: {})
 
 
-def leave_the_journal_in_memory(patch: Patch) -> None:
-    write = journal.Journal._write
-    patch(
-        journal.Journal,
-        "_write",
-        lambda made, records, *, durably: write(made, records, durably=False),
-    )
+@wrong(1, journal.Journal, "_write")
+def leave_the_journal_in_memory(write: Any, made: Any, records: Any, *, durably: bool) -> None:
+    write(made, records, durably=False)
 
 
-def rewrite_only_the_newest_entry(patch: Patch) -> None:
-    rewrite = journal.Journal._rewrite
-
-    def newest(made: Any) -> None:
-        made.pending = dict([*made.pending.items()][-1:])
-        rewrite(made)
-
-    patch(journal.Journal, "_rewrite", newest)
+@wrong(1, journal.Journal, "_rewrite")
+def rewrite_only_the_newest_entry(rewrite: Any, made: Any) -> None:
+    made.pending = dict([*made.pending.items()][-1:])
+    rewrite(made)
 
 
-def resume_in_reverse(patch: Patch) -> None:
-    read = journal.read
-    patch(journal, "read", lambda path: dict([*read(path).items()][::-1]))
+plant("resume_in_reverse", 1, journal, "read", lambda read, path: dict([*read(path).items()][::-1]))
+plant("skip_the_search_for_operations", 22, Evaluator, "published_before", lambda *_: [])
 
 
-def skip_the_search_for_operations(patch: Patch) -> None:
-    patch(Evaluator, "published_before", lambda *_: [])
+@wrong(6, generator.state_in_effect, "first_snapshot")
+def start_without_overrides(first: Any, *given: Any) -> Any:
+    found = first(*given)
+    config = replace(found.state.config, overrides={})
+    return replace(found, state=replace(found.state, config=config))
 
 
-def start_without_overrides(patch: Patch) -> None:
-    first = generator.state_in_effect.first_snapshot
-
-    def without(*given: Any) -> Any:
-        found = first(*given)
-        config = replace(found.state.config, overrides={})
-        return replace(found, state=replace(found.state, config=config))
-
-    patch(generator.state_in_effect, "first_snapshot", without)
+@wrong(0, snapshot, "_claim_texts")
+def start_without_the_last_claim(texts: Any, *given: Any) -> Any:
+    return iter([*texts(*given)][:-1])
 
 
-def start_without_the_last_claim(patch: Patch) -> None:
-    texts = snapshot._claim_texts
-    patch(snapshot, "_claim_texts", lambda *given: iter([*texts(*given)][:-1]))
+_known = set[str]()
+"""The demands whose proposals a generator has forgotten at a restart."""
 
 
-def skip_approval_after_a_restart(patch: Patch) -> None:
-    resumed, reasons = demand_lifecycle.ticket_from_journal, permission.approval_reasons
-    known = set[str]()
-
-    def forgotten(entry: Any) -> Ticket:
-        if entry.proposal:
-            known.add(entry.goal.get("demand", ""))
-        return resumed(replace(entry, proposal=None))
-
-    def without(request: Any, *more: Any) -> tuple[str, ...]:
-        return () if request.demand in known else reasons(request, *more)
-
-    patch(demand_lifecycle, "ticket_from_journal", forgotten)
-    patch(permission, "approval_reasons", without)
+def _forget_proposal(resumed: Any, entry: Any) -> Ticket:
+    if entry.proposal:
+        _known.add(entry.goal.get("demand", ""))
+    return resumed(replace(entry, proposal=None))
 
 
-FAULTS: dict[Callable[[Patch], None], int] = {
-    keep_former_requesters: 7,
-    let_strangers_change_a_demand: 1,
-    release_only_the_first_claim: 17,
-    replace_what_was_joined: 2,
-    commit_what_is_booked_already: 8,
-    grant_one_claim_too_many: 4,
-    take_a_repeat_for_another_shutdown: 16,
-    take_back_promised_leases: 5,
-    lose_renewals: 3,
-    end_leases_by_the_wall_clock: 3,
-    come_down_at_once: 8,
-    come_down_early: 1,
-    never_come_down: 15,
-    share_one_instance: 1,
-    move_instances_with_the_channel: 4,
-    keep_the_channel_of_the_default_version: 22,
-    take_the_first_domain: 1,
-    forget_what_is_booked_in_a_domain: 100,
-    carry_only_the_first_demands_routes: 0,
-    name_a_shared_route_twice: 0,
-    deliver_under_the_source_topic: 6,
-    send_a_source_topic_to_two_targets: 6,
-    leave_the_clients_of_a_released_connection: 0,
-    leave_the_far_end: 0,
-    let_the_last_in_first: 6,
-    ignore_priorities: 44,
-    begin_the_wait_anew: 13,
-    forget_those_that_wait: 6,
-    let_others_overtake_in_a_batch: 13,
-    leave_drained_nodes_full: 4,
-    place_on_drained_nodes: 3,
-    choose_anew_for_a_placed_demand: 0,
-    count_no_room: 3,
-    count_released_room_as_taken: 0,
-    apply_no_override_to_what_a_demand_changes: 8,
-    apply_overrides_only_to_new_demands: 1,
-    let_the_lowest_priority_win: 63,
-    override_all_nodes: 8,
-    run_what_is_denied: 26,
-    book_what_is_denied: 6,
-    end_overrides_early: 6,
-    acknowledge_before_publishing: 0,
-    refuse_before_publishing: 0,
-    follow_nothing: 0,
-    push_on_any_tip: 1,
-    put_a_commit_on_the_wrong_parent: 0,
-    remove_no_file: 0,
-    decide_on_a_stale_tip: 2,
-    drop_what_a_batch_has_left: 0,
-    bring_back_what_was_deleted: 0,
-    book_again_what_was_approved: 0,
-    turn_down_what_waits: 0,
-    forget_the_journal: 1,
-    leave_the_journal_in_memory: 1,
-    rewrite_only_the_newest_entry: 1,
-    resume_in_reverse: 1,
-    skip_the_search_for_operations: 22,
-    start_without_overrides: 6,
-    start_without_the_last_claim: 0,
-    skip_approval_after_a_restart: 6,
-}
-"""Each planted fault, with a seed that found it at once when the table was written."""
+@wrong(6, permission, "approval_reasons")
+def skip_approval_after_a_restart(reasons: Any, request: Any, *more: Any) -> tuple[str, ...]:
+    return () if request.demand in _known else reasons(request, *more)
+
+
+FAULTS["skip_approval_after_a_restart"].parts.append(
+    (demand_lifecycle, "ticket_from_journal", _forget_proposal)
+)

@@ -4,120 +4,50 @@ from __future__ import annotations
 
 import shutil
 from collections import Counter
+from collections.abc import Callable
 from datetime import timedelta
 from functools import lru_cache
 from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
+from typing import Any
 
 import pygit2
 from demandops.repo.git.repository import MAIN
 from demandops.serve.timing.expiry import LONGEST_WAIT_S
 
 from tests.kit import plain_yaml, repo
+from tests.kit.config import texts_below
 from tests.kit.promises import Maker, name_of
-from tests.kit.repo import POLICY, GitRepo
-from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, MAY, NEXT, TALLY
+from tests.kit.repo import GitRepo
+from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
 from tests.model.leases import Goal
-from tests.model.running import CITY_QUOTA
+from tests.model.running import Running
 from tests.simulation.oracle import KEPT_REPLICAS, PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
 
 STEPS = 30
+STATE_REPO = Path(__file__).with_name("state-repo")
 MEMORY = "/dev/shm"
-NODES = "inventory/nodes.yaml"
+NODES = "inventory/nodes/places.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 VERSIONS = "registry/versions.yaml"
-_RULES = [
-    {"name": "visitors", "requesters": [f"{VISITOR}*"], "approval": "required"},
-    {"name": "residents", "requesters": ["vehicle*", "station*"]},
-]
 _OVERRIDES: dict[str, dict[str, object]] = {
     "more": {"select": [{"nodes": ["edge", "cloud"]}], "replicas": 2},
     "many": {"select": [{"nodes": ["edge"]}], "replicas": 3, "priority": 10},
     "closed": {"select": [{"connections": ["x"]}], "deny": True},
 }
 _LONGEST_LEASE_S = 90
-_TALLY = f"""apiVersion: demandops/v1
-kind: ApplicationDefinition
-name: {TALLY}
-description: Counts vehicles
-versions: separate
-inputs:
-  ego_data: {{description: State of a vehicle, type: perception_msgs/msg/EgoData}}
-services:
-  counter:
-    prefix: ta
-    description: Counts vehicles
-    inputs: {{ego_data: ego_data}}
-    chart: object-fusion
-    images: [object-fusion]
-    values: values/counter.yaml.j2
-    scaling: {{max: 3, per: {{topics: 1}}, downAfter: 120s}}
-"""
-_COUNTER = """replicas: {{ replicas }}
-image: {tag: {{ images["object-fusion"].tag }}}
-inputs: {egoData: {{ topics.ego_data }}, objectList: []}
-fusion:
-  nodeName: {{ release | ros_name }}
-  rawObjectListsTopic: /raw
-  fusedObjectListsTopic: /fused
-  fusedTrajectoriesTopic: /trajectories
-watcher: {nodeName: {{ (release | ros_name) ~ "_Watcher" }}}
-"""
 
 
 @lru_cache(maxsize=1)
 def template() -> Path:
-    """Return the state repo that every history copies.
-
-    It is in memory, has leases and approval, and its nodes may become full.
-    """
     path = repo.init(Path(mkdtemp(dir=MEMORY, prefix="simulation-")) / "template.git")
-    files = GitRepo(path).files()
-    policy, nodes, appdef = (plain_yaml.load(files[name]) for name in (POLICY, NODES, APPDEF))
-    policy["domains"][0] |= {
-        "rules": _RULES,
-        "leases": {"slack": f"{SLACK_S}s"},
-        "whenFull": "wait",
-    }
-    nodes["nodes"] += [
-        {"id": id, "type": "rack", "cluster": "c-its", "capacity": {"slots": 1}}
-        for id in sorted(PLACES)
-    ]
+    files = texts_below(STATE_REPO)
+    appdef = plain_yaml.load(GitRepo(path).files(APPDEF)[APPDEF])
     appdef["services"]["object-fusion"]["requests"] = {"slots": 1}
-    city = sorted(name for name, nodes in MAY.items() if FURTHER in nodes)
-    policy["domains"].append(
-        {
-            "name": "city",
-            "namespace": "city",
-            "nodes": ["nothing-else"],
-            "ros": {"domainId": 42},
-            "rules": [{"name": "control", "requesters": city}],
-            "leases": {"slack": f"{SLACK_S}s"},
-            "quotas": {"claimsPerRequester": CITY_QUOTA},
-        }
-    )
-    further = [{"name": "city"}]
-    nodes["nodes"].append(
-        {"id": HALL, "type": "hall", "cluster": "c-its", "accessDomains": further}
-    )
-    changed = {POLICY: policy, NODES: nodes, APPDEF: appdef}
-    texts = {name: plain_yaml.dump(data) for name, data in changed.items()}
-    folder = f"appdefs/{TALLY}"
-    texts |= {f"{folder}/appdef.yaml": _TALLY, f"{folder}/values/counter.yaml.j2": _COUNTER}
-    GitRepo(path).commit(texts | {VERSIONS: _versions(NEXT)})
+    GitRepo(path).commit(files | {APPDEF: plain_yaml.dump(appdef)})
     repo.git(path, "repack", "-adq")
     return path
-
-
-def _versions(testing: str) -> str:
-    entry = {
-        "default": DEFAULT,
-        "channels": {"testing": testing},
-        "versions": {DEFAULT: {}, NEXT: {"images": {"object-fusion": {"tag": NEXT}}}},
-    }
-    head = {"apiVersion": "demandops/v1", "kind": "Versions"}
-    return plain_yaml.dump(head | {"applications": {TALLY: entry}})
 
 
 class History:
@@ -142,7 +72,6 @@ class History:
         )
 
     def run(self, steps: int) -> None:
-        """Play ``steps`` random steps, then mend all faults and check the end."""
         things = (
             [self.demand] * 15 + [self.rush] * 2 + [self.wait] * 4 + [self.edit] * 3
             + [self.decide] * 2 + [self.crash] * 2 + [self.spoil_network] * 3 + [self.set_clocks]
@@ -182,15 +111,11 @@ class History:
         self._send([self._goal() for _ in range(self.chance.choice([1, 1, 1, 2, 4]))])
 
     def rush(self) -> None:
-        """Send two demands at once, for which the generator chooses nodes.
-
-        If such a demand has a node already, send its release first.
-        """
+        """Send two demands without a node; first release one that has a node."""
         held = [one for one in self.oracle.claims().values() if one.demand.startswith("place")]
         goals = [self._placed(), self._placed()]
         for claim in held[:1]:
-            names = {"demand": claim.demand, "requesters": [*claim.requesters]}
-            goals.insert(0, {"kind": "Demand", "operation": "release", **names})
+            goals.insert(0, _named(claim.demand, [*claim.requesters]) | {"operation": "release"})
         self._send(goals)
 
     def _send(self, goals: list[Goal]) -> None:
@@ -228,10 +153,7 @@ class History:
         return made
 
     def _tallied(self) -> Goal:
-        """Return a put, release or renewal of an application of the type `tally`.
-
-        The application runs on the node that is in two access domains.
-        """
+        """Return a put, release or renewal of a tally on the node that is in two access domains."""
         topics = self.chance.sample(range(4), self.chance.randrange(1, 5))
         inputs = {"ego_data": [{"topic": f"/e{one}", "source": "vehicle00"} for one in topics]}
         known = [one for one in self._sent if one.get("demand", "").startswith("tally")]
@@ -241,58 +163,37 @@ class History:
             return puts[-1] | {"applications": [app | {"inputs": inputs}]}
         names = ["traffic", "vehicle01", "vehicle01", "vehicle01", "vehicle00"]
         who = sorted({self.chance.choice(names), self.chance.choice(names)})
-        made = {"kind": "Demand", "demand": f"tally{self.chance.randrange(2)}", "requesters": who}
+        made = _named(f"tally{self.chance.randrange(2)}", who)
         if puts and not self.chance.randrange(3):
             return made | {"operation": self.chance.choice(["release", "renew"])}
-        app = {
-            "id": self.chance.choice(["hall0", "hall0", "hall0", "hall1", f"hall0@{NEXT}"]),
-            "type": TALLY,
-            "node": self.chance.choice([HALL, FIRST, FURTHER, FURTHER]),
-            "version": self.chance.choice(["", "", DEFAULT, NEXT, "testing"]),
-            "connect": "none",
-            "inputs": inputs,
-        }
-        made |= {"operation": "put", "applications": [app], "connections": []}
-        lease = self.chance.choice([None, None, None, 90])
-        return made | ({"lease": lease} if lease else {})
+        app = _fusion(
+            self.chance.choice(["hall0", "hall0", "hall0", "hall1", f"hall0@{NEXT}"]),
+            type=TALLY,
+            node=self.chance.choice([HALL, FIRST, FURTHER, FURTHER]),
+            version=self.chance.choice(["", "", DEFAULT, NEXT, "testing"]),
+            inputs=inputs,
+        )
+        return made | _put(app, self.chance.choice([None, None, None, 90]))
 
     def _placed(self) -> Goal:
-        """Return a put, release or renewal of a demand whose node the generator chooses."""
         number = self.chance.randrange(4)
         who = [f"vehicle0{one}" for one in self.chance.choice([[0], [1], [0, 1]])]
-        made = {"kind": "Demand", "demand": f"place{number}", "requesters": who}
+        made = _named(f"place{number}", who)
         if not self.chance.randrange(3):
             return made | {"operation": self.chance.choice(["release", "release", "renew"])}
-        app = {
-            "id": f"place{number}",
-            "type": "object-detection-fusion",
-            "place": {"role": "rack"},
-            "connect": "none",
-            "inputs": {"ego_data": [{"topic": "/ego1", "source": "vehicle00"}]},
-        }
-        made |= {"operation": "put", "applications": [app], "connections": []}
         made["priority"] = self.chance.choice([0, 0, 5])
-        lease = self.chance.choice([None, 10, 60, 90])
-        return made | ({"lease": lease} if lease else {})
+        app = _fusion(f"place{number}", place={"role": "rack"})
+        return made | _put(app, self.chance.choice([None, 10, 60, 90]))
 
     def _visitor(self) -> Goal:
         number = self.chance.randrange(3)
         made = self._maker.put()
-        made |= {"demand": f"visit{number}", "requesters": [f"{VISITOR}{number}"]}
+        named = _named(f"visit{number}", [f"{VISITOR}{number}"])
         if not self.chance.randrange(4):
-            named = {key: made[key] for key in ("kind", "demand", "requesters")}
             return named | {"operation": self.chance.choice(["release", "renew"])}
         topics = [{"topic": f"/ego{self.chance.randrange(3)}", "source": "vehicle00"}]
-        made["applications"] = [
-            {
-                "id": f"visit{number}",
-                "type": "object-detection-fusion",
-                "node": "edge",
-                "connect": "none",
-                "inputs": {"ego_data": topics},
-            }
-        ]
-        return made | {"connections": []}
+        app = _fusion(f"visit{number}", node="edge", inputs={"ego_data": topics})
+        return made | named | {"applications": [app], "connections": []}
 
     def wait(self) -> None:
         self.turns.sleep(self.chance.choice([0.1, 1, 10, 31, 61, 100, 200, 1000]))
@@ -335,18 +236,9 @@ class History:
     # ---- people ----
 
     def edit(self) -> None:
-        edits = (
-            self._override,
-            self._override,
-            self._inventory,
-            self._drain,
-            self._stop_waiting,
-            self._come_down,
-            self._move_channel,
-            self._delete_claim,
-            self._delete_claim,
-        )
-        self.chance.choice((*edits, self._edit_generated, *[self._edited_often] * 4))()
+        edits = [self._override] * 2 + [self._inventory, self._drain, self._stop_waiting]
+        edits += [self._come_down, self._move_channel] + [self._delete_claim] * 2
+        self.chance.choice([*edits, self._edit_generated, *[self._edited_often] * 4])()
 
     def _commit(self, changed: dict[str, str | None]) -> str:
         who = ("Petra Platform", "petra@example.org", int(self.turns.now().timestamp()))
@@ -356,7 +248,6 @@ class History:
         return GitRepo(Path(self.world.remote.path)).files(under)
 
     def _override(self) -> None:
-        """Add an override, which mostly ends by itself, change its end, or remove it."""
         name = self.chance.choice(sorted(_OVERRIDES))
         path = f"overrides/{name}.yaml"
         if path in self._files("overrides/") and self.chance.randrange(2):
@@ -369,46 +260,55 @@ class History:
             file["expires"] = end.isoformat().replace("+00:00", "Z")
         self._commit({path: plain_yaml.dump(file)})
 
+    def _changed(self, path: str, change: Callable[[Any], object]) -> str:
+        """Commit a change of a file's data; return the commit's id."""
+        data = plain_yaml.load(self._files(path)[path])
+        change(data)
+        return self._commit({path: plain_yaml.dump(data)})
+
     def _inventory(self) -> None:
-        data = plain_yaml.load(self._files(NODES)[NODES])
-        added = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
-        data["nodes"].append(added)
-        self._commit({NODES: plain_yaml.dump(data)})
+        def add(data: Any) -> None:
+            car = {"id": f"car{len(data['nodes'])}", "type": "vehicle", "cluster": "c-its"}
+            data["nodes"].append(car)
+
+        self._changed(NODES, add)
 
     def _drain(self) -> None:
-        """Drain a node, mostly one in use, or end its draining."""
         self.oracle.check()
-        data, books = plain_yaml.load(self._files(NODES)[NODES]), self.oracle.books
+        books = self.oracle.books
         used = sorted(PLACES - books.free() - books.drained) if self.chance.randrange(3) else []
         name = self.chance.choice(used or sorted(PLACES))
-        (node,) = (one for one in data["nodes"] if one["id"] == name)
-        drained = node["drained"] = not node.get("drained", False)
-        commit = self._commit({NODES: plain_yaml.dump(data)})
+        drained = name not in books.drained
+
+        def drain(data: Any) -> None:
+            (node,) = (one for one in data["nodes"] if one["id"] == name)
+            node["drained"] = drained
+
+        commit = self._changed(NODES, drain)
         self.oracle.edits[commit] = lambda books: books.drain(name, drained)
 
-    def _stop_waiting(self) -> None:
-        """Delete the file of a waiting demand."""
+    def _delete_record(self, under: str, follow: Callable[[Running, Any], object]) -> None:
         self.oracle.check()
-        if found := sorted(self._files("ledger/waiting").items()):
+        if found := sorted(self._files(under).items()):
             path, text = self.chance.choice(found)
-            demand = plain_yaml.load(text)["demand"]
-            commit = self._commit({path: None})
-            self.oracle.edits[commit] = lambda books: books.waiting.pop(demand)
+            record = plain_yaml.load(text)
+            self.oracle.edits[self._commit({path: None})] = lambda books: follow(books, record)
+
+    def _stop_waiting(self) -> None:
+        self._delete_record("ledger/waiting", lambda books, one: books.waiting.pop(one["demand"]))
 
     def _come_down(self) -> None:
         """Let a service scale down at once: delete the record of the replicas that it keeps."""
-        self.oracle.check()
-        if found := sorted(self._files(KEPT_REPLICAS).items()):
-            path, text = self.chance.choice(found)
-            record = plain_yaml.load(text)
-            instance = record["application"], record["node"]
-            commit = self._commit({path: None})
-            self.oracle.edits[commit] = lambda books: books.kept.pop(instance)
+        self._delete_record(
+            KEPT_REPLICAS, lambda books, one: books.kept.pop((one["application"], one["node"]))
+        )
 
     def _move_channel(self) -> None:
         self.oracle.check()
         version = self.chance.choice([DEFAULT, NEXT])
-        commit = self._commit({VERSIONS: _versions(version)})
+        commit = self._changed(
+            VERSIONS, lambda data: data["applications"][TALLY]["channels"].update(testing=version)
+        )
         self.oracle.edits[commit] = lambda books: setattr(books, "testing", version)
 
     def _delete_claim(self) -> None:
@@ -429,7 +329,6 @@ class History:
         return sorted(b for b in self.world.remote.branches.local if b.startswith("demand/"))
 
     def decide(self) -> None:
-        """Choose a proposal, merge it or not, and delete its branch."""
         if not (branches := self._branches()):
             return
         remote, branch = self.world.remote, self.chance.choice(branches)
@@ -452,8 +351,22 @@ class History:
         remote.branches.delete(branch)
 
 
+def _named(demand: str, who: list[str]) -> Goal:
+    return {"kind": "Demand", "demand": demand, "requesters": who}
+
+
+def _fusion(id: str, **more: Any) -> dict[str, Any]:
+    inputs = {"ego_data": [{"topic": "/ego1", "source": "vehicle00"}]}
+    app = {"id": id, "type": "object-detection-fusion", "connect": "none", "inputs": inputs}
+    return app | more
+
+
+def _put(app: dict[str, Any], lease: int | None) -> Goal:
+    made = {"operation": "put", "applications": [app], "connections": []}
+    return made | ({"lease": lease} if lease else {})
+
+
 def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:
-    """Play the history of a seed; return the last commit, and how often each thing happened."""
     with TemporaryDirectory(dir=MEMORY, prefix="simulation-") as folder:
         world = World(seed, template(), Path(folder), machines=1 + seed % 3)
         history = History(world)
@@ -464,6 +377,5 @@ def play(seed: int, steps: int = STEPS) -> tuple[str, Counter[str]]:
 
 
 def clean_up() -> None:
-    """Remove the state repo that :func:`template` made."""
     shutil.rmtree(template().parent)
     template.cache_clear()

@@ -38,10 +38,9 @@ VISITOR = "visitor"
 
 @dataclass(eq=False)
 class Asked:
-    """A demand that was sent to a machine.
+    """A demand that was sent to a machine when main had ``place`` commits.
 
-    ``time`` is when it was sent: by the monotonic clock for a demand in our own format, by the wall
-    clock for a goal of the reference. ``place`` is the number of commits on main before the demand.
+    ``time`` is monotonic for our own format, and by the wall clock for a goal of the reference.
     """
 
     goal: Goal
@@ -59,10 +58,7 @@ class Asked:
 
     @property
     def subjects(self) -> set[Subject]:
-        """The subjects of the demand, and the demand's name.
-
-        Demands that share one of these are booked in the order in which they were sent.
-        """
+        """Return its subjects; demands that share one are booked in the order of sending."""
         found = {("demand", self.goal["demand"])} if "demand" in self.goal else set()
         kinds = ("applications", "connections")
         return found | {(kind, each["id"]) for kind in kinds for each in self.goal.get(kind, ())}
@@ -77,16 +73,13 @@ class Oracle:
         self.edits: dict[str, Callable[[Running], object]] = {}
         """The change that a person's commit makes in the model, by the commit's id."""
         self.approved: set[str] = set()
-        """The branches of the proposals that a person has merged."""
         self.decided: set[str] = set()
-        """The branches of the proposals that a person has merged or turned down."""
         self.counts = Counter[str]()
         self._seen = world.tip
         self.books = Running(SLACK_S, nodes=PLACES)
         self._ended: set[Override] = set()
-        """The overrides of the last commit that have ended."""
         self._pushed_at = world.turns.monotonic()
-        """The time at which the oracle last found a new tip of main."""
+        """When the oracle last found a new tip of main."""
         self._models = [pickle.dumps(self.books)]
         """The pickled model after each commit of main; copying the model takes ten times longer."""
         self._place: dict[str, int] = {}
@@ -99,7 +92,6 @@ class Oracle:
         world.on_push = lambda: self._guard(self._follow_main)
 
     def ask(self, machine: Machine, goal: Goal) -> Asked:
-        """Send a demand to a machine and watch for its answer."""
         turns = self.world.turns
         turns.pass_(0.001)
         assert machine.generator is not None
@@ -113,13 +105,11 @@ class Oracle:
         return asked
 
     def check(self) -> None:
-        """Follow main; fail if anything since the last check contradicts the model."""
         self._guard(self._follow_main)
         if self.world.failure is not None:
             raise self.world.failure
 
     def claims(self, revision: str = MAIN) -> dict[str, Claim]:
-        """Return the claims of a commit, by the paths of their files."""
         commit = self.world.remote.revparse_single(revision).id
         tree = trees.commit_of(self.world.remote, commit).tree
         found = {}
@@ -179,38 +169,35 @@ class Oracle:
             renews = any(one.lease for one in self.claims(str(commit.id)).values())
             assert outcome != "unchanged" or renews, f"{operation} is booked, but changes nothing"
             self.counts["waited"] += outcome == "waiting"
-        expected = self.books.claims()
-        assert claims == expected, f"after {commit.message}\n{claims}\nbut expected\n{expected}"
-        told, waiting = self.books.waiting_files(), self._waiting_on(commit)
-        assert waiting == told, f"{waiting} wait, but expected {told}"
-        self._compare_instances(commit, records)
+        _assert_same(commit, claims, self.books.claims())
+        _assert_same(commit, self._waiting_on(commit), self.books.waiting_files())
+        self._compare_replicas(commit, records)
         if entry_of(commit).by_generator:
-            self._compare_running(commit)
+            services, links = _rendered(commit)
+            _assert_same(commit, services, self.books.services())
+            _assert_same(commit, links, self.books.links())
         self.books.chosen = {}
         self._claims, self._records = claims, records
         self._models.append(pickle.dumps(self.books))
 
-    def _compare_instances(
+    def _compare_replicas(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> None:
-        """Fail unless a commit has the instances of the model and keeps the same replicas."""
         entry, now = entry_of(commit), _made(commit) + timedelta(seconds=1)
         self.counts["scaled_down"] += entry.first("Operation") == "scale-down"
         for one in self.books.kept.keys() | records.keys():
             self.books.come_down(one, records.get(one, {}), now)
         if entry.by_generator:
-            running = self.books.demanded()
-            expected = sorted(
+            expected = [
                 (
                     "city" if one[1] == FURTHER else "perception",
                     one[0].partition("@")[2],
                     sorted(topic for _, topic in topics),
                     self.books.replicas(one),
                 )
-                for one, topics in running.items()
-            )
-            found = sorted(_rendered_instances(commit))
-            assert found == expected, f"after {commit.message}\n{found} run, not {expected}"
+                for one, topics in self.books.demanded().items()
+            ]
+            _assert_same(commit, sorted(_rendered_instances(commit)), sorted(expected))
 
     def _follow_overrides(self, commit: pygit2.Commit) -> None:
         """Update the model with the overrides of a commit; fail if one ended before its time."""
@@ -223,21 +210,10 @@ class Oracle:
         self._ended = {one for one in overrides if one.name in ended}
         self.books.overrides = frozenset(overrides) - self._ended
 
-    def _compare_running(self, commit: pygit2.Commit) -> None:
-        """Fail unless a generator's commit runs the services and connections of the model."""
-        services, links = _rendered(commit)
-        expected = self.books.services()
-        assert services == expected, f"after {commit.message}\n{services} run, not {expected}"
-        routes = self.books.links()
-        assert links == routes, f"after {commit.message}\n{links} are carried, not {routes}"
-
     def _time_of_own_work(
         self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
     ) -> datetime:
-        """Return the time at which a generator acted without a demand.
-
-        A new record of kept replicas gives the exact time. Otherwise it is the time of the commit.
-        """
+        """Return when a generator acted by itself; new records of replicas tell it exactly."""
         known = {end for steps in self._records.values() for end in steps.values()}
         told = {end for steps in records.values() for end in steps.values()} - known
         made = _made(commit)
@@ -251,20 +227,14 @@ class Oracle:
         return books.take(asked.goal, time, received.replace("+00:00", "Z"))  # type: ignore[arg-type]
 
     def _waiting_on(self, commit: pygit2.Commit) -> dict[str, tuple[int, str, frozenset[str]]]:
-        """Return priority, start of the wait, and requesters of each waiting demand in a commit."""
         texts = trees.texts(commit.tree, ["ledger/waiting"]).values()
-        found = [plain_yaml.load(text) for text in texts]
         return {
             one["demand"]: (one["priority"], str(one["since"]), frozenset(one["requesters"]))
-            for one in found
+            for one in map(plain_yaml.load, texts)
         }
 
     def _own_work(self, claims: Any, machine: Machine, started: float, time: float) -> None:
-        """Update the model with a generator's act that no demand asked for.
-
-        The generator ended leases, booked a waiting demand, or moved applications away from a
-        drained node.
-        """
+        """Follow what a generator did by itself: it ends leases, lets in and moves."""
         both = self._claims.keys() & claims.keys()
         moved = {one for one in both if _node(self._claims[one]) != _node(claims[one])}
         let_in = {demand for demand, _ in claims.keys() - both}
@@ -278,11 +248,7 @@ class Oracle:
         assert moved or gone or let_in, "a generator acted without a reason"
 
     def _operations(self, commit: pygit2.Commit) -> list[tuple[str, str]]:
-        """Return the ids of the operations of a commit and of all commits that it merges.
-
-        Each id comes with the branch of the proposal that contained the operation, or an empty
-        text. The lease of a proposed demand starts at the merge.
-        """
+        """Return the operations of a commit and of what it merges, each with its proposal."""
         commits = [commit]
         if len(commit.parents) > 1:
             remote, main = self.world.remote, commit.parents[0].id
@@ -321,10 +287,7 @@ class Oracle:
         )
 
     def _guard(self, check: Callable[[], object]) -> None:
-        """Run a check; keep its failure for the next :meth:`check`.
-
-        Generators and futures catch most errors, so a failure that is only raised would be lost.
-        """
+        """Keep a failure for :meth:`check`, because generators and futures catch errors."""
         try:
             check()
         except Exception as error:
@@ -401,10 +364,7 @@ class Oracle:
                 )
 
     def check_end(self) -> None:
-        """Fail unless all demands are answered, and all booked demands are in effect.
-
-        The check comes long after all faults were mended.
-        """
+        """All demands are answered, and what is booked is in effect, long after all faults."""
         self.check()
         tip = self.world.tip
         left = [op for op, one in self.asked.items() if not (one.is_answered or one.is_lost)]
@@ -433,12 +393,15 @@ class Oracle:
         assert verdict.holds, verdict
 
 
+def _assert_same(commit: pygit2.Commit, found: object, expected: object) -> None:
+    assert found == expected, f"after {commit.message}\n{found}\nbut expected\n{expected}"
+
+
 def _made(commit: pygit2.Commit) -> datetime:
     return datetime.fromtimestamp(commit.commit_time, timezone.utc)
 
 
 def _kept_replicas(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
-    """Return the numbers of replicas that each instance keeps, each with the time of its end."""
     return dict(map(_record, trees.texts(commit.tree, [KEPT_REPLICAS]).values()))
 
 
@@ -466,10 +429,7 @@ def _overrides(commit: pygit2.Commit) -> tuple[list[Override], set[str]]:
 def _rendered(
     commit: pygit2.Commit,
 ) -> tuple[dict[Service, tuple[list[str], int]], dict[Link, dict[str, str]]]:
-    """Return the rendered services and connections, as the model names them.
-
-    A connection carries what its source client sends under a name that its target client reads.
-    """
+    """Return the rendered services and connections; both clients must name topics alike."""
     services: dict[Service, tuple[list[str], int]] = {}
     ends: dict[tuple[str, str], tuple[str, dict[str, str]]] = {}
     for path, blob in trees.blobs(commit.tree, ["clusters"]):
@@ -512,7 +472,6 @@ def _carried(text: str) -> dict[str, str]:
 
 
 def _rendered_instances(commit: pygit2.Commit) -> Iterator[tuple[str, str, list[str], int]]:
-    """Yield namespace, version, topics and replicas of each rendered instance."""
     for path, blob in trees.blobs(commit.tree, ["clusters"]):
         if Path(path).name.startswith("ta-"):
             yield _rendered_instance(trees.text_of(blob))

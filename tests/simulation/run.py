@@ -27,7 +27,6 @@ RESULTS = Path("build/simulate.json")
 
 
 def main() -> int:
-    """Play at most ``HISTORIES`` histories while there is time; return 1 if one failed, else 0."""
     os.environ.update(NO_GIT_CONFIG)
     logging.disable(logging.CRITICAL)
     sync.force(False)
@@ -66,18 +65,7 @@ def main() -> int:
 
 
 def as_line(counts: Counter[str]) -> str:
-    names = (
-        "histories",
-        "demands",
-        "commits",
-        "faults",
-        "waited",
-        "let_in",
-        "moved",
-        "scaled_down",
-        "failures",
-    )
-    return ", ".join(f"{counts[name]} {name.replace('_', ' ')}" for name in names)
+    return ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items())
 
 
 if __name__ == "__main__":

@@ -34,8 +34,6 @@ _JOURNAL = "outbox.jsonl"
 
 
 class Machine(Runtime):
-    """A machine with one generator, which may crash and start again."""
-
     def __init__(self, world: World, name: str) -> None:
         super().__init__()
         self.world, self.name, self.turns = world, name, world.turns
@@ -53,7 +51,6 @@ class Machine(Runtime):
         self.crashes_in = self.losses = self.rejections = 0
         self.is_cut_off, self.delay = False, 0.0
         self.has_rejected = False
-        """Whether the remote has rejected a push of this machine."""
 
     def processor_s(self) -> float:
         return 0.0
@@ -81,7 +78,6 @@ class Machine(Runtime):
         self.world.on_start(self)
 
     def failed(self, name: str, error: Exception) -> None:
-        """Let the history fail after an unexpected error."""
         super().failed(name, error)
         if not isinstance(error, DemandOpsError):
             self.world.failure = self.world.failure or error
@@ -94,10 +90,7 @@ class Machine(Runtime):
                 self.crash()
 
     def crash(self) -> None:
-        """Stop all threads, and lose everything that is not on the disk.
-
-        The content of the disk moves to a new folder, which the stopped threads cannot reach.
-        """
+        """Stop all threads and lose what is not on the disk, which they cannot reach."""
         self.world.dead += self.threads
         self.is_up, self.generator, self.crashes_in = False, None, 0
         old, self.folder = (
@@ -126,10 +119,7 @@ class Disk:
         self._contents: dict[int, bytes] = {}
 
     def sync(self, path: Path) -> None:
-        """Record what ``fsync`` makes durable: the names in a folder, or the content of a file.
-
-        The machine may crash before or after the call.
-        """
+        """Record what ``fsync`` makes durable: names or a content; crash before or after."""
         self._machine.may_crash()
         if path.is_dir():
             self._names = {found.name: found.stat().st_ino for found in path.iterdir()}
@@ -138,15 +128,11 @@ class Disk:
         self._machine.may_crash()
 
     def sync_all(self, folder: Path) -> None:
-        """Record that a folder's journal, and the names of the files in the folder, are durable."""
         for path in (*folder.glob(_JOURNAL), folder):
             self.sync(path)
 
     def left_of(self, folder: Path) -> bytes | None:
-        """Return what is left of a journal after a crash; None if there is no journal.
-
-        Chance decides whether only the process crashes, which loses nothing, or the whole machine.
-        """
+        """Return what is left of a journal after a crash of the process or of the whole machine."""
         chance, path = self._machine.turns.chance, folder / _JOURNAL
         now = {_JOURNAL: path.stat().st_ino} if path.exists() else {}
         if chance.randrange(2):  # only the process crashes, so all that was written stays
@@ -269,8 +255,6 @@ def _failed(command: tuple[str, ...], text: str) -> git.GitCommandError:
 
 
 class World:
-    """Machines that share a remote; the seed determines everything that happens."""
-
     def __init__(self, seed: int, template: Path, folder: Path, machines: int) -> None:
         self.turns, self.folder, self.numbers = Turns(seed), folder, count(1)
         self.remote = pygit2.Repository(str(shutil.copytree(template, folder / "remote.git")))
@@ -279,11 +263,10 @@ class World:
         self.dead: list[Any] = []
         self.on_start: Callable[[Machine], object] = lambda machine: None
         self.failure: Exception | None = None
-        """The first error that must not happen, if there was one."""
         self.on_push: Callable[[], object] = lambda: None
         self.machines = [Machine(self, f"machine{number}") for number in range(machines)]
         self.last_jump = -1.0
-        """When the clocks were last set forward; -1 if they never were."""
+        """When the clocks were last set forward."""
 
     @property
     def tip(self) -> str:
@@ -291,7 +274,6 @@ class World:
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Run the machines for the length of a block, with the simulated git and disks."""
         by_name = {machine.name: machine for machine in self.machines}
 
         def connect(address: str, folder: Path, notify: object, *, allow_offline: bool) -> Clone:
@@ -318,7 +300,6 @@ class World:
             self.turns.end(self.dead)
 
     def set_clocks(self, seconds: float) -> None:
-        """Move the wall clocks of all machines by some seconds, as a common time server does."""
         self.turns.set_by(seconds)
         if seconds > 0:
             self.last_jump = self.turns.monotonic()
