@@ -14,7 +14,7 @@ from typing import Any
 
 from demandops.base.errors import InvalidInput
 from demandops.connections import connection
-from demandops.connections.connection import Route
+from demandops.connections.connection import ConnectionType, Route
 from demandops.decide import booking, changeset, decision
 from demandops.decide.admission import admitted_request, permission
 from demandops.decide.checks import quotas
@@ -104,11 +104,11 @@ def in_reverse(right: Wrong, *given: Any) -> Any:
 
 @wrong(7, booking, "book")
 def keep_former_requesters(
-    book: Any, ledger: Any, one: Any, request: str, key: Any, current: Any, now: Any
+    book: Any, ledger: Any, one: Any, request: str, key: Any, current: Any, *more: Any, **named: Any
 ) -> Any:
     former = current.requesters if current else ()
     one = replace(one, requesters=(*one.requesters, *former))
-    return book(ledger, one, request, key, current, now)
+    return book(ledger, one, request, key, current, *more, **named)
 
 
 plant("let_strangers_change_a_demand", 1, booking, "refuse_other_owners", nothing)
@@ -183,7 +183,7 @@ def leave_the_clients_of_a_released_connection(
     return affected(before, after, left)
 
 
-plant("leave_the_far_end", 0, release_keys, "_client_keys", first_only)
+plant("leave_the_far_end", 0, ConnectionType, "keys", first_only)
 
 
 # ---- placement ----
