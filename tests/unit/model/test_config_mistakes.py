@@ -42,10 +42,12 @@ def changed(mistake: Mapping[str, Any]) -> dict[str, str | None]:
     for layer in (_BASES.get(mistake.get("base", ""), {}), mistake):
         for path, change in layer.items():
             if path == "scaling":
-                path, change = APPDEF, {"prefix: of": f"…\n    scaling: {json.dumps(change)}"}
-            if path != "base":
-                before = files.get(path) or skeleton().get(path, "")
-                files[path] = _edited(before, change) if isinstance(change, dict) else change
+                scaling = {"prefix: of": f"…\n    scaling: {json.dumps(change)}"}
+                files[APPDEF] = _edited(files.get(APPDEF) or skeleton()[APPDEF], scaling)
+            elif isinstance(change, dict):
+                files[path] = _edited(files.get(path) or skeleton()[path], change)
+            elif path != "base":
+                files[path] = change
     return files
 
 
