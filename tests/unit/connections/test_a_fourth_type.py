@@ -1,13 +1,12 @@
 """A fourth connection type needs one module, its templates, and an entry in the list of types.
 
-This test module is that module. Its client is a relay, which runs at the target and fetches the
-topics of all sources. Although nothing else in the program knows the type, demands for connections
-of this type are booked, planned, rendered and explained.
+This test module is that module, and ``relay/`` has the templates. Its client is a relay, which runs
+at the target and fetches the topics of all sources. Although nothing else in the program knows the
+type, demands for connections of this type are booked, planned, rendered and explained.
 """
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -36,45 +35,7 @@ from tests.kit.connections import ROS_IMAGE, demand, routes, state
 from tests.kit.goals import connection, goal
 from tests.kit.memory import MemoryRepo
 
-SCHEMA = {
-    "type": "object",
-    "required": ["fetch"],
-    "additionalProperties": False,
-    "properties": {"fetch": {"type": "object", "additionalProperties": {"type": "string"}}},
-}
-TEMPLATE = """\
-apiVersion: v1
-kind: ConfigMap
-metadata:
-  name: {{ client.name }}
-  namespace: {{ client.domain.namespace }}
-data:
-  relay.yaml: |
-{{ configuration | literal(4) }}
----
-apiVersion: apps/v1
-kind: Deployment
-metadata:
-  name: {{ client.name }}
-  namespace: {{ client.domain.namespace }}
-spec:
-  replicas: 1
-  selector:
-    matchLabels:
-      app.kubernetes.io/instance: {{ client.name }}
-  template:
-    metadata:
-      labels:
-        app.kubernetes.io/instance: {{ client.name }}
-      annotations:
-        demandops/config-checksum: {{ checksum }}
-    spec:
-{% include 'connections/placement.yaml.j2' %}
-      containers:
-        - name: relay
-          image: {{ image }}
-{% include 'connections/security.yaml.j2' %}
-"""
+RELAY_TEMPLATES = Path(__file__).parent / "relay"
 
 
 class RelayType(ConnectionType):
@@ -133,10 +94,7 @@ RELAY = RelayType()
 @pytest.fixture(autouse=True)
 def a_fourth_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(settings.data_folder("templates"), tmp_path / "templates")
-    folder = tmp_path / "templates" / "connections" / "relay"
-    folder.mkdir()
-    folder.joinpath("client.yaml.j2").write_text(TEMPLATE)
-    folder.joinpath("schema.json").write_text(json.dumps(SCHEMA))
+    shutil.copytree(RELAY_TEMPLATES, tmp_path / "templates" / "connections" / "relay")
     for name in ("appdefs", "state-repo-skeleton"):
         (tmp_path / name).symlink_to(settings.data_folder(name))
     monkeypatch.setattr(settings, "_CHECKOUT", tmp_path)
@@ -210,6 +168,6 @@ def test_what_it_cannot_do_is_refused_and_others_name_it() -> None:
 
 def test_a_field_that_it_does_not_read_never_reaches_a_commit(tmp_path: Path) -> None:
     schema = tmp_path / "templates" / "connections" / "relay" / "schema.json"
-    schema.write_text(json.dumps(SCHEMA | {"required": ["fetch", "port"]}))
+    schema.write_text(schema.read_text().replace('["fetch"]', '["fetch", "port"]'))
     with pytest.raises(InvalidInput, match="relay of relay-edge"):
         booked()
