@@ -114,6 +114,13 @@ def test_tls_without_a_secret_trusts_what_the_image_trusts() -> None:
         assert [volume["name"] for volume in pods(repo)[name]["spec"]["volumes"]] == ["config"]
 
 
+def test_without_settings_a_client_runs_what_the_image_has() -> None:
+    repo = MemoryRepo({"registry/clients.yaml": None})
+    repo.send(routes(demand("mqtt")))
+    (container,) = pods(repo)["mqtt-c-source"]["spec"]["containers"]
+    assert container["args"][3] == "standalone.launch.xml"
+
+
 @pytest.mark.parametrize(
     ("kind", "route", "lost", "field", "told"),
     [

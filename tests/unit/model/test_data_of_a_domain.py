@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -44,34 +43,18 @@ domains:
     }
 
 
-def clients(files: dict[str, str]) -> dict[str, Any]:
-    """Send a demand for a connection between both domains. Return each end's pod spec, by node."""
+def secrets(files: dict[str, str]) -> dict[str, list[tuple[str, list[str]]]]:
+    """Return the secrets and keys that the clients of a connection between both domains get."""
     books = MemoryRepo(files)
     books.send(CONNECTION)
     pods = [item["spec"]["template"]["spec"] for item in books.objects("Deployment").values()]
-    return {pod["nodeSelector"]["node_id"]: pod for pod in pods}
-
-
-def test_each_end_of_a_connection_is_in_the_ros_domain_of_its_access_domain() -> None:
-    own = skeleton()[NODES].replace("ros: {rmw: image}", "ros: {rmw: image, domainId: 3}", 1)
-    found = {
-        node: {one["name"]: one["value"] for one in pod["containers"][0]["env"]}["ROS_DOMAIN_ID"]
-        for node, pod in clients(domains(f"{BOTH}, ros: {{domainId: 41}}") | {NODES: own}).items()
-    }
-    assert found == {"vehicle00": "41", "edge": "0"}
-    nodes = load(configuration(domains(city="ros: {domainId: 42}") | {NODES: own})).nodes
-    of_nodes = {id: nodes[id].ros.domain_id for id in ("vehicle00", "vehicle01", "edge")}
-    assert of_nodes == {"vehicle00": 3, "vehicle01": 0, "edge": 42}
-
-
-def secrets(files: dict[str, str]) -> dict[str, list[tuple[str, list[str]]]]:
     return {
-        node: [
+        pod["nodeSelector"]["node_id"]: [
             (one["secret"]["secretName"], [item["key"] for item in one["secret"]["items"]])
             for one in pod["volumes"]
             if "secret" in one
         ]
-        for node, pod in clients(files).items()
+        for pod in pods
     }
 
 
