@@ -16,10 +16,9 @@ from demandops.base.errors import Fault, InvalidInput
 from demandops.model.config.load import load
 
 from tests.kit import plain_yaml
-from tests.kit.config import brokers, configuration, edited, skeleton
+from tests.kit.config import configuration, edited, skeleton
 
 ROOT, NODES = "demandops.yaml", "inventory/nodes.yaml"
-DOMAINS = "policy/access-domains.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 V1 = "- id: vehicle01\n"
 Files = Mapping[str, str | None]
@@ -73,7 +72,13 @@ def refused(changed: Files) -> tuple[Fault, ...]:
 @pytest.mark.parametrize("content", [None, "", "- a\n", "a: [\n"])
 def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
     for path in (
-        *(ROOT, NODES, DOMAINS, "inventory/clusters.yaml", "inventory/brokers.yaml"),
+        *(
+            ROOT,
+            NODES,
+            "policy/access-domains.yaml",
+            "inventory/clusters.yaml",
+            "inventory/brokers.yaml",
+        ),
         *("registry/charts.yaml", "registry/images.yaml"),
     ):
         (found,) = refused({path: content})
@@ -95,32 +100,6 @@ def test_a_usual_topic_that_ros_forbids_is_refused(topic: str) -> None:
     assert (found.file, found.field) == (NODES, "nodes[0].topics.ego_data")
 
 
-@pytest.mark.parametrize(
-    "files",
-    [
-        brokers(),
-        edited(NODES, V1, f'{V1}    selector: {{"a.b/c": "1e3", d: ""}}\n'),
-        edited(NODES, V1, f"{V1}    tolerations: [{{operator: Exists}}]\n"),
-        edited(DOMAINS, '"*"', '"*", "ghost"'),
-        {"README.md": "x", "appdefs/notes.txt": "x", "inventory/README.md": "x"},
-        changed({"base": "Argo CD"}),
-        {ROOT: f"{skeleton()[ROOT]}argocd:\n  url: https://git.example/state.git\n"},
-        changed({"base": "a shared service"}),
-        changed(
-            {
-                "base": "a shared service",
-                "appdefs/driver/service.yaml": {"each: cloud\n": "", "scope: topic": "scope: node"},
-            }
-        ),
-        changed(
-            {
-                "base": "versions",
-                "registry/versions.yaml": {
-                    "{1.0.0: {}}": "{1.0.0: {}, 2.0.0-rc.1: {charts: {object-fusion: 0.1.0}}}"
-                },
-            }
-        ),
-    ],
-)
-def test_an_odd_but_valid_configuration_loads(files: dict[str, str]) -> None:
-    load(configuration(files))
+@pytest.mark.parametrize("name", _LISTED["valid"])
+def test_an_odd_but_valid_configuration_loads(name: str) -> None:
+    load(configuration(changed(_LISTED["valid"][name])))
