@@ -69,18 +69,15 @@ def refused(changed: Files) -> tuple[Fault, ...]:
     return invalid.value.faults
 
 
+NEEDED = [
+    *(ROOT, NODES, "policy/access-domains.yaml", "registry/charts.yaml", "registry/images.yaml"),
+    *("inventory/clusters.yaml", "inventory/brokers.yaml"),
+]
+
+
 @pytest.mark.parametrize("content", [None, "", "- a\n", "a: [\n"])
 def test_a_file_of_no_use_is_one_fault(content: str | None) -> None:
-    for path in (
-        *(
-            ROOT,
-            NODES,
-            "policy/access-domains.yaml",
-            "inventory/clusters.yaml",
-            "inventory/brokers.yaml",
-        ),
-        *("registry/charts.yaml", "registry/images.yaml"),
-    ):
+    for path in NEEDED:
         (found,) = refused({path: content})
         assert found.file == path
 
