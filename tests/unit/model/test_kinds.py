@@ -1,4 +1,4 @@
-"""The Role, the AppProject and `check` permit the same kinds of objects in an access domain."""
+"""The Role and the AppProject permit the same kinds of objects in an access domain."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decide import warnings
 from demandops.model.config.load import load
 from demandops.model.config.policy import KINDS, AccessDomain
 
@@ -17,8 +16,6 @@ from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
 
 DOMAINS = "policy/access-domains.yaml"
-APPDEFS = "appdefs/object-detection-fusion"
-CHART = f"{APPDEFS}/charts/object-detection"
 MONITOR = "{kind: ServiceMonitor, group: monitoring.coreos.com, resource: servicemonitors}"
 REGISTERED = {
     "": "ConfigMap PersistentVolumeClaim Secret Service ServiceAccount",
@@ -103,63 +100,3 @@ def test_the_list_of_the_documentation_is_taken() -> None:
 def test_the_schema_takes_a_word_or_a_kind() -> None:
     items = AccessDomain.model_json_schema()["properties"]["kinds"]["anyOf"][0]["items"]
     assert items["anyOf"][0]["enum"] == list(KINDS)
-
-
-def warned(files: Mapping[str, str | None]) -> list[str]:
-    return [str(found) for found in warnings.policy_warnings(MemoryRepo(files).state)]
-
-
-AGENT = f"{CHART}/templates/agent.yaml"
-DAEMON = {AGENT: "kind: DaemonSet\n"}
-
-
-def test_a_kind_that_the_domain_may_not_have_is_told_with_its_line() -> None:
-    text = (
-        "{{- if .Values.agent }}\napiVersion: apps/v1\nkind: DaemonSet # on each node\n{{- end }}\n"
-    )
-    (told,) = warned({AGENT: text})
-    assert told.startswith(f"{AGENT}:3: DaemonSet is not among the kinds of access domain")
-    assert told.replace(CHART, "appdefs/agent/charts/agent") in PAGE
-
-
-USED = "ConfigMap, Deployment, HorizontalPodAutoscaler, Role, RoleBinding, Secret, ServiceAccount"
-CLOSED = {AGENT: "kind: NetworkPolicy\n"} | domain(network="namespace")
-
-
-@pytest.mark.parametrize(
-    ("files", "remedy"),
-    [
-        ({}, None),
-        (DAEMON | domain(kinds=f"[{USED}, DaemonSet]"), None),
-        (DAEMON | domain(kinds=f"[{USED}]"), f"add DaemonSet to 'kinds' in {DOMAINS}"),
-        (CLOSED, f"remove 'network: namespace' of the domain in {DOMAINS}"),
-        (DAEMON | domain(rules="[{name: all, applications: [other]}]"), None),
-        (DAEMON | domain(rules='[{name: all, applications: ["object-*"]}]'), "list DaemonSet in "),
-        # only templates that Helm installs are searched
-        ({f"{CHART}/templates/tests/connection.yaml": "kind: Pod\n"}, None),
-        ({f"{CHART}/templates/NOTES.txt": "kind: DaemonSet\n"}, None),
-        ({f"{CHART}/README.md": "kind: DaemonSet\n"}, None),
-        ({AGENT: "apiVersion: v1\nkind: Service\nspec:\n  kind: Pod\n"}, None),
-        ({f"{CHART}/charts/sub/templates/a.yml": 'kind: "DaemonSet"\n'}, "list DaemonSet in "),
-    ],
-)
-def test_only_a_kind_that_the_domain_lacks_is_told_with_a_remedy_that_can_be_followed(
-    files: dict[str, str], remedy: str | None
-) -> None:
-    told = [one.partition("renders one; ")[2] for one in warned(files) if "renders one" in one]
-    assert [one.startswith(remedy or "") for one in told] == [True] * bool(remedy)
-
-
-def test_what_cannot_be_known_is_said() -> None:
-    chart = skeleton()[f"{CHART}/Chart.yaml"].partition("dependencies:")[0]
-    files = {
-        f"{CHART}/templates/any.yaml": "kind: {{ .Values.kind }}\n",
-        f"{CHART}/crds/robot.yaml": "kind: CustomResourceDefinition\n",
-        f"{CHART}/Chart.yaml": f"{chart}dependencies: [{{name: redis}}, {{name: sub}}]\n",
-        f"{CHART}/charts/sub/Chart.yaml": "name: sub\nversion: 0.1.0\n",
-    }
-    subchart, crd, computed = warned(files)
-    assert subchart.startswith(f"{CHART}/Chart.yaml: dependencies[0]: subchart 'redis' is not ")
-    assert crd.startswith(f"{CHART}/crds/robot.yaml: CustomResourceDefinition is not among ")
-    assert "list CustomResourceDefinition, with its group and resource, in 'kinds'" in crd
-    assert computed.startswith(f"{CHART}/templates/any.yaml:1: the template computes the kind ")
