@@ -17,7 +17,6 @@ from demandops.base.errors import InvalidInput
 from demandops.model.config.config import (
     CLIENTS_FILE,
     COLLECTIONS,
-    DOMAINS_FILE,
     NODES_FILE,
     collection_of,
 )
@@ -88,78 +87,9 @@ def test_the_faults_of_the_documentation_are_told() -> None:
     assert faults({"inventory/vehicles.yaml": FILES[VEHICLE]}) in BLOCKS
 
 
-@pytest.mark.parametrize(
-    "path",
-    [
-        "inventory/nodes/more.yml",
-        "inventory/nodes/north/more.yaml",
-        "inventory/nodes.yml",
-        "policy/rules.yaml",
-        "policy/access-domains/edge/more.yaml",
-        "registry/nodes.yaml",
-    ],
-)
-def test_a_name_that_is_nearly_right_is_a_fault_too(path: str) -> None:
-    assert faults({path: "kind: Nodes\n"}).startswith(f"{path}: is not read; ")
-
-
-def test_files_that_are_no_configuration_are_ignored() -> None:
-    odd = ("README.md", "nodes/README.md", "nodes/.draft.yaml", ".old/nodes.yaml", "plan.txt")
-    load(configuration({f"inventory/{name}": "not: [yaml" for name in odd}))
-    load(configuration({"policy/allowed-signers": ""}))
-
-
 def test_the_folder_alone_is_enough_and_messages_name_it() -> None:
     moved = {NODES_FILE: None, "inventory/nodes/all.yaml": skeleton()[NODES_FILE]}
     assert MemoryRepo(moved).config == load(configuration())
     broker = edited("inventory/brokers.yaml", "node: cloud", "node: clod")
     assert "brokers[0].node: 'clod' is not in nodes/; did you mean" in faults(moved | broker)
-    assert "is not in nodes.yaml or nodes/; " in faults(FILES | broker)
     assert faults({NODES_FILE: None}).startswith(f"{NODES_FILE}: is missing; ")
-
-
-BAD_VEHICLE = FILES[VEHICLE].replace("cluster: c-its", "cluster: c-it").replace("  ego_", "  eggo_")
-DOMAIN = skeleton()[DOMAINS_FILE].replace("name: perception", "name: other")
-CLIENTS = "apiVersion: demandops/v1\nkind: Clients\n"
-ZENOH = "registry/clients/zenoh.yaml"
-
-
-@pytest.mark.parametrize(
-    ("files", "places"),
-    [
-        (
-            FILES | {VEHICLE: BAD_VEHICLE},
-            [(VEHICLE, "nodes[0].cluster"), (VEHICLE, "nodes[0].topics.eggo_data")],
-        ),
-        (FILES | {VEHICLE: "kind: Nodes\n"}, [(VEHICLE, "apiVersion"), (VEHICLE, "nodes")]),
-        (
-            {"policy/access-domains/a.yaml": DOMAIN.replace('["*"]', "[nobody]")},
-            [("policy/access-domains/a.yaml", "domains[0].namespace")],
-        ),
-        (
-            {ZENOH: f"{CLIENTS}mqtt: {{launchFile: x}}\n"},
-            [("registry/clients.yaml", "mqtt"), (ZENOH, "mqtt")],
-        ),
-    ],
-    ids=["of a node", "of a file", "of two domains", "settings in two files"],
-)
-def test_a_fault_in_one_of_many_files_names_the_file_and_the_field(
-    files: dict[str, str], places: list[tuple[str, str]]
-) -> None:
-    with pytest.raises(InvalidInput) as invalid:
-        load(configuration(files))
-    assert [(found.file, found.field) for found in invalid.value.faults] == places
-
-
-def test_images_of_a_file_come_from_its_registry() -> None:
-    head = "apiVersion: demandops/v1\nkind: Images\nregistry: mirror.example:5000\nimages:\n"
-    mine = "registry/images/mine.yaml"
-    images = load(configuration({mine: f"{head}  recorder: {{repository: x/recorder, tag: v1}}\n"}))
-    assert images.images["recorder"].repository == "mirror.example:5000/x/recorder"
-    assert images.images["object-fusion"].repository.startswith("docker.io/")
-
-
-def test_settings_of_another_connection_type_may_be_in_another_file() -> None:
-    clients = load(configuration({ZENOH: f"{CLIENTS}zenoh: {{hostNetwork: false}}\n"})).clients
-    assert clients.zenoh.host_network is False
-    assert clients.mqtt.launch_file == "standalone.launch.ros2.xml"
