@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from random import Random
-from types import MappingProxyType
 
 import pytest
 from demandops.base.errors import Fault, InvalidInput
@@ -49,7 +48,6 @@ moments = st.datetimes(
 )
 leases = st.none() | st.builds(Lease, st.integers(1, LONGEST_S), st.integers(0, LONGEST_S), moments)
 people = st.lists(ids, min_size=1, max_size=4, unique=True).map(lambda who: tuple(sorted(who)))
-inputs = st.lists(st.builds(InputTopic, topics, ids, st.just("") | ids), min_size=1, max_size=4)
 deliveries = st.builds(Delivery, ids, ids, st.just("") | topics)
 routes = st.builds(
     Route,
@@ -71,32 +69,25 @@ values = st.recursive(
     lambda inner: st.lists(inner, max_size=3) | st.dictionaries(words, inner, max_size=3),
     max_leaves=6,
 )
-
-
-def as_in_a_claim(found: list[InputTopic]) -> tuple[InputTopic, ...]:
-    """Return topics sorted, and only one of those with the same name and source."""
-    return tuple(sorted({(item.topic, item.source): item for item in found}.values()))
-
-
-@st.composite
-def applications(draw: st.DrawFn) -> Application:
-    return Application(
-        id=draw(ids),
-        appdef=draw(ids),
-        node=draw(ids),
-        inputs=MappingProxyType(
-            {
-                role: as_in_a_claim(draw(inputs))
-                for role in ("ego_data", "point_cloud", "radar")
-                if draw(st.booleans())
-            }
-        ),
-        parameters=MappingProxyType(draw(st.dictionaries(ids, values, max_size=3))),
-        version=draw(st.sampled_from(["", "1.0.0", "1e3", "0x10", "next", "on", "2024-01-01"])),
-        deliver=tuple(sorted(draw(st.sets(deliveries, max_size=2)))),
-    )
-
-
+# sorted, and only one of those with the same name and source
+inputs = st.lists(
+    st.builds(InputTopic, topics, ids, st.just("") | ids),
+    min_size=1,
+    max_size=4,
+    unique_by=lambda one: (one.topic, one.source),
+).map(lambda found: tuple(sorted(found)))
+applications = st.builds(
+    Application,
+    id=ids,
+    appdef=ids,
+    node=ids,
+    inputs=st.dictionaries(st.sampled_from(["ego_data", "point_cloud", "radar"]), inputs).map(
+        lambda found: dict(sorted(found.items()))
+    ),
+    parameters=st.dictionaries(ids, values, max_size=3),
+    version=st.sampled_from(["", "1.0.0", "1e3", "0x10", "next", "on", "2024-01-01"]),
+    deliver=st.sets(deliveries, max_size=2).map(lambda found: tuple(sorted(found))),
+)
 connections = st.builds(
     Connection,
     id=ids,
@@ -110,7 +101,7 @@ connections = st.builds(
 
 claims = st.builds(
     Claim,
-    held=applications() | connections,
+    held=applications | connections,
     demand=ids,
     request=st.just("") | ids,
     requesters=people,
