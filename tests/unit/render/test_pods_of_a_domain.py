@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import InvalidInput
 from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
 from demandops.model.config.policy import matches
@@ -25,9 +24,7 @@ from demandops.render.release_file import check_files
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
 
-DOMAINS, NODES, CLIENTS = (
-    *("policy/access-domains.yaml", "inventory/nodes.yaml", "registry/clients.yaml"),
-)
+DOMAINS, NODES = "policy/access-domains.yaml", "inventory/nodes.yaml"
 BOOTSTRAP = "bootstrap/c-its.yaml"
 PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
 HEAD = "apiVersion: demandops/v1\nkind: {}\n"
@@ -170,19 +167,3 @@ def test_the_default_lets_nodes_have_the_hosts_network() -> None:
     bare = skeleton()[DOMAINS].replace("    podSecurity: host-network\n", "")
     assert bare != skeleton()[DOMAINS]
     assert bootstrap({DOMAINS: bare}) == bootstrap({})
-
-
-def test_a_node_may_not_have_what_its_domain_forbids() -> None:
-    policy = POLICY.replace("ns-fleet,", "ns-fleet, podSecurity: baseline,")
-    nodes = skeleton()[NODES].replace("    type:", "    hostNetwork: false\n    type:", 1)
-    own = OWN.replace("c-its, ", "c-its, hostNetwork: false, ")
-    clients = skeleton()[CLIENTS] + "  hostNetwork: true\n"
-    files = {DOMAINS: policy, NODES: nodes, "inventory/nodes/own.yaml": own, CLIENTS: clients}
-    with pytest.raises(InvalidInput) as invalid:
-        load(configuration(files))
-    nodes = [(NODES, f"nodes[{place}].hostNetwork") for place in (1, 2, 3)]
-    found = invalid.value.faults
-    assert [(one.file, one.field) for one in found] == [*nodes, (CLIENTS, "mqtt.hostNetwork")]
-    assert all(
-        "of access domain 'fleet' is baseline, which forbids it" in str(one) for one in found
-    )
