@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import pytest
 from demandops.decide.state import rendered_files
-from demandops.model.ledger.records import SHUTDOWNS_ROOT
 
-from tests.kit.golden import CASES, START, play, read, rendered, to_store, whole
+from tests.kit.golden import CASES, play, read, rendered, to_store, whole
 
 
 @pytest.mark.parametrize("case", CASES)
@@ -20,12 +19,6 @@ def test_the_ledger_and_the_configuration_alone_render_the_same_files(case: str)
         files = whole(case)[step]
         without_ledger = {p: text for p, text in files.items() if not p.startswith("ledger/")}
         assert rendered_files(repo.state, files) == without_ledger
-
-
-def test_after_the_last_vehicle_left_only_what_init_laid_down_is_there() -> None:
-    steps = rendered("experiment")
-    last = steps["8-vehicle03-leaves"]
-    assert {p: t for p, t in last.items() if not p.startswith(SHUTDOWNS_ROOT)} == steps[START]
 
 
 def test_between_steps_two_and_seven_only_the_fusions_inputs_change() -> None:

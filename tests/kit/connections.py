@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from copy import deepcopy
 from typing import Any
 
-import jsonschema_rs
 import yaml
-from demandops.base.settings import data_folder
 from demandops.decide.state import State
 from demandops.model.config.load import load
 
@@ -78,10 +75,3 @@ def routes(demand: Mapping[str, Any]) -> dict[str, Any]:
 
 def decided(before: State, demand: Mapping[str, Any]) -> State:
     return MemoryRepo(state=before).decide(routes(demand)).state
-
-
-def schema_faults(kind: str, configuration: object) -> list[str]:
-    """Return what the program of a client would not read, by the schema of its type."""
-    file = data_folder("templates") / "connections" / kind / "schema.json"
-    schema = jsonschema_rs.Draft7Validator(json.loads(file.read_text()))
-    return [error.message for error in schema.iter_errors(configuration)]

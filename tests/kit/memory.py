@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from datetime import datetime, timedelta, timezone
 from functools import lru_cache
 from typing import Any
 
+import jsonschema_rs
 import yaml
 from demandops.base.errors import Refused
+from demandops.base.settings import data_folder
 from demandops.decide.decision import Decision, decide, scale_down
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import Config
@@ -21,6 +24,7 @@ from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import RecentShutdowns
 from demandops.views.bookkeeping import as_data, bookkeeping
 
+from tests.kit import plain_yaml
 from tests.kit.config import configuration, skeleton, state_of
 from tests.kit.goals import Goal
 from tests.kit.plain_yaml import FAST
@@ -32,6 +36,21 @@ NOW = datetime(2026, 1, 31, 12, tzinfo=timezone.utc)
 @lru_cache(maxsize=1)
 def _unchanged() -> State:
     return state_of(load(configuration()))
+
+
+@lru_cache(maxsize=8)
+def _schema(kind: str) -> jsonschema_rs.Draft7Validator | None:
+    file = data_folder("templates") / "connections" / kind / "schema.json"
+    return jsonschema_rs.Draft7Validator(json.loads(file.read_text())) if file.is_file() else None
+
+
+def unread_fields(path: str, text: str) -> list[str]:
+    """Return what the program of a communication client would not read of its configuration."""
+    schema = _schema(path.rpartition("/")[2].partition("-")[0])
+    if schema is None or not path.startswith("clusters/"):
+        return []
+    configuration, *_ = next(yaml.load_all(text, Loader=FAST))["data"].values()
+    return [error.message for error in schema.iter_errors(plain_yaml.load(configuration))]
 
 
 class MemoryRepo:
@@ -77,6 +96,7 @@ class MemoryRepo:
     def _write(self, files: Mapping[str, str | None]) -> None:
         for path, text in files.items():
             assert self.files.get(path) != text, f"written or removed without need: {path}"
+            assert text is None or not unread_fields(path, text), path
             self.files.pop(path) if text is None else self.files.update({path: text})
 
     def scale_down(self, now: datetime) -> list[str]:

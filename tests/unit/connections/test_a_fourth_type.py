@@ -1,8 +1,8 @@
 """A fourth connection type needs one module, its templates, and an entry in the list of types.
 
-This test module is that module. Its client is a relay, which runs at the target and fetches the
-topics of all sources. Although nothing else in the program knows the type, demands for connections
-of this type are booked, planned, rendered and explained.
+This test module is that module, and ``relay/`` has the templates. Its client is a relay, which runs
+at the target and fetches the topics of all sources. Although nothing else in the program knows the
+type, demands for connections of this type are booked, planned, rendered and explained.
 """
 
 from __future__ import annotations
@@ -35,39 +35,7 @@ from tests.kit.connections import ROS_IMAGE, demand, routes, state
 from tests.kit.goals import connection, goal
 from tests.kit.memory import MemoryRepo
 
-TEMPLATE = """\
-apiVersion: v1
-kind: ConfigMap
-metadata:
-  name: {{ client.name }}
-  namespace: {{ client.domain.namespace }}
-data:
-  relay.yaml: |
-{{ configuration | literal(4) }}
----
-apiVersion: apps/v1
-kind: Deployment
-metadata:
-  name: {{ client.name }}
-  namespace: {{ client.domain.namespace }}
-spec:
-  replicas: 1
-  selector:
-    matchLabels:
-      app.kubernetes.io/instance: {{ client.name }}
-  template:
-    metadata:
-      labels:
-        app.kubernetes.io/instance: {{ client.name }}
-      annotations:
-        demandops/config-checksum: {{ checksum }}
-    spec:
-{% include 'connections/placement.yaml.j2' %}
-      containers:
-        - name: relay
-          image: {{ image }}
-{% include 'connections/security.yaml.j2' %}
-"""
+RELAY_TEMPLATES = Path(__file__).parent / "relay"
 
 
 class RelayType(ConnectionType):
@@ -126,9 +94,7 @@ RELAY = RelayType()
 @pytest.fixture(autouse=True)
 def a_fourth_type(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(settings.data_folder("templates"), tmp_path / "templates")
-    folder = tmp_path / "templates" / "connections" / "relay"
-    folder.mkdir()
-    folder.joinpath("client.yaml.j2").write_text(TEMPLATE)
+    shutil.copytree(RELAY_TEMPLATES, tmp_path / "templates" / "connections" / "relay")
     for name in ("appdefs", "state-repo-skeleton"):
         (tmp_path / name).symlink_to(settings.data_folder(name))
     monkeypatch.setattr(settings, "_CHECKOUT", tmp_path)
@@ -147,17 +113,15 @@ def booked(kind: str = "relay") -> tuple[MemoryRepo, Decision]:
     return world, world.send(routes(demand(kind, {"/a": {"target": "/b", "queue": 3}})))
 
 
-def test_a_demand_for_it_becomes_a_claim_that_its_file_keeps() -> None:
-    world, _ = booked()
+@pytest.mark.parametrize("kind", ["relay", "auto"])
+def test_a_demand_for_it_becomes_a_claim_and_a_client(kind: str) -> None:
+    """Without a type, it is chosen because no other can carry the topic."""
+    world, decision = booked(kind)
     (claim,) = world.state.ledger.connection_claims("c")
     assert claim.connection.type is RELAY
     path = claim_file.path_of(claim.key)
     assert yaml.safe_load(world.files[path])["type"] == "relay"
     assert claim_file.read(world.files[path], path) == claim
-
-
-def test_its_client_is_rendered_and_described_for_the_commit() -> None:
-    world, decision = booked()
     assert world.objects("Deployment").keys() == {"relay-edge"}
     (config,) = world.objects("ConfigMap").values()
     assert yaml.safe_load(config["data"]["relay.yaml"]) == {"fetch": {"/a": "/b"}}
@@ -187,12 +151,6 @@ def test_people_are_told_what_it_is_for_and_what_shapes_it() -> None:
     assert ("registry/images.yaml", "images.relay") in files
 
 
-def test_it_is_chosen_if_no_other_can_carry_the_topic() -> None:
-    world, _ = booked("auto")
-    found = world.state.ledger.connection("c")
-    assert found and found.type is RELAY
-
-
 def test_its_number_is_known_on_the_wire() -> None:
     world = repo()
     assert world.send(goal([], [connection("c", topics=["/a"], broker="", type=7)])).releases
@@ -201,10 +159,8 @@ def test_its_number_is_known_on_the_wire() -> None:
 
 
 def test_what_it_cannot_do_is_refused_and_others_name_it() -> None:
-    assert repo().faults(routes(demand("relay", {"/a": {"qos": 1}}, target="cloud"))) == [
-        "connections[0].target: 'cloud' has no wan; add it in inventory/nodes.yaml",
-        "connections[0].topics[0].qos: qos of '/a' is not supported by RELAY; leave it out, or use "
-        "type MQTT",
-    ]
+    link, option = repo().faults(routes(demand("relay", {"/a": {"qos": 1}}, target="cloud")))
+    assert link.startswith("connections[0].target: 'cloud' has no wan")
+    assert option.startswith("connections[0].topics[0].qos: qos of '/a' is not supported by RELAY")
     found = repo().faults(routes(demand("ros", {"/a": {"target": "/b"}})))
     assert any(one.endswith("or use type MQTT or RELAY") for one in found)

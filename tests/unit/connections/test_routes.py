@@ -1,15 +1,14 @@
-"""Which routes are valid, whatever connection type carries them."""
+"""Options of routes; ``tests/scenarios`` has what routes of a connection must agree on."""
 
 from __future__ import annotations
 
 from dataclasses import fields
-from typing import Any
 
+import pytest
 from demandops.connections.connection import (
     Route,
     RouteOptions,
     contradictions,
-    faults,
     merged_routes,
 )
 from demandops.connections.connection_types import CONNECTION_TYPES
@@ -26,10 +25,6 @@ OPTIONS: dict[str, object] = {
     "queue": 7,
     "rate": 0.5,
 }
-
-
-def told(found: Any) -> list[str]:
-    return [f"{one.field}: {one.message}" for one in found]
 
 
 def test_a_route_carries_exactly_the_options_that_are_given() -> None:
@@ -51,26 +46,6 @@ def test_every_option_does_something_in_some_client() -> None:
     assert honoured == RouteOptions.model_fields.keys() - {"type", "reverse"}
 
 
-def test_a_topic_listed_with_two_ways_to_carry_it_is_told() -> None:
-    routes = [Route("/a", "/b"), Route("/a", "/b", qos=1, reverse=True)]
-    assert told(faults("topics", routes)) == [
-        "topics[1].reverse: '/a' is listed with reverse false and true; list it once",
-        "topics[1].qos: '/a' is listed with qos 0 and 1; list it once",
-    ]
-
-
-def test_a_topic_that_is_carried_back_goes_to_one_place() -> None:
-    routes = [Route("/a", "/x", reverse=True), Route("/b", "/x", reverse=True)]
-    assert told(faults("topics", routes)) == [
-        "topics[1].target: '/x' is carried back to '/a' and to '/b'; a connection carries a target "
-        "topic back to only one source topic, so use a second connection"
-    ]
-
-
-def test_two_topics_may_arrive_as_one() -> None:
-    assert not list(faults("topics", [Route("/a", "/x"), Route("/b", "/x")]))
-
-
 def test_a_type_that_is_not_said_contradicts_none_and_is_filled_in() -> None:
     plain, typed = Route("/a", "/a"), Route("/a", "/a", type="std_msgs/msg/String")
     assert not list(contradictions(plain, typed))
@@ -81,15 +56,13 @@ def test_a_type_that_is_not_said_contradicts_none_and_is_filled_in() -> None:
     ]
 
 
-def test_where_messages_come_from_and_arrive() -> None:
-    there, back = Route("/a", "/b"), Route("/a", "/b", reverse=True)
-    assert (there.read_topic, there.written_topic, there.sender_and_receiver("s", "t")) == (
-        "/a",
-        "/b",
-        ("s", "t"),
-    )
-    assert (back.read_topic, back.written_topic, back.sender_and_receiver("s", "t")) == (
-        "/b",
-        "/a",
-        ("t", "s"),
-    )
+@pytest.mark.parametrize(
+    ("reverse", "topics", "nodes"),
+    [(False, ("/a", "/b"), ("s", "t")), (True, ("/b", "/a"), ("t", "s"))],
+)
+def test_where_messages_come_from_and_arrive(
+    reverse: bool, topics: tuple[str, str], nodes: tuple[str, str]
+) -> None:
+    route = Route("/a", "/b", reverse=reverse)
+    assert (route.read_topic, route.written_topic) == topics
+    assert route.sender_and_receiver("s", "t") == nodes

@@ -1,46 +1,73 @@
-"""What a change of a claim says about itself, and which demands a refusal names."""
+"""What a change of claims says about itself, and which connections the ledger knows at a node.
+
+``tests/scenarios/a-connection-carries-a-topic-in-one-way.yaml`` has the contradictions.
+"""
 
 from __future__ import annotations
 
-from datetime import datetime, timedelta, timezone
+from dataclasses import replace
+from datetime import timedelta
+from typing import Any
 
 import pytest
 from demandops.base.errors import Refused
-from demandops.connections.connection import Connection, Route
+from demandops.connections.connection import Connection, ConnectionType, Route
 from demandops.connections.mqtt import MQTT
+from demandops.connections.ros import ROS
+from demandops.connections.zenoh import ZENOH
 from demandops.decide.booking import apply
-from demandops.model.demand.claim import OVERRIDE_PREFIX, Claim, ClaimKey, Term
+from demandops.model.demand.claim import OVERRIDE_PREFIX, Claim, Term
 from demandops.model.demand.demand_request import Demanded, DemandRequest, Join, Release, Shutdown
 from demandops.model.ledger.ledger import Changes, Ledger
 
-NOW = datetime(2026, 1, 31, 12, 0, tzinfo=timezone.utc)
+from tests.kit.memory import NOW, rebuilt
+
 HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
 
 
-def item(*requesters: str) -> tuple[Demanded, ...]:
-    return (Demanded(HELD, requesters, "connections[0].{}".format, Term(60)),)
+def item(*requesters: str, held: Connection = HELD) -> tuple[Demanded, ...]:
+    return (Demanded(held, requesters, "connections[0].{}".format, Term(60)),)
 
 
-def applied(ledger: Ledger, request: DemandRequest, minutes: int) -> tuple[Ledger, Changes]:
+def applied(ledger: Ledger, request: DemandRequest, minutes: int = 0) -> tuple[Ledger, Changes]:
     return apply(ledger, request, NOW + timedelta(minutes=minutes))
+
+
+def joined(ledger: Ledger, who: str = "v", **changed: Any) -> Ledger:
+    return applied(ledger, Join("r", item(who, held=replace(HELD, **changed))))[0]
 
 
 def test_a_renewed_lease_only_renews_and_a_shutdown_does_not() -> None:
     ledger, new = applied(Ledger(), Join("r", item("v", "w")), 0)
     ledger, again = applied(ledger, Join("r", item("v", "w")), 1)
     _, less = applied(ledger, Shutdown("r", item("v")), 2)
-    assert [change.only_renews for change in new.claims] == [False]
-    assert [change.only_renews for change in again.claims] == [True]
-    assert [change.only_renews for change in less.claims] == [False]
+    renews = [change.only_renews for changes in (new, again, less) for change in changes.claims]
+    assert renews == [False, True, False]
 
 
 def test_a_refusal_suggests_no_claims_of_overrides() -> None:
-    ledger = Ledger()
-    for demand in (f"{OVERRIDE_PREFIX}keep", "mine"):
-        claim = Claim(HELD, demand, "r", ("v",), NOW)
-        ledger = ledger.replace(ClaimKey(HELD.subject, demand), claim)
-    with pytest.raises(Refused) as refused:
-        applied(ledger, Release("r", (), "mien", ("v",)), 0)
-    assert refused.value.faults[0].message == (
-        "'mien' holds nothing; the requesters of this request hold, for example, mine"
-    )
+    demands = (f"{OVERRIDE_PREFIX}keep", "mine")
+    ledger = rebuilt(Claim(HELD, demand, "r", ("v",), NOW) for demand in demands)
+    with pytest.raises(Refused, match=r"hold, for example, mine$"):
+        applied(ledger, Release("r", (), "mien", ("v",)))
+
+
+def test_a_reverse_route_delivers_to_the_source() -> None:
+    ledger = joined(Ledger(), topics=(Route("/a", "/b"), Route("/c", "/d", reverse=True)))
+    assert ledger.is_carried_to("t", "/b")
+    assert ledger.is_carried_to("s", "/c")
+    assert not ledger.is_carried_to("t", "/d")
+
+
+@pytest.mark.parametrize("kind", [ZENOH, ROS])
+def test_links_are_known_at_both_nodes_as_long_as_somebody_holds_them(kind: ConnectionType) -> None:
+    ledger = joined(joined(Ledger(), type=kind), "w", type=kind)
+    ledger = joined(ledger, type=kind, id="d", target="u")
+
+    def known(ledger: Ledger) -> list[tuple[str, ...]]:
+        return [ledger.connections_at(kind, node) for node in "stu"]
+
+    assert known(ledger) == [("c", "d"), ("c",), ("d",)]
+    for claim, at_target in zip(ledger.connection_claims("c"), [("c",), ()], strict=True):
+        ledger = ledger.replace(claim.key, None)
+        assert known(ledger) == [(*at_target, "d"), at_target, ("d",)]

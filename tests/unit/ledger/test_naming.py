@@ -59,37 +59,32 @@ subjects: st.SearchStrategy[Subject] = st.one_of(
 
 def rivals(subject: Subject, name: str) -> Iterator[Subject]:
     """Yield other subjects that would also get ``name`` if names were made in a simpler way."""
-    prefix, rest = subject[0], name.removeprefix(f"{subject[0]}-")
-    yield ("of", rest)
-    yield ("mqtt", rest.removesuffix("-source").removesuffix("-target") or "x", "source")
+    prefix, *ids_ = subject
+    rest = name.removeprefix(f"{prefix}-")
     pieces = rest.split("-")
+    yield ("of", rest)
     for cut in range(1, len(pieces)):
-        first, second = "-".join(pieces[:cut]), "-".join(pieces[cut:])
-        if prefix == "od":
-            yield ("od", first, second)
-        elif second in ("source", "target"):
-            yield ("mqtt", first, second)
-    for ids_ in (subject[1:], tuple(rest.split("-"))):
-        for old, new in (("_", "-"), ("/", "-"), ("-", "_"), ("/", "_")):
-            other = tuple(part.replace(old, new) for part in ids_)
-            if prefix == "od" and len(other) in (2, 3):
-                yield (prefix, *other)
-    yield (prefix, subject[1].lower(), *subject[2:])
-    yield (prefix, subject[1].upper(), *subject[2:])
-    yield (prefix, subject[1][:-1] or "x", *subject[2:])
+        yield (prefix, "-".join(pieces[:cut]), "-".join(pieces[cut:]))
+    for old, new in (("_", "-"), ("/", "-"), ("-", "_"), ("/", "_")):
+        yield (prefix, *(part.replace(old, new) for part in ids_))
+        yield (prefix, *(part.replace(old, new) for part in pieces))
+    for first in (ids_[0].lower(), ids_[0].upper(), ids_[0][:-1] or "x"):
+        yield (prefix, first, *ids_[1:])
 
 
-def named_apart(found: set[Subject], name_of: Callable[[Subject], str]) -> dict[str, Subject]:
+def is_named(prefix: str, *ids: str) -> bool:
+    """Return whether the program makes a name from this."""
+    counts = {"od": (2, 3), "of": (1,), "mqtt": (2,)}
+    return len(ids) in counts[prefix] and (prefix != "mqtt" or ids[1] in ("source", "target"))
+
+
+def named_apart(found: set[Subject], name_of: Callable[..., str]) -> dict[str, Subject]:
     """Check that all subjects have different names; return the subjects by name."""
     names: dict[str, Subject] = {}
     for subject in sorted(found):
-        other = names.setdefault(name_of(subject), subject)
-        assert other == subject, f"{other} and {subject} are both {name_of(subject)}"
+        other = names.setdefault(name_of(*subject), subject)
+        assert other == subject, f"{other} and {subject} have one name"
     return names
-
-
-def kubernetes_name(subject: Subject) -> str:
-    return naming.object_name(*subject)
 
 
 @examples(40)
@@ -99,22 +94,17 @@ def test_different_subjects_have_different_names_that_kubernetes_takes(
 ) -> None:
     found = set(drawn)
     for _ in range(2):  # the second round adds the rivals of rivals
-        found |= {
-            rival for subject in list(found) for rival in rivals(subject, kubernetes_name(subject))
-        }
+        every = [one for each in found for one in rivals(each, naming.object_name(*each))]
+        found |= {one for one in every if is_named(*one)}
         if len(found) > 150:
             break
-    names = named_apart(found, kubernetes_name)
+    names = named_apart(found, naming.object_name)
     for name, subject in names.items():
         assert DNS_1123.fullmatch(name), subject
         assert len(name) <= LONGEST_NAME, subject
     ros_names = {naming.ros_name(name) for name in names}
     assert len(ros_names) == len(names)
     assert all(ROS_NODE.fullmatch(name) for name in ros_names)
-
-
-def topic_instance(subject: Subject) -> str:
-    return naming.topic_part(*subject)
 
 
 def as_the_reference(id: str) -> str:
@@ -127,16 +117,15 @@ def as_the_reference(id: str) -> str:
 def test_derived_topics_are_the_references_or_differ_and_ros_takes_them(
     drawn: list[Subject],
 ) -> None:
-    found = {*drawn, *((topic_instance(subject),) for subject in drawn)}
+    found = {*drawn, *((naming.topic_part(*subject),) for subject in drawn)}
     taken = {s for s in found if len(s) == 1 and ROS_NODE.fullmatch(as_the_reference(s[0]))}
     taken = {(id,) for (id,) in taken if len(id) <= 120 and re.search("[^-/_]", id)}
-    assert all(topic_instance(subject) == as_the_reference(subject[0]) for subject in taken)
-    named_apart(found - taken, topic_instance)
-    for instance in map(topic_instance, found):
-        for suffix in ("_local_objectlist", "_global_trajectories"):
-            topic = f"/{instance}{suffix}"
-            assert ROS_TOPIC.fullmatch(topic), topic
-            assert len(topic) <= LONGEST_TOPIC
+    assert all(naming.topic_part(id) == as_the_reference(id) for (id,) in taken)
+    named_apart(found - taken, naming.topic_part)
+    for subject in found:
+        topic = f"/{naming.topic_part(*subject)}_global_trajectories"
+        assert ROS_TOPIC.fullmatch(topic), topic
+        assert len(topic) <= LONGEST_TOPIC
 
 
 @examples(30)
@@ -151,38 +140,30 @@ def test_whatever_the_ids_each_release_has_a_name_a_file_and_topics_of_its_own(
 ) -> None:
     repo = with_nodes(nodes)
     asked = [(cloud, node) for node in nodes for cloud in [usual_cloud(nodes, node), *clouds]]
-    places = [nodes[place % len(nodes)] for place in range(len(applications))]
-    apps = [
-        application(id_, node=node, clouds=asked)
-        for id_, node in zip(applications, places, strict=True)
-    ]
+    placed = {id_: nodes[place % len(nodes)] for place, id_ in enumerate(applications)}
+    apps = [application(id_, node=node, clouds=asked) for id_, node in placed.items()]
     ends = nodes[0], nodes[1]
     links = [connection(id_, ends=ends, topics=["/a"], targets=["/b"]) for id_ in connections]
     (request,) = told([goal(apps, links)])
-    ids_of_topics = {*nodes, *applications}
 
     taken = repo.take(request)
 
     if isinstance(taken, Refused):
+        ids_of_topics = {*nodes, *applications}
         assert {fault.code for fault in taken.faults} == {"conflict"}
         assert len({*map(as_the_reference, ids_of_topics)}) < len(ids_of_topics), taken
         return
-    releases = len(set(places)) * len(asked) + len(applications) + 2 * len(connections)
+    places = {*placed.values()}
+    releases = len(places) * len(asked) + len(applications) + 2 * len(connections)
     assert len(taken.releases) == len({release.name for release in taken.releases}) == releases
-    manifests = [
-        text for path, text in taken.files.items() if text and path.startswith("clusters/")
-    ]
+    manifests = [*repo.rendered().values()]
     assert len(manifests) == releases
     lowered = [path.lower() for path in taken.files]
     assert len(set(lowered)) == len(lowered), "a file system that ignores case would confuse them"
     assert all(len(part) <= 100 for path in taken.files for part in path.split("/"))
-    for node in set(places):
-        produced = [
-            topic
-            for text in manifests
-            if f"demandops/node: {quoted(node)}" in text
-            for topic in re.findall(r"(?:objectList|fusedObjectLists)Topic: (\S+)", text)
-        ]
+    for node in map(quoted, places):
+        texts = [text for text in manifests if f"demandops/node: {node}" in text]
+        produced = re.findall(r"(?:objectList|fusedObjectLists)Topic: (\S+)", "".join(texts))
         assert len(set(produced)) == len(produced)
         assert all(ROS_TOPIC.fullmatch(topic) for topic in produced)
     shutdown = repo.take({**request, "shutdown": True})

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
-from datetime import datetime, timedelta
+from datetime import timedelta
 from random import Random
-from typing import Any
 
 import pytest
-from demandops.base.errors import Refused
+from demandops.base.errors import Fault, Refused
 from demandops.decide.decision import Decision, decide
 from demandops.decide.restoration import Restoration
 from demandops.decide.state import State
-from demandops.model.config.config import Config
 from demandops.model.demand.claim import Claim, Lease
 from demandops.model.ledger.ledger import Ledger
 
@@ -21,17 +19,7 @@ from tests.kit.memory import NOW, MemoryRepo
 from tests.model.goals import Maker
 
 LATER = NOW + timedelta(hours=3)
-
-
-def back_to(claims: Iterable[Claim], *, drop_newer: bool = False) -> Restoration:
-    return Restoration(
-        id="",
-        to="0" * 40,
-        claims=tuple(claims),
-        drop_newer=drop_newer,
-        reason="r",
-        by="A person",
-    )
+LEASE = Lease(600, 30, NOW + timedelta(minutes=10))
 
 
 def filled(seed: int) -> MemoryRepo:
@@ -42,12 +30,24 @@ def filled(seed: int) -> MemoryRepo:
     return repo
 
 
-def claims(ledger: Ledger) -> dict[Any, Claim]:
-    return {claim.key: claim for claim in ledger}
+def with_ledger(repo: MemoryRepo, ledger: Ledger) -> State:
+    return replace(repo.state, ledger=ledger)
 
 
-def rolled_back(repo: MemoryRepo, request: Restoration, now: datetime = LATER) -> Decision:
-    return decide(repo.state, request, now, repo.files.get)
+def back_to(claims: Iterable[Claim], *, drop_newer: bool = False) -> Restoration:
+    return Restoration(
+        "", to="0" * 40, claims=tuple(claims), drop_newer=drop_newer, reason="r", by="A person"
+    )
+
+
+def rolled_back(repo: MemoryRepo, request: Restoration, state: State | None = None) -> Decision:
+    return decide(state or repo.state, request, LATER, repo.files.get)
+
+
+def refusal(repo: MemoryRepo, request: Restoration, state: State | None = None) -> list[Fault]:
+    with pytest.raises(Refused) as refused:
+        rolled_back(repo, request, state)
+    return [*refused.value.faults]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -59,7 +59,7 @@ def test_books_and_files_are_what_they_were(seed: int) -> None:
         repo.take(request)
     repo.forget_shutdowns()
     decision = rolled_back(repo, back_to(then, drop_newer=True))
-    assert claims(decision.state.ledger) == claims(then)
+    assert dict(decision.state.ledger.claims) == dict(then.claims)
     after = repo.files | decision.files
     assert {path: text for path, text in after.items() if text is not None} == files
     assert decision.outcome == ("restored" if decision.files else "unchanged")
@@ -67,64 +67,54 @@ def test_books_and_files_are_what_they_were(seed: int) -> None:
 
 def test_a_rollback_past_newer_claims_is_refused_and_lists_them() -> None:
     repo = filled(0)
-    kept = list(repo.state.ledger)
-    newer = kept.pop()
-    with pytest.raises(Refused) as told:
-        rolled_back(repo, back_to(kept))
-    assert [(one.code, one.field) for one in told.value.faults] == [("newer", ""), ("newer", "")]
+    *kept, newer = repo.state.ledger
+    found = refusal(repo, back_to(kept))
+    assert [(one.code, one.field) for one in found] == [("newer", ""), ("newer", "")]
     who = ", ".join(newer.requesters)
-    assert told.value.faults[0].message == (
+    assert found[0].message == (
         f"would drop the claim of {who} on {newer.subject}, booked "
         f"{newer.booked:%Y-%m-%d %H:%M:%S} UTC (request '{newer.request}')"
     )
-    assert told.value.faults[1].message == (
-        "claims that were booked or changed since are undone only with --drop-newer"
-    )
+    assert "--drop-newer" in found[1].message
 
 
 def test_a_claim_changed_since_counts_as_newer() -> None:
     repo = filled(0)
     first, *others = repo.state.ledger
-    with pytest.raises(Refused) as told:
-        rolled_back(repo, back_to([replace(first, request="another"), *others]))
-    assert "would undo a change of the claim of" in told.value.faults[0].message
+    found = refusal(repo, back_to([replace(first, request="another"), *others]))
+    assert "would undo a change of the claim of" in found[0].message
 
 
 def test_a_claim_that_comes_back_has_its_lease_from_now_on() -> None:
     repo = filled(0)
     first, *others = repo.state.ledger
-    leased = replace(first, lease=Lease(600, 30, NOW + timedelta(minutes=10)))
-    repo.state = replace(repo.state, ledger=repo.state.ledger.replace(first.key, None))
-    decision = rolled_back(repo, back_to([leased, *others]))
-    back = decision.state.ledger.get(first.key)
-    assert back == replace(leased, lease=Lease(600, 30, LATER + timedelta(minutes=10)))
+    leased = replace(first, lease=LEASE)
+    without = with_ledger(repo, repo.state.ledger.replace(first.key, None))
+    decision = rolled_back(repo, back_to([leased, *others]), without)
+    until = LATER + timedelta(minutes=10)
+    assert decision.state.ledger.get(first.key) == replace(
+        leased, lease=replace(LEASE, until=until)
+    )
 
 
 def test_a_lease_renewed_since_stays_as_it_is() -> None:
     repo = filled(0)
     first, *others = repo.state.ledger
-    leased = replace(first, lease=Lease(600, 30, NOW + timedelta(minutes=10)))
-    renewed = replace(first, lease=Lease(600, 30, NOW + timedelta(minutes=50)))
-    repo.state = replace(repo.state, ledger=repo.state.ledger.replace(first.key, renewed))
-    decision = rolled_back(repo, back_to([leased, *others]))
+    until = NOW + timedelta(minutes=50)
+    renewed = replace(first, lease=replace(LEASE, until=until))
+    state = with_ledger(repo, repo.state.ledger.replace(first.key, renewed))
+    decision = rolled_back(repo, back_to([replace(first, lease=LEASE), *others]), state)
     assert (decision.outcome, dict(decision.files)) == ("unchanged", {})
 
 
 def test_what_the_configuration_no_longer_has_is_refused() -> None:
     repo = filled(0)
     then = repo.state.ledger
-    application = next(c for c in then if c.subject.kind.value == "applications")
-    ledger = then.replace(application.key, None)
-    config = _without_node(repo.state.config, application.application.node)
-    state = State(config, ledger, repo.state.evaluate)
-    with pytest.raises(Refused) as told:
-        decide(state, back_to(then), LATER, repo.files.get)
-    found = [one for one in told.value.faults if one.field == "node"]
+    gone = next(claim for claim in then if claim.is_on_application)
+    nodes = {id: node for id, node in repo.config.nodes.items() if id != gone.application.node}
+    config = replace(repo.config, nodes=nodes)
+    state = State(config, then.replace(gone.key, None), repo.state.evaluate)
+    found = [one for one in refusal(repo, back_to(then), state) if one.field == "node"]
     assert found
     assert found[0].code == "unknown-node"
     assert found[0].file.startswith("ledger/applications/")
-
-
-def _without_node(config: Config, node: str) -> Config:
-    nodes = {name: known for name, known in config.nodes.items() if name != node}
-    return replace(config, nodes=nodes)

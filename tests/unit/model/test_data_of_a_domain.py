@@ -1,4 +1,4 @@
-"""ROS domains and the credentials of brokers keep the data of access domains apart."""
+"""The credentials of brokers keep the data of access domains apart."""
 
 from __future__ import annotations
 
@@ -6,145 +6,41 @@ import re
 from pathlib import Path
 from typing import Any
 
-import pytest
 import yaml
-from demandops.base.errors import InvalidInput
-from demandops.decide import warnings
 from demandops.model.config.load import load
 
-from tests.kit.config import configuration, skeleton, state_of
+from tests.kit.config import configuration, skeleton
 from tests.kit.memory import MemoryRepo
+from tests.unit.model.test_config_mistakes import changed
 
-DOMAINS, NODES, BROKERS = (
-    *("policy/access-domains.yaml", "inventory/nodes.yaml", "inventory/brokers.yaml"),
-)
+DOMAINS, BROKERS = "policy/access-domains.yaml", "inventory/brokers.yaml"
 PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
-BOTH = 'rules: [{name: all, peers: ["*"]}]'
-CONNECTION = {
-    "kind": "Demand",
-    "demand": "d",
-    "requesters": ["vehicle00"],
-    "connections": [
-        {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
-    ],
-}
 
 
-def domains(fleet: str = "", city: str = "") -> dict[str, str]:
-    """Return a policy with the access domains `fleet` and `city`.
-
-    Each argument has further YAML fields of the domain of that name, by default a rule that permits
-    everything.
-    """
-    return {
-        DOMAINS: f"""
-apiVersion: demandops/v1
-kind: AccessDomains
-domains:
-  - {{name: fleet, namespace: fleet, nodes: ["vehicle*"], {fleet or BOTH}}}
-  - {{name: city, namespace: city, nodes: [station00, edge, cloud], {city or BOTH}}}
-"""
-    }
-
-
-def clients(files: dict[str, str]) -> dict[str, Any]:
-    """Send a demand for a connection between both domains. Return each end's pod spec, by node."""
-    books = MemoryRepo(files)
-    books.send(CONNECTION)
+def secrets(files: dict[str, Any]) -> dict[str, list[tuple[str, list[str]]]]:
+    """Return the secrets and keys that the clients of a connection between two domains get."""
+    books = MemoryRepo(changed({"base": "two domains"} | files))
+    link = {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
+    books.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "connections": [link]})
     pods = [item["spec"]["template"]["spec"] for item in books.objects("Deployment").values()]
-    return {pod["nodeSelector"]["node_id"]: pod for pod in pods}
-
-
-def test_each_end_of_a_connection_is_in_the_ros_domain_of_its_access_domain() -> None:
-    own = skeleton()[NODES].replace("ros: {rmw: image}", "ros: {rmw: image, domainId: 3}", 1)
-    found = {
-        node: {one["name"]: one["value"] for one in pod["containers"][0]["env"]}["ROS_DOMAIN_ID"]
-        for node, pod in clients(domains(f"{BOTH}, ros: {{domainId: 41}}") | {NODES: own}).items()
-    }
-    assert found == {"vehicle00": "41", "edge": "0"}
-    config = load(configuration(domains(city="ros: {domainId: 42}") | {NODES: own}))
-    assert {node.id: node.ros.domain_id for node in config.nodes.values()} == {
-        **dict.fromkeys(("vehicle01", "vehicle02", "vehicle03"), 0),
-        **dict.fromkeys(("station00", "edge", "cloud"), 42),
-        "vehicle00": 3,
-    }
-
-
-def secrets(files: dict[str, str]) -> dict[str, list[tuple[str, list[str]]]]:
     return {
-        node: [
+        pod["nodeSelector"]["node_id"]: [
             (one["secret"]["secretName"], [item["key"] for item in one["secret"]["items"]])
             for one in pod["volumes"]
             if "secret" in one
         ]
-        for node, pod in clients(files).items()
+        for pod in pods
     }
 
 
 def test_each_end_of_a_connection_has_the_credentials_of_its_access_domain() -> None:
-    own = f"{BOTH}, brokerCredentials: {{edge: {{secret: of-fleet, passwordKey: pw}}}}"
-    assert secrets(domains(own)) == {"vehicle00": [("of-fleet", ["username", "pw"])], "edge": []}
-    shared = skeleton()[BROKERS].replace("port: 1993", "port: 1993\n    credentials: {secret: all}")
-    assert secrets(domains(own) | {BROKERS: shared}) == {
-        "vehicle00": [("of-fleet", ["username", "pw"])],
-        "edge": [("all", ["username", "password"])],
-    }
-
-
-def test_credentials_name_a_broker() -> None:
-    with pytest.raises(InvalidInput) as invalid:
-        load(configuration(domains("brokerCredentials: {egde: {secret: s}}")))
-    assert str(invalid.value) == (
-        f"{DOMAINS}: domains[0].brokerCredentials.egde: 'egde' is not in brokers.yaml; did you "
-        "mean 'edge'?"
-    )
-
-
-def warned(files: dict[str, str]) -> list[str]:
-    return [str(found) for found in warnings.policy_warnings(MemoryRepo(files).state)]
-
-
-SHARED = (
-    f"{DOMAINS}: access domains 'city' and 'fleet' share ROS domain 0 on the network of the hosts "
-    "of cluster 'c-its', so each may read and write the topics of the others; give each access "
-    "domain its own ros.domainId"
-)
-CLOSED = (
-    f"{DOMAINS}: 'network: namespace' of access domain 'fleet' has no effect on nodes whose "
-    "pods use the host's network: 'vehicle00', 'vehicle01', 'vehicle02' and 1 more; set "
-    "hostNetwork: false for these nodes, or separate their network yourself"
-)
-
-
-def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
-    books = MemoryRepo(domains("ros: {domainId: 1}, " + BOTH))
-    books.send(CONNECTION)
-    assert list(warnings.policy_warnings(books.state)) == []
-    config = load(configuration(domains("ros: {domainId: 1}")))
-    told = warnings.policy_warnings(state_of(config, books.state.ledger))
-    assert list(map(str, told)) == [
-        f"{DOMAINS}: no rule of access domain 'fleet' has 'city' among its 'peers', so nobody "
-        "can demand a connection between the two domains; claims on such connections stay in "
-        "effect: 1"
-    ]
-
-
-def test_what_the_hosts_network_leaves_open_is_told() -> None:
-    assert warned(domains()) == [SHARED]
-    assert warned(domains("ros: {domainId: 1}", "ros: {domainId: 2}")) == []
-    assert warned(domains("network: namespace, ros: {domainId: 1}")) == [CLOSED]
-
-
-def test_without_it_nothing_is_open() -> None:
-    text = skeleton()[NODES].replace("    type:", "    hostNetwork: false\n    type:")
-    assert warned(domains("network: namespace") | {NODES: text}) == []
-
-
-def test_clusters_have_networks_of_their_own() -> None:
-    clusters = skeleton()["inventory/clusters.yaml"] + "  - name: fleet\n"
-    nodes = re.sub(r"(?<=type: vehicle\n    cluster: )c-its", "fleet", skeleton()[NODES])
-    files = domains() | {NODES: nodes, "inventory/clusters.yaml": clusters}
-    assert warned(files) == []
+    credentials = "{edge: {secret: of-fleet, passwordKey: pw}}"
+    own = {DOMAINS: {"namespace: fleet": f"…, brokerCredentials: {credentials}"}}
+    of_fleet = ("of-fleet", ["username", "pw"])
+    assert secrets(own) == {"vehicle00": [of_fleet], "edge": []}
+    shared = {BROKERS: {"port: 1993": "…\n    credentials: {secret: all}"}}
+    of_all = ("all", ["username", "password"])
+    assert secrets(own | shared) == {"vehicle00": [of_fleet], "edge": [of_all]}
 
 
 def test_the_example_of_the_documentation() -> None:
@@ -153,6 +49,5 @@ def test_the_example_of_the_documentation() -> None:
     given = yaml.safe_load(example)
     assert {node.ros.domain_id for node in config.nodes.values()} == {given["ros"]["domainId"]}
     found = config.domains["perception"].broker_credentials
-    assert {node: {"secret": one.secret} for node, one in found.items()} == given[
-        "brokerCredentials"
-    ]
+    secrets = {node: {"secret": one.secret} for node, one in found.items()}
+    assert secrets == given["brokerCredentials"]

@@ -35,46 +35,43 @@ def form_of(file: str) -> Form:
     return FORMS["overrides/values.yaml" if file.startswith("overrides/") else file]
 
 
-class Loader:
-    """Loads a configuration with one file given as parsed data. Parses other files only once."""
+@pytest.fixture
+def parsed(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Parse each text only once; return what is known of texts, to which a test may add."""
+    known: dict[str, Any] = {}
+    parse = strict_yaml.load
 
-    def __init__(self, files: dict[str, str], monkeypatch: pytest.MonkeyPatch) -> None:
-        self._files = files
-        self._parsed: dict[str, Any] = {}
-        self._parse = strict_yaml.load
-        monkeypatch.setattr(strict_yaml, "load", self._load)
+    def load_once(text: str, file: str = "") -> Any:
+        if text not in known:
+            known[text] = parse(text, file)
+        return known[text]
 
-    def _load(self, text: str, file: str = "") -> Any:
-        if text not in self._parsed:
-            self._parsed[text] = self._parse(text, file)
-        return self._parsed[text]
+    monkeypatch.setattr(strict_yaml, "load", load_once)
+    return known
 
-    def document(self, file: str) -> Any:
-        return self._load(self._files[file])
 
-    def faults(self, file: str, document: Any) -> list[Fault]:
-        self._parsed["mutated"] = document
-        try:
-            load(self._files | {file: "mutated"})
-        except InvalidInput as invalid:
-            return list(invalid.faults)
-        return []
+def faults(files: dict[str, str]) -> list[Fault]:
+    try:
+        load(files)
+    except InvalidInput as invalid:
+        return list(invalid.faults)
+    return []
 
 
 @pytest.mark.parametrize(("files", "file"), DOCUMENTS)
 def test_a_mistake_anywhere_is_a_fault_at_its_place(
-    files: Callable[[], dict[str, str]], file: str, monkeypatch: pytest.MonkeyPatch
+    files: Callable[[], dict[str, str]], file: str, parsed: dict[str, Any]
 ) -> None:
-    loader = Loader(files(), monkeypatch)
-    document = loader.document(file)
-    assert loader.faults(file, document) == []
+    whole, form = files(), form_of(file)
+    assert faults(whole) == []
     problems = []
-    for mutation in mutations.mutations(document, form_of(file).limits()):
-        found = loader.faults(file, mutation.document)
+    for mutation in mutations.mutations(parsed[whole[file]], form.limits()):
+        parsed["mutated"] = mutation.document
+        found = faults(whole | {file: "mutated"})
         if file == DOMAINS:  # an invalid domain has no nodes, so overrides have faults too
             found = [one for one in found if one.file == file or "access domain" not in one.message]
         free = FREE_PLACES if file != "registry/charts.yaml" else ()
-        problems.append(mutations.problem(mutation, found, form_of(file), free=free, file=file))
+        problems.append(mutations.problem(mutation, found, form, free=free, file=file))
     assert list(filter(None, problems)) == []
 
 

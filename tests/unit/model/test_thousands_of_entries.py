@@ -5,10 +5,12 @@ Work is counted in calls of functions, so the tests need no clock.
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,6 +23,7 @@ from demandops.model.config.override_conflicts import check_override_conflicts, 
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.config import configuration, may_select_same_release, override
 from tests.unit.decide.test_ties import _override, effects, selector
@@ -29,69 +32,41 @@ Files = dict[str, str]
 CONFIG = load(configuration())
 
 
-def listed(path: str, kind: str, field: str, items: list[dict[str, Any]]) -> Files:
-    return {path: yaml.safe_dump({"apiVersion": "demandops/v1", "kind": kind, field: items})}
+MANY = plain_yaml.load(Path(__file__).with_name("many-entries.yaml").read_text())
 
 
-def nodes(count: int, **more: Callable[[int], Any]) -> Files:
-    node = {"type": "edge", "cluster": "c-its"}
-    made = [
-        node | {"id": f"n{number}"} | {name: value(number) for name, value in more.items()}
-        for number in range(count)
-    ]
-    return listed("inventory/nodes/more.yaml", "Nodes", "nodes", made)
+def files_of(kind: str, count: int) -> Files:
+    """Return the files with ``count`` entries of each form of a case."""
+    if kind in TWO:
+        return {f"overrides/o{number}.yaml": TWO[kind](number, count) for number in range(2)}
+    files = Files()
+    for path, document in MANY[kind].items():
+        if "{}" in path:
+            files |= {
+                numbered(path, number): override(*one.pop("select"), **one)
+                for number, one in enumerate(numbered(document, n) for n in range(count))
+            }
+        else:
+            entries = {
+                field: [numbered(one[0], number) for number in range(count)]
+                for field, one in document.items()
+                if isinstance(one, list)
+            }
+            files[path] = yaml.safe_dump({"apiVersion": "demandops/v1"} | document | entries)
+    return files
 
 
-def domains(count: int, pattern: Callable[[int], str]) -> Files:
-    made = [
-        {"name": f"d{number}", "namespace": f"d{number}", "nodes": [pattern(number)]}
-        for number in range(count)
-    ]
-    return listed("policy/access-domains/more.yaml", "AccessDomains", "domains", made)
+def numbered(entry: Any, number: int) -> Any:
+    text = json.dumps(entry).replace(' "{}"', f" {number}")
+    return json.loads(text.replace("{}", f"{number:04}"))
 
 
-def brokers(count: int) -> Files:
-    made = [{"node": f"b{number}", "host": "h", "port": 1883} for number in range(count)]
-    return listed("inventory/brokers/more.yaml", "Brokers", "brokers", made)
-
-
-def overrides(count: int, fields: Callable[[int], dict[str, Any]]) -> Files:
-    made = ({"select": [{"nodes": ["*"]}]} | fields(number) for number in range(count))
-    return {
-        f"overrides/o{number:04}.yaml": override(*one.pop("select"), **one)
-        for number, one in enumerate(made)
-    }
-
-
-MANY: dict[str, Callable[[int], Files]] = {
-    "nodes": nodes,
-    "nodes of unknown clusters": lambda n: nodes(n, cluster=lambda i: f"c{i}"),
-    "nodes with unknown peers": lambda n: nodes(n, bridged=lambda i: {f"p{i}": ["/a"]}),
-    "nodes in domains of their own": lambda n: nodes(n) | domains(n, lambda i: f"n{i}"),
-    "nodes in too many domains": lambda n: nodes(n) | domains(n, lambda i: "n*"),
-    "brokers on unknown nodes": lambda n: nodes(n) | brokers(n),
-    "overrides that contradict each other": lambda n: overrides(n, lambda i: {"replicas": i}),
-    "overrides that say the same": lambda n: overrides(n, lambda i: {"replicas": 1}),
-    "overrides of nodes of their own": lambda n: overrides(
-        n, lambda i: {"select": [{"nodes": [f"n{i}"]}], "replicas": i}
+TWO: dict[str, Callable[[int, int], str]] = {
+    "two overrides with many patterns": lambda i, count: override(
+        {"nodes": [f"n{i}-{k}" for k in range(count)]}, replicas=i
     ),
-    "overrides of parts of names": lambda n: overrides(
-        n, lambda i: {"select": [{"nodes": [f"n{i:04}*"]}], "replicas": i}
-    ),
-    "overrides of applications": lambda n: overrides(
-        n, lambda i: {"select": [{"applications": [f"a{i}"], "services": ["x"]}], "replicas": i}
-    ),
-    "patches of the same value": lambda n: overrides(n, lambda i: {"values": {"k": {"l": i}}}),
-    "patches of different values": lambda n: overrides(n, lambda i: {"values": {f"k{i}": i}}),
-    "holds of what others change": lambda n: overrides(
-        n, lambda i: {"hold": True} if i % 2 else {"replicas": 2}
-    ),
-    "moves to unknown nodes": lambda n: overrides(n, lambda i: {"node": f"v{i}"}) | nodes(n),
-    "two overrides with many patterns": lambda n: overrides(
-        2, lambda i: {"select": [{"nodes": [f"n{i}-{k}" for k in range(n)]}], "replicas": i}
-    ),
-    "two overrides with many selectors": lambda n: overrides(
-        2, lambda i: {"select": [{"nodes": [f"n{i}-{k}"]} for k in range(n)], "replicas": i}
+    "two overrides with many selectors": lambda i, count: override(
+        *({"nodes": [f"n{i}-{k}"]} for k in range(count)), replicas=i
     ),
 }
 
@@ -114,12 +89,12 @@ def work_of(files: Files) -> tuple[int, tuple[Fault, ...]]:
     return calls, ()
 
 
-@pytest.mark.parametrize("kind", MANY)
+@pytest.mark.parametrize("kind", [*MANY, *TWO])
 def test_the_work_grows_with_the_entries_and_not_faster(kind: str) -> None:
     work_of({})  # what is read once for all
     none, _ = work_of({})
-    few, _ = work_of(MANY[kind](200))
-    many, faults = work_of(MANY[kind](800))
+    few, _ = work_of(files_of(kind, 200))
+    many, faults = work_of(files_of(kind, 800))
     assert many - none < 6 * (few - none), "four times as many entries"
     assert len(faults) < 4 * 800
 

@@ -13,20 +13,8 @@ from hypothesis import strategies as st
 from tests.kit.chance import examples
 
 WORDS = [
-    "/v1/points",
-    "yes",
-    "1",
-    "a b",
-    "",
-    "é",
-    "it's",
-    "a: b",
-    "# c",
-    'a"b',
-    "a\\b",
-    "\x7f",
-    "~",
-]
+    "/v1/points", "yes", "1", "a b", "", "é", "it's", "a: b", "# c", 'a"b', "a\\b", "\x7f", "~",
+]  # fmt: skip
 STAND_INS = ["demandops-list", "demandops-list-0", "- demandops-list", "x\n- demandops-list\ny\n"]
 LONG = ["x" * 90, "x" * 120, "a b" * 40, "x " * 2500, "x" * 5000]
 TOPICS = st.integers(0, 40).map(lambda count: [f"/vehicle{one:02}/points" for one in range(count)])
@@ -40,16 +28,9 @@ DATA = st.recursive(
     max_leaves=6,
 )
 AROUND = [
-    "{}",
-    "x: |\n  {}",
-    "x: '{}'",
-    "x: {{{}}}",
-    "- {}",
-    "{} # why",
-    "{}\n  more",
-    "? {}",
+    "{}", "x: |\n  {}", "x: '{}'", "x: {{{}}}", "- {}", "{} # why", "{}\n  more", "? {}",
     "!!str {}",
-]
+]  # fmt: skip
 
 
 def outcome(read: Any) -> tuple[str, Any]:
@@ -57,6 +38,11 @@ def outcome(read: Any) -> tuple[str, Any]:
         return "read", read()
     except InvalidInput as error:
         return "refused", str(error)
+
+
+def assert_read_as_by_pyyaml(text: str) -> None:
+    by_pyyaml = outcome(lambda: next(strict_yaml.load_all(text, most=1)))
+    assert outcome(lambda: strict_yaml.load(text)) == by_pyyaml
 
 
 @given(data=DATA)
@@ -72,18 +58,14 @@ def test_pyyaml_would_write_the_same(data: Any) -> None:
 def test_a_list_is_read_as_pyyaml_reads_it(values: list[list[str]], around: str) -> None:
     fields = [f"f{place}: {strict_yaml.to_json(value)}" for place, value in enumerate(values)]
     indent = "\n" + " " * (len(around.partition("{}")[0].rpartition("\n")[2]))
-    text = around.format(indent.join(fields))
-    assert outcome(lambda: strict_yaml.load(text)) == outcome(
-        lambda: next(strict_yaml.load_all(text, most=1))
-    )
+    assert_read_as_by_pyyaml(around.format(indent.join(fields)))
 
 
 @pytest.mark.parametrize("depth", [98, 99, 100])
 def test_a_list_counts_as_a_level(depth: int) -> None:
     opened = "".join(f"{' ' * level}a:\n" for level in range(depth))
-    text = f"{opened}{' ' * depth}b: {strict_yaml.to_json(['/v1/points'] * 40)}\n"
-    assert outcome(lambda: strict_yaml.load(text)) == outcome(
-        lambda: next(strict_yaml.load_all(text, most=1))
+    assert_read_as_by_pyyaml(
+        f"{opened}{' ' * depth}b: {strict_yaml.to_json(['/v1/points'] * 40)}\n"
     )
 
 

@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import InvalidInput
 from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
 from demandops.model.config.policy import matches
@@ -25,20 +24,19 @@ from demandops.repo.pull_request.rendered_charts import manifest_faults
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo
 
-DOMAINS, NODES, CLIENTS = (
-    *("policy/access-domains.yaml", "inventory/nodes.yaml", "registry/clients.yaml"),
-)
+DOMAINS, NODES = "policy/access-domains.yaml", "inventory/nodes.yaml"
 BOOTSTRAP = "bootstrap/c-its.yaml"
 PAGE = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
 HEAD = "apiVersion: demandops/v1\nkind: {}\n"
 POLICY = f"""{HEAD.format("AccessDomains")}domains:
   - {{name: fleet, namespace: ns-fleet, nodes: ["vehicle*", "car.[?]", own*]}}
-  - {{name: city, namespace: ns-city, nodes: [edge, cloud, station00]}}
+  - {{name: city, namespace: ns-city, nodes: [edge, cloud, station00], ros: {{domainId: 7}}}}
 """
 OWN = f"""{HEAD.format("Nodes")}nodes:
   - {{id: "car.[1]", type: vehicle, cluster: c-its, selector: {{kubernetes.io/hostname: a}}}}
   - {{id: own1, type: vehicle, cluster: c-its, selector: {{kubernetes.io/hostname: b}}}}
   - {{id: own2, type: vehicle, cluster: c-its, selector: {{place: "x", rack: "1"}}}}
+  - {{id: own3, type: vehicle, cluster: c-its, accessDomains: [{{name: city}}]}}
 """
 FILES = {DOMAINS: POLICY, "inventory/nodes/own.yaml": OWN}
 
@@ -60,7 +58,7 @@ def test_a_pod_selects_a_node_of_its_domain() -> None:
     for domain in config.domains.values():
         rule = node_rule("c-its", domain, config)
         for node in config.nodes.values():
-            own = config.domain_of[node.id] is domain
+            own = config.domain_of[node.id] is domain or node.labels() == {"node_id": "own3"}
             assert taken(rule, node.labels()) == own, (domain.name, node.id)
             assert taken(rule, node.labels() | {"more": "narrower"}) == own
         for selector in ({}, {"node_id": "other"}, {"place": "x"}, {"kubernetes.io/os": "linux"}):
@@ -90,30 +88,33 @@ def bootstrap(files: Mapping[str, str]) -> dict[str, dict[str, Any]]:
     return {item["kind"]: item for item in yaml.safe_load_all(text)}
 
 
-@pytest.mark.parametrize("gitops", ["flux", "argocd"])
-def test_one_more_vehicle_changes_nothing_that_someone_applied(gitops: str) -> None:
-    root = {"demandops.yaml": skeleton(gitops)["demandops.yaml"]}
-    node = f"{HEAD.format('Nodes')}nodes: [{{id: vehicle9, type: vehicle, cluster: c-its}}]\n"
-    before = rendered_files(MemoryRepo(root | FILES).state)
-    after = rendered_files(MemoryRepo(root | FILES | {"inventory/nodes/new.yaml": node}).state)
-    assert before == after
-    own = node.replace("c-its}", "c-its, selector: {node_id: nine}}")
-    after = rendered_files(MemoryRepo(root | FILES | {"inventory/nodes/new.yaml": own}).state)
-    assert [path for path in after if after[path] != before[path]] == [BOOTSTRAP]
+NODE = f"{HEAD.format('Nodes')}nodes: [{{id: vehicle9, type: vehicle, cluster: c-its}}]\n"
+OWN_LABELS = NODE.replace("c-its}", "c-its, selector: {node_id: nine}}")
+CHARTS, NEW = "registry/charts.yaml", "appdefs/new/charts/new"
+CHART = {
+    CHARTS: f"{skeleton()[CHARTS]}  new: {{folder: {NEW}, version: 1.0.0}}\n",
+    f"{NEW}/Chart.yaml": "apiVersion: v2\nname: new\nversion: 1.0.0\n",
+}
 
 
-def test_a_chart_in_a_new_folder_changes_nothing_that_someone_applied() -> None:
-    """The bootstrap file stays as it is, because nobody applies it again for a new chart."""
-    folder = "appdefs/new/charts/new"
-    charts = skeleton()["registry/charts.yaml"]
-    added = {
-        "registry/charts.yaml": f"{charts}  new: {{folder: {folder}, version: 1.0.0}}\n",
-        f"{folder}/Chart.yaml": "apiVersion: v2\nname: new\nversion: 1.0.0\n",
-    }
-    before = rendered_files(MemoryRepo(FILES).state)
-    after = rendered_files(MemoryRepo(FILES | added).state)
-    changed = {path.rpartition("/")[2] for path in after if before.get(path) != after[path]}
-    assert changed == {"new-1.0.0.yaml"}
+@pytest.mark.parametrize(
+    ("gitops", "added", "changed"),
+    [
+        *((gitops, {"inventory/nodes/new.yaml": NODE}, set()) for gitops in ("flux", "argocd")),
+        ("flux", {"inventory/nodes/new.yaml": OWN_LABELS}, {"c-its.yaml"}),
+        ("flux", CHART, {"new-1.0.0.yaml"}),
+    ],
+    ids=["a vehicle", "a vehicle, by Argo CD", "labels of its own", "a chart in a new folder"],
+)
+def test_only_labels_of_its_own_change_what_someone_applied(
+    gitops: str, added: dict[str, str], changed: set[str]
+) -> None:
+    """Nobody applies the bootstrap file again for a further vehicle or chart."""
+    files = FILES | {"demandops.yaml": skeleton(gitops)["demandops.yaml"]}
+    before = rendered_files(MemoryRepo(files).state)
+    after = rendered_files(MemoryRepo(files | added).state)
+    names = {path.rpartition("/")[2] for path in after if before.get(path) != after[path]}
+    assert names == changed
 
 
 LEVELS = {"baseline": 7, "host-network": 6, "privileged": 1}
@@ -166,23 +167,3 @@ def test_the_default_lets_nodes_have_the_hosts_network() -> None:
     bare = skeleton()[DOMAINS].replace("    podSecurity: host-network\n", "")
     assert bare != skeleton()[DOMAINS]
     assert bootstrap({DOMAINS: bare}) == bootstrap({})
-
-
-def test_a_node_may_not_have_what_its_domain_forbids() -> None:
-    policy = POLICY.replace("ns-fleet,", "ns-fleet, podSecurity: baseline,")
-    nodes = skeleton()[NODES].replace("    type:", "    hostNetwork: false\n    type:", 1)
-    own = OWN.replace("c-its, ", "c-its, hostNetwork: false, ")
-    clients = skeleton()[CLIENTS] + "  hostNetwork: true\n"
-    files = {DOMAINS: policy, NODES: nodes, "inventory/nodes/own.yaml": own, CLIENTS: clients}
-    with pytest.raises(InvalidInput) as invalid:
-        load(configuration(files))
-    assert str(invalid.value).splitlines() == [
-        *(
-            f"{NODES}: nodes[{place}].hostNetwork: is true (the default), and podSecurity of "
-            "access domain 'fleet' is baseline, which forbids it; set 'hostNetwork: false' or "
-            "'podSecurity: host-network'"
-            for place in (1, 2, 3)
-        ),
-        f"{CLIENTS}: mqtt.hostNetwork: is true, and podSecurity of access domain 'fleet' is "
-        "baseline, which forbids it; leave it out, so that each client has the setting of its node",
-    ]

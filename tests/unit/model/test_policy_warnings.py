@@ -1,0 +1,49 @@
+"""``policy-warnings.yaml`` lists what ``demandops check`` warns of in a valid configuration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from demandops.decide import warnings
+from demandops.model.config.load import load
+
+from tests.kit import plain_yaml
+from tests.kit.config import configuration, state_of
+from tests.kit.memory import MemoryRepo
+from tests.unit.model.test_config_mistakes import changed
+
+CASES = plain_yaml.load(Path(__file__).with_name("policy-warnings.yaml").read_text())
+
+
+def told(case: dict[str, Any]) -> list[str]:
+    files = {path: change for path, change in case.items() if path != "warns"}
+    state = MemoryRepo(changed(files)).state
+    patterns = warnings.unmatched_pattern_warnings(state.config)
+    return [str(one) for one in (*patterns, *warnings.policy_warnings(state))]
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_exactly_what_is_listed_is_warned_of(name: str) -> None:
+    found = told(CASES[name])
+    for words, one in zip(CASES[name]["warns"], found, strict=True):
+        assert words in one
+
+
+def test_the_warning_of_the_documentation_is_told() -> None:
+    page = (Path(__file__).parents[3] / "docs" / "policy.md").read_text()
+    (one,) = told(CASES["a kind that the domain lacks, with its line"])
+    one = one.replace("object-detection-fusion", "agent").replace("object-detection", "agent")
+    assert one in page
+
+
+def test_connections_that_could_not_be_demanded_any_longer_are_told() -> None:
+    books = MemoryRepo(changed({"base": "two domains"}))
+    link = {"id": "c", "source": "vehicle00", "target": "edge", "topics": [{"source": "/a"}]}
+    books.send({"kind": "Demand", "demand": "d", "requesters": ["v"], "connections": [link]})
+    closed = {"base": "two domains", "policy/access-domains.yaml": {"peers: [": "nodes: ["}}
+    config = load(configuration(changed(closed)))
+    found = map(str, warnings.policy_warnings(state_of(config, books.state.ledger)))
+    (told,) = [one for one in found if "no rule of access domain 'fleet' has 'city' among" in one]
+    assert told.endswith("claims on such connections stay in effect: 1")
