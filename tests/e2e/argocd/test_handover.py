@@ -6,15 +6,13 @@ import json
 from collections.abc import Iterator
 
 import pytest
-import yaml
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import CLUSTER, NODES, WITHOUT_DEMANDS
+from tests.e2e.common.namespace import name_of
 from tests.e2e.common.ros import Client
-from tests.e2e.common.running import running
-from tests.e2e.common.staterepo import demandops
-from tests.e2e.flux import view as flux_view
-from tests.e2e.flux.world import World as FluxWorld
+from tests.e2e.common.world import World, demandops, running
+from tests.e2e.flux.view import Domain as FluxDomain
 from tests.e2e.rig.argocd import NAMESPACE as CONTROL
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
@@ -36,7 +34,7 @@ def both(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
 def test_every_pod_stays_there_and_back(
     both: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    world = FluxWorld(both, tmp_path_factory.mktemp("world"), ros_domain, client)
+    world = World(both, tmp_path_factory.mktemp("world"), ros_domain, client)
     try:
         flux = world.bootstrap(CLUSTER, both)
         world.generator.start()
@@ -69,14 +67,14 @@ def test_every_pod_stays_there_and_back(
         world.remove_wide()
 
 
-def from_flux(domain: flux_view.Domain) -> None:
+def from_flux(domain: FluxDomain) -> None:
     """Suspend the Flux objects that would otherwise remove the releases."""
     for kind in ("Kustomization", "HelmRelease"):
         for item in domain.find(kind):
-            domain.kube.patch(kind, item["metadata"]["name"], SUSPENDED, domain.namespace)
+            domain.kube.patch(kind, name_of(item), SUSPENDED, domain.namespace)
 
 
-def upgrade(world: FluxWorld, gitops: str) -> str:
+def upgrade(world: World, gitops: str) -> str:
     """Render the state repo for a controller while the generator runs; return the commit.
 
     Fail unless this makes exactly one commit.
@@ -90,14 +88,12 @@ def upgrade(world: FluxWorld, gitops: str) -> str:
     return str(commit)
 
 
-def to_argocd(world: FluxWorld) -> Domain:
+def to_argocd(world: World) -> Domain:
     """Render the state repo for Argo CD, apply its bootstrap file, and demand step 2."""
     upgraded = upgrade(world, "argocd")
-    manifests = list(yaml.safe_load_all(world.file(f"bootstrap/{CLUSTER}.yaml")))
+    manifests = world.manifests(CLUSTER)
     world.apply(world.rig.kube, manifests)
-    folder = manifests[-1]
-    destination = folder["spec"]["destination"]["namespace"]
-    domain = Domain(world.rig.kube, destination, folder["metadata"]["name"])
+    (domain,) = Domain.all_in(world.rig.kube, manifests)
     domain.wait_applied(upgraded)
     domain.wait_releases()
     sent = world.demand(expected.demand(2))
@@ -107,19 +103,17 @@ def to_argocd(world: FluxWorld) -> Domain:
     return domain
 
 
-def forget_flux(domain: flux_view.Domain) -> None:
+def forget_flux(domain: FluxDomain) -> None:
     """Delete Helm's records and Flux's objects.
 
     Flux's objects are suspended, so their deletion removes no release.
     """
     for kind in FLUX_KINDS:
         for item in domain.find(kind):
-            name = item["metadata"]["name"]
-            domain.kube.delete(kind, name, domain.namespace)
-            domain.kube.wait_gone(kind, name, domain.namespace)
+            domain.take_away(kind, name_of(item))
     for secret in domain.find("Secret"):
         if secret["type"] == "helm.sh/release.v1":
-            domain.kube.delete("Secret", secret["metadata"]["name"], domain.namespace)
+            domain.kube.delete("Secret", name_of(secret), domain.namespace)
 
 
 def forget_argocd(domain: Domain) -> None:
@@ -127,10 +121,7 @@ def forget_argocd(domain: Domain) -> None:
 
     The folder's Application goes first, because it would restore the Applications of the releases.
     """
-    apps = [
-        (domain.name, CONTROL),
-        *((name, domain.namespace) for name in domain.releases()),
-    ]
+    apps = [(domain.name, CONTROL), *((name, domain.namespace) for name in domain.releases())]
     for name, namespace in apps:
         domain.kube.patch("Application", name, {"metadata": {"finalizers": None}}, namespace)
         domain.kube.delete("Application", name, namespace)
@@ -138,7 +129,7 @@ def forget_argocd(domain: Domain) -> None:
     domain.kube.delete("AppProject", domain.name, CONTROL)
 
 
-def to_flux(world: FluxWorld) -> None:
+def to_flux(world: World) -> None:
     """Render the state repo for Flux, demand step 4, and apply the bootstrap file of Flux."""
     upgrade(world, "flux")
     world.demand(expected.demand(4))

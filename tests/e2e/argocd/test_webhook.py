@@ -13,11 +13,10 @@ from tests.e2e.common.access import access_file, documented_roles, limited
 from tests.e2e.common.answers import TIMEOUT_S, fusion, push_chart, restart_generator
 from tests.e2e.common.expected import CLUSTER
 from tests.e2e.common.namespace import name_of
+from tests.e2e.common.world import World
+from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.argocd import SERVER, WEBHOOK_SECRET
 from tests.e2e.rig.cluster import Rig
-
-from .conftest import MakeWorld
-from .world import World
 
 OF_CHART = "\n---\napiVersion: v1\nkind: ConfigMap\nmetadata: {name: {{ .Release.Name }}-new}\n"
 
@@ -36,7 +35,7 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
         namespace: [
             {**rule, "verbs": [verb for verb in rule["verbs"] if verb != "patch"]} for rule in rules
         ]
-        for namespace, rules in documented_roles("argo cd").items()
+        for namespace, rules in documented_roles("argocd").items()
     }
     access_file(
         made.folder,

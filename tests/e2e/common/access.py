@@ -27,8 +27,9 @@ def access_file(folder: Path, cluster: str, **connection: object) -> Path:
 
 def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
     """Return the role rules that docs/status.md lists for a controller, by namespace."""
+    name = {"flux": "flux", "argocd": "argo cd"}[gitops]
     blocks = re.findall(r"```yaml\n(.*?)```", _STATUS_PAGE.read_text(), re.DOTALL)
-    (block,) = [text for text in blocks if f"# with {gitops}\n" in text.lower()]
+    (block,) = [text for text in blocks if f"# with {name}\n" in text.lower()]
     roles = list(yaml.safe_load_all(block))
     return {role["metadata"]["namespace"]: role["rules"] for role in roles}
 

@@ -5,8 +5,9 @@ The `view` module of each controller adds what depends on the controller.
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
 import yaml
@@ -14,7 +15,6 @@ import yaml
 from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube, Manifest
 from tests.e2e.rig.kwok import NODE_ID_LABEL
-from tests.kit.limits import PATIENCE_S
 
 from .expected import FUSION
 
@@ -32,6 +32,10 @@ _OF_RELEASES = (
     "ServiceAccount",
 )
 _OTHERS = ("Job", "Service")
+_READY_POD = re.compile(r"pod of (?P<name>\S+?)(-[0-9a-f]{12})? on (?P<node>\S+), ready")
+
+Pods = set[tuple[str, str]]
+"""Pods, each as the name of its service without a hash, and its node."""
 
 
 class Namespace:
@@ -40,7 +44,6 @@ class Namespace:
     `name` is the name of the controller's object that applies the domain's folder.
     """
 
-    GITOPS: ClassVar[str]
     RELEASE: ClassVar[str]
     OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's objects
     STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that a commit must not touch without need
@@ -48,6 +51,19 @@ class Namespace:
     def __init__(self, kube: Kube, namespace: str, name: str) -> None:
         self.kube, self.namespace, self.name = kube, namespace, name
         self._node_ids: dict[str, str] = {}
+
+    @classmethod
+    def all_in(cls, kube: Kube, bootstrap: Iterable[Manifest]) -> list[Any]:
+        """Return the access domains that a bootstrap file lays down on a cluster."""
+        raise NotImplementedError
+
+    def settle(self, commit: str) -> None:
+        """Wait until the controller has taken up the bootstrap file and applied a commit."""
+        raise NotImplementedError
+
+    def remove(self) -> None:
+        """Remove the controller's objects and with them all releases; the namespace stays."""
+        raise NotImplementedError
 
     # --- reading ----------------------------------------------------------------------------
 
@@ -73,6 +89,12 @@ class Namespace:
         found += [self._pod_line(pod) for pod in self.find("Pod")]
         repeated = {line for line in found if found.count(line) > 1}
         return frozenset(found) | {f"twice: {line}" for line in repeated}
+
+    def pods(self) -> Pods:
+        """Return the pods; one that is not ready is ``("?", "?")``."""
+        lines = (line for line in self.lines() if line.startswith("pod of "))
+        matches = map(_READY_POD.fullmatch, lines)
+        return {(match["name"], match["node"]) if match else ("?", "?") for match in matches}
 
     def releases(self) -> dict[str, Any]:
         return {name_of(item): item["spec"] for item in self.find(self.RELEASE)}
@@ -138,9 +160,16 @@ class Namespace:
         """Wait until the controller has compared every release with the given commit."""
         raise NotImplementedError
 
+    def trouble(self, kind: str, name: str) -> str:
+        """Return why an object of the controller is not ready; empty if it has no reason."""
+        raise NotImplementedError
+
     def folder_trouble(self) -> str:
         """Return why the domain's folder cannot be applied; empty if it can."""
         raise NotImplementedError
+
+    def read_chart(self, release: str) -> None:
+        """Make the controller read a release's chart again, if it does not do so by itself."""
 
     def take_away(self, kind: str, name: str) -> None:
         """Delete an object that the controller restores."""
@@ -154,13 +183,22 @@ class Namespace:
 
     # --- waiting ----------------------------------------------------------------------------
 
-    def wait_lines(self, wanted: frozenset[str], timeout: float = PATIENCE_S) -> float:
+    def wait_lines(self, wanted: frozenset[str]) -> float:
         """Wait until `lines` returns just the wanted lines; return the time (`time.monotonic`)."""
-        return self._wait_same(self.lines, wanted, timeout)
+        return self._wait_same(self.lines, wanted)
 
-    def wait_inventory(self, wanted: frozenset[str], timeout: float = PATIENCE_S) -> None:
+    def wait_inventory(self, wanted: frozenset[str]) -> None:
         """Wait until `inventory` returns exactly the wanted objects."""
-        self._wait_same(self.inventory, wanted, timeout)
+        self._wait_same(self.inventory, wanted)
+
+    def wait_refused(self, why: str, *releases: str) -> None:
+        """Wait until the domain's folder, or one of these releases, reports a refusal."""
+
+        def refused() -> bool:
+            told = [self.folder_trouble(), *(self.trouble(self.RELEASE, name) for name in releases)]
+            return any(why in text for text in told)
+
+        self.kube.wait(f"'{why}' to be reported", refused)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
         """Wait until no object of a release has changed for ``seconds``; return `versions`.
@@ -192,9 +230,7 @@ class Namespace:
             for counted in ("readyReplicas", "availableReplicas")
         )
 
-    def _wait_same(
-        self, look: Callable[[], frozenset[str]], wanted: frozenset[str], timeout: float
-    ) -> float:
+    def _wait_same(self, look: Callable[[], frozenset[str]], wanted: frozenset[str]) -> float:
         seen: list[frozenset[str]] = [frozenset()]
 
         def same() -> bool:
@@ -202,7 +238,7 @@ class Namespace:
             return seen[0] == wanted
 
         try:
-            self.kube.wait("exactly what is wanted", same, timeout)
+            self.kube.wait("exactly what is wanted", same)
         except RigError as error:
             raise AssertionError(f"{error}\n{_difference(wanted, seen[0])}") from error
         return time.monotonic()
@@ -227,6 +263,18 @@ class Namespace:
             labels = found["metadata"].get("labels") or {}
             self._node_ids[node] = labels.get(NODE_ID_LABEL, f"{node} without label")
         return self._node_ids[node]
+
+
+def wait_for_pods(wanted: Mapping[Namespace, Pods]) -> None:
+    """Wake the controller until each of these domains runs exactly its pods."""
+
+    def same() -> bool:
+        for domain in wanted:
+            domain.wake()
+        return all(domain.pods() == pods for domain, pods in wanted.items())
+
+    listed = {domain.namespace: sorted(pods) for domain, pods in wanted.items()}
+    next(iter(wanted)).kube.wait(f"exactly {listed}", same)
 
 
 def fusion_inputs(config: Manifest) -> list[str]:

@@ -10,10 +10,9 @@ import pytest
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import STEPS
+from tests.e2e.common.world import World
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
-
-from .world import World
 
 Act = Callable[[World, dict[str, Any]], None]
 

@@ -11,26 +11,20 @@ import pytest
 from tests.e2e.common import expected
 from tests.e2e.common.access import access_file, limited
 from tests.e2e.common.expected import CLUSTER, STEPS, WITHOUT_DEMANDS
-from tests.e2e.common.timing import Table
+from tests.e2e.common.world import World, show_times
+from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .conftest import MakeWorld
 from .view import SOURCE, Domain
-from .world import World
 
 READ = ["get", "list", "watch"]
 RIGHTS = [
-    {
-        "apiGroups": ["source.toolkit.fluxcd.io"],
-        "resources": ["gitrepositories"],
-        "verbs": [*READ, "patch"],
-    },
-    {
-        "apiGroups": ["kustomize.toolkit.fluxcd.io"],
-        "resources": ["kustomizations"],
-        "verbs": READ,
-    },
+    {"apiGroups": [f"{part}.toolkit.fluxcd.io"], "resources": [kind], "verbs": verbs}
+    for part, kind, verbs in (
+        ("source", "gitrepositories", [*READ, "patch"]),
+        ("kustomize", "kustomizations", READ),
+    )
 ]
 REQUESTED = "reconcile.fluxcd.io/requestedAt"
 ROUNDS = 3
@@ -50,9 +44,8 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 def test_a_trigger_saves_the_wait_for_the_next_fetch(world: World, say: Report) -> None:
     """Flux fetches only every ten minutes, so only the trigger can bring the demand in time."""
-    table = Table("Triggered by the generator, next fetch after 10 minutes")
-    table.add("joins", world.step(1, expected.after(1), wake=False))
-    table.show(say)
+    times = {"joins": world.step(1, expected.after(1), wake=False)}
+    show_times(say, "Triggered by the generator, next fetch after 10 minutes", times)
     world.follow(world.demand(expected.demand(1) | {"shutdown": True}), WITHOUT_DEMANDS)
 
 
