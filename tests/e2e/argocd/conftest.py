@@ -17,5 +17,4 @@ def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
     """A cluster with a fake node for each node of the skeleton's inventory."""
     cluster = Rig(CLUSTER, gitops="argocd", nodes=NODES, report=say)
     with running(cluster, request.session):
-        say(f"\nrig started: {cluster.timings}")
         yield cluster

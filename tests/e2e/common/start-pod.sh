@@ -38,4 +38,5 @@ done
 [ -n "$image" ] || show_folders  # a volume may hide one: this checkout may be below /tmp
 mount -o remount,bind,ro "$root"
 cd /
-exec chroot "$root" setpriv --reuid "$user" --regid "$group" --groups "$group"   --bounding-set=-all --inh-caps=-all --no-new-privs --pdeathsig KILL env -i "$@"
+exec chroot "$root" setpriv --reuid "$user" --regid "$group" --groups "$group" \
+  --bounding-set=-all --inh-caps=-all --no-new-privs --pdeathsig KILL env -i "$@"

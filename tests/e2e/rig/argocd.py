@@ -15,7 +15,7 @@ import shutil
 from pathlib import Path
 
 from .errors import RigError
-from .kube import Manifest
+from .kube import Manifest, build_manifest
 from .net import LOOPBACK, accepts, answers, free_port, url
 from .processes import Component
 
@@ -32,62 +32,44 @@ WEBHOOK_SECRET = secrets.token_hex(16)
 
 def prerequisites() -> list[Manifest]:
     """Return the manifests that Argo CD's parts need before they start, as docs/argocd.md says."""
-    labels = {"app.kubernetes.io/part-of": "argocd"}
-    return [
-        {"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}},
-        {
-            "apiVersion": "v1",
-            "kind": "ConfigMap",
-            "metadata": {"name": "argocd-cm", "namespace": NAMESPACE, "labels": labels},
-            "data": {"application.sync.impersonation.enabled": "true"},
-        },
-        {
-            "apiVersion": "v1",
-            "kind": "Secret",
-            "metadata": {"name": "argocd-secret", "namespace": NAMESPACE, "labels": labels},
-            "data": {
-                "webhook.github.secret": base64.b64encode(WEBHOOK_SECRET.encode()).decode(),
-            },
-        },
+    secret = base64.b64encode(WEBHOOK_SECRET.encode()).decode()
+    made = [
+        build_manifest("v1", "Namespace", NAMESPACE),
+        build_manifest(
+            "v1",
+            "ConfigMap",
+            "argocd-cm",
+            NAMESPACE,
+            data={"application.sync.impersonation.enabled": "true"},
+        ),
+        build_manifest(
+            "v1", "Secret", "argocd-secret", NAMESPACE, data={"webhook.github.secret": secret}
+        ),
     ]
+    for manifest in made[1:]:
+        manifest["metadata"]["labels"] = {"app.kubernetes.io/part-of": "argocd"}
+    return made
 
 
-def components(
-    binaries: dict[str, Path], folder: Path, kubeconfig: Path, own: dict[str, list[str]]
-) -> list[Component]:
-    """Return Redis and the components of Argo CD; `own` maps a name to additional arguments."""
+def components(binaries: dict[str, Path], folder: Path, kubeconfig: Path) -> list[Component]:
+    """Return Redis and the components of Argo CD."""
     redis, repo_server, server_port, data = free_port(), free_port(), free_port(), folder / "argocd"
     data.mkdir(parents=True, exist_ok=True)
     cache = f"--redis={LOOPBACK}:{redis}"
-    controller = [
+    manifests = [cache, f"--address={LOOPBACK}", f"--port={repo_server}", "--disable-tls"]
+    manifests.append(f"--metrics-address={LOOPBACK}")
+    both = [
         f"--kubeconfig={kubeconfig}",
         f"--namespace={NAMESPACE}",
         cache,
         f"--repo-server={LOOPBACK}:{repo_server}",
         "--repo-server-plaintext",
         "--application-namespaces=*",
-        # Shortens a wait of up to five minutes after repeated manual changes.
-        "--self-heal-backoff-cap-seconds=3",
     ]
-    manifests = [
-        cache,
-        f"--address={LOOPBACK}",
-        f"--port={repo_server}",
-        f"--metrics-address={LOOPBACK}",
-        "--disable-tls",
-    ]
-    server = [
-        f"--kubeconfig={kubeconfig}",
-        f"--namespace={NAMESPACE}",
-        cache,
-        f"--address={LOOPBACK}",
-        f"--port={server_port}",
-        f"--metrics-address={LOOPBACK}",
-        f"--repo-server={LOOPBACK}:{repo_server}",
-        "--repo-server-plaintext",
-        "--application-namespaces=*",
-        "--insecure",
-    ]
+    # Shortens a wait of up to five minutes after repeated manual changes.
+    controller = [*both, "--self-heal-backoff-cap-seconds=3"]
+    server = [*both, f"--address={LOOPBACK}", f"--port={server_port}", "--insecure"]
+    server.append(f"--metrics-address={LOOPBACK}")
     environment = {
         "ARGOCD_FAKE_IN_CLUSTER": "true",  # "in-cluster" then means the kubeconfig's cluster
         "ARGOCD_GPG_ENABLED": "false",
@@ -99,9 +81,9 @@ def components(
     }
     program = binaries["argocd"]
     parts = [
-        _part(REPO_SERVER, program, [*manifests, *own.get(REPO_SERVER, [])], environment),
-        _part(CONTROLLER, program, [*controller, *own.get(CONTROLLER, [])], environment),
-        _part(SERVER, program, [*server, *own.get(SERVER, [])], environment, server_port),
+        _part(REPO_SERVER, program, manifests, environment),
+        _part(CONTROLLER, program, controller, environment),
+        _part(SERVER, program, server, environment, server_port),
     ]
     return [_redis(redis, data), *parts]
 
@@ -109,9 +91,7 @@ def components(
 def _redis(port: int, folder: Path) -> Component:
     program = shutil.which(REDIS)
     if program is None:
-        raise RigError(
-            f"`{REDIS}` is not on PATH: install Redis (Debian: the package redis-server)"
-        )
+        raise RigError(f"`{REDIS}` is not on PATH: install Redis (Debian: redis-server)")
     argv = [program, "--bind", LOOPBACK, "--port", str(port), "--dir", str(folder)]
     return Component(REDIS, (*argv, "--save", "", "--appendonly", "no"), accepts(port))
 

@@ -7,7 +7,6 @@ there is no leader election.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 
 from .net import LOOPBACK, answers, free_port, url
@@ -17,18 +16,10 @@ from .processes import Component
 _SERVICES = "10.96.0.0/16"
 
 
-@dataclass(frozen=True)
 class ControlPlane:
-    binaries: dict[str, Path]
-    folder: Path
-    pki: Pki
-    etcd_port: int
-    api_port: int
-
-    @staticmethod
-    def plan(binaries: dict[str, Path], folder: Path, pki: Pki) -> ControlPlane:
-        """Return a control plane with free ports."""
-        return ControlPlane(binaries, folder, pki, free_port(), free_port())
+    def __init__(self, binaries: dict[str, Path], folder: Path, pki: Pki) -> None:
+        self.binaries, self.folder, self.pki = binaries, folder, pki
+        self.etcd_port, self.api_port = free_port(), free_port()
 
     @property
     def server(self) -> str:
@@ -98,14 +89,10 @@ class ControlPlane:
     def scheduler(self, kubeconfig: Path) -> Component:
         """Return the scheduler, which evaluates node selectors."""
         port = free_port()
-        argv = [
-            str(self.binaries["kube-scheduler"]),
-            f"--kubeconfig={kubeconfig}",
-            *self._serving(port),
-        ]
-        return Component(
-            "kube-scheduler", tuple(argv), answers(port, "/healthz", self.pki.authority)
-        )
+        program = str(self.binaries["kube-scheduler"])
+        argv = [program, f"--kubeconfig={kubeconfig}", *self._serving(port)]
+        probe = answers(port, "/healthz", self.pki.authority)
+        return Component("kube-scheduler", tuple(argv), probe)
 
     def _serving(self, port: int) -> list[str]:
         return [

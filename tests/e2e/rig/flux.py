@@ -26,10 +26,8 @@ def prerequisites() -> list[Manifest]:
     return [{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}}]
 
 
-def components(
-    binaries: dict[str, Path], folder: Path, kubeconfig: Path, own: dict[str, list[str]]
-) -> list[Component]:
-    """Return the three controllers; `own` maps a controller's name to additional arguments."""
+def components(binaries: dict[str, Path], folder: Path, kubeconfig: Path) -> list[Component]:
+    """Return the three controllers."""
     storage = folder / "artifacts"
     storage.mkdir(parents=True, exist_ok=True)
     artifacts = f"{LOOPBACK}:{free_port()}"
@@ -43,10 +41,7 @@ def components(
         # By default helm-controller waits up to ten minutes for running releases before it ends.
         "helm-controller": ["--graceful-shutdown-timeout=5s", *LOCKED_DOWN],
     }
-    return [
-        _component(name, binaries[name], kubeconfig, [*extra[name], *own.get(name, [])])
-        for name in CONTROLLERS
-    ]
+    return [_component(name, binaries[name], kubeconfig, extra[name]) for name in CONTROLLERS]
 
 
 def _component(name: str, binary: Path, kubeconfig: Path, extra: list[str]) -> Component:

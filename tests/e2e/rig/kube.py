@@ -101,11 +101,9 @@ class Kube:
             return None
         return dict(found.to_dict())
 
-    def find(
-        self, kind: str, namespace: str = "", selector: str = "", version: str = ""
-    ) -> list[Manifest]:
+    def find(self, kind: str, namespace: str = "", selector: str = "") -> list[Manifest]:
         """Return the objects of a kind that match a label selector, in one namespace or in all."""
-        found = self._resource(kind, version).get(
+        found = self._resource(kind).get(
             namespace=namespace or None, label_selector=selector or None
         )
         return [dict(item) for item in found.to_dict()["items"]]
@@ -116,10 +114,8 @@ class Kube:
         except NotFoundError:
             return
 
-    def patch(
-        self, kind: str, name: str, body: Manifest, namespace: str = "", version: str = ""
-    ) -> None:
-        self._resource(kind, version).patch(
+    def patch(self, kind: str, name: str, body: Manifest, namespace: str = "") -> None:
+        self._resource(kind).patch(
             name=name,
             namespace=namespace or None,
             body=body,
@@ -151,12 +147,10 @@ class Kube:
         review = api.sanitize_for_serialization(call({"spec": {"namespace": namespace}}))
         return list(review["status"]["resourceRules"])
 
-    def reconcile(self, kind: str, name: str, namespace: str) -> str:
-        """Trigger a reconcile of an object by Flux; return the token that `handled` needs."""
-        token = f"{time.time():.6f}"
-        annotations = {"reconcile.fluxcd.io/requestedAt": token}
+    def reconcile(self, kind: str, name: str, namespace: str) -> None:
+        """Trigger a reconcile of an object by Flux."""
+        annotations = {"reconcile.fluxcd.io/requestedAt": f"{time.time():.6f}"}
         self.patch(kind, name, {"metadata": {"annotations": annotations}}, namespace)
-        return token
 
     def wait(self, what: str, look: Callable[[], Seen | None], timeout: float = PATIENCE_S) -> Seen:
         """Return the first result of `look` that is neither None nor False.
@@ -176,51 +170,35 @@ class Kube:
                 raise RigError(f"waited {timeout:.0f} s for {what}{trouble}")
             time.sleep(_POLL_SECONDS)
 
-    def wait_ready(
-        self,
-        kind: str,
-        name: str,
-        namespace: str = "",
-        timeout: float = PATIENCE_S,
-        version: str = "",
-    ) -> Manifest:
-        """Wait until an object's newest generation is Ready; return the object."""
-        last: list[str] = ["does not exist"]
+    def wait_ready(self, kind: str, name: str, namespace: str = "") -> None:
+        """Wait until an object's newest generation is Ready."""
+        last = "does not exist"
 
-        def ready() -> Manifest | None:
-            found = self.get(kind, name, namespace, version)
-            last[:] = [_condition(found)]
-            return found if last == [""] else None
+        def ready() -> bool:
+            nonlocal last
+            last = _condition(self.get(kind, name, namespace))
+            return last == ""
 
-        what = f"{kind} {namespace}/{name} to be Ready"
         try:
-            return self.wait(what, ready, timeout)
+            self.wait(f"{kind} {namespace}/{name} to be Ready", ready)
         except RigError as error:
-            raise RigError(f"{error}; last seen: {last[0]}") from error
+            raise RigError(f"{error}; last seen: {last}") from error
 
-    def wait_gone(
-        self,
-        kind: str,
-        name: str,
-        namespace: str = "",
-        timeout: float = PATIENCE_S,
-        version: str = "",
-    ) -> None:
+    def wait_gone(self, kind: str, name: str, namespace: str = "") -> None:
         what = f"{kind} {namespace}/{name} to go"
-        self.wait(what, lambda: self.get(kind, name, namespace, version) is None, timeout)
+        self.wait(what, lambda: self.get(kind, name, namespace) is None)
 
-    def install_crds(self, files: Iterable[Path], timeout: float = PATIENCE_S) -> None:
+    def install_crds(self, files: Iterable[Path]) -> None:
         """Apply CRDs and wait until the server serves them."""
         crds = _documents([path.read_text() for path in files])
         self.apply(*crds)
-        for crd in crds:
-            name = crd["metadata"]["name"]
-
-            def established(name: str = name) -> bool:
-                found = self.get("CustomResourceDefinition", name) or {}
-                return _holds(found, "Established")
-
-            self.wait(f"CRD {name} to be served", established, timeout)
+        for name in (crd["metadata"]["name"] for crd in crds):
+            self.wait(
+                f"CRD {name} to be served",
+                lambda name=name: _holds(
+                    self.get("CustomResourceDefinition", name) or {}, "Established"
+                ),
+            )
 
     def _resource(self, kind: str, version: str = "") -> Any:
         if self._dynamic is None:  # not earlier, because it queries the server
@@ -236,11 +214,6 @@ def build_manifest(
     """Return a manifest with further `fields`; without a namespace the object is cluster-wide."""
     metadata = {"name": name} | ({"namespace": namespace} if namespace else {})
     return {"apiVersion": version, "kind": kind, "metadata": metadata, **fields}
-
-
-def handled(manifest: Manifest, token: str) -> bool:
-    """Return whether a Flux controller has finished the reconcile that `token` triggered."""
-    return bool(manifest.get("status", {}).get("lastHandledReconcileAt") == token)
 
 
 def _condition(found: Manifest | None) -> str:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from .pki import Pki
 from .processes import Component
 
 NODE_ID_LABEL = "node_id"
-HOLD_ANNOTATION = "rig.demandops.invalid/hold"  # see stages.yaml
 _STAGES = Path(__file__).resolve().parent / "stages.yaml"
 _FAKE = "kwok.x-k8s.io/node"
 _LABEL_VALUE = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
@@ -53,7 +51,7 @@ def node_name(node_id: str) -> str:
     return f"{slug or 'node'}-{hashlib.sha256(node_id.encode()).hexdigest()[:6]}"
 
 
-def manifest(node_id: str, labels: Mapping[str, str] | None = None) -> dict[str, Any]:
+def manifest(node_id: str) -> dict[str, Any]:
     """Return the Node of an inventory node; raise RigError if its id is no valid label value."""
     if not _LABEL_VALUE.fullmatch(node_id):
         raise RigError(f"node {node_id!r}: not a label value; use letters, digits, '-', '_', '.'")
@@ -64,7 +62,7 @@ def manifest(node_id: str, labels: Mapping[str, str] | None = None) -> dict[str,
         "kind": "Node",
         "metadata": {
             "name": name,
-            "labels": {**common, **(labels or {}), NODE_ID_LABEL: node_id},
+            "labels": {**common, NODE_ID_LABEL: node_id},
             "annotations": {_FAKE: "fake", "node.alpha.kubernetes.io/ttl": "0"},
         },
         "status": {"capacity": _CAPACITY, "allocatable": _CAPACITY},

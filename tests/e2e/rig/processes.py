@@ -10,14 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import signal
 import subprocess
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -132,10 +129,6 @@ class Processes:
     def pids(self) -> dict[str, int]:
         return {name: process.pid for name, process in self._running.items()}
 
-    def names(self) -> list[str]:
-        """Return all components, in the order of their start."""
-        return list(self._components)
-
     def url(self, name: str) -> str:
         """Return the URL of a component that has one."""
         return self._known(name).url
@@ -155,16 +148,15 @@ class Processes:
         with self.log(component.name).open("ab") as log:
             log.write(f"--- {time.strftime('%H:%M:%S')} {' '.join(component.argv)}\n".encode())
             log.flush()
-            process = _spawner.call(
-                lambda: subprocess.Popen(
-                    argv,
-                    env=environment,
-                    cwd=self._logs,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,
-                )
+            # the kernel also kills the process when this thread ends: start no rig in another
+            process = subprocess.Popen(
+                argv,
+                env=environment,
+                cwd=self._logs,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
             )
         self._running[component.name] = process
         self._started[component.name] = time.monotonic()
@@ -216,38 +208,3 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         while time.monotonic() < deadline:
             os.killpg(process.pid, 0)  # fails once the group is empty
             time.sleep(_POLL_SECONDS / 5)
-
-
-class _Spawner:
-    """Starts every process from one thread that lives as long as this process.
-
-    The kernel kills a child when the *thread* that started it ends. So a rig that a worker thread
-    starts, as with two clusters at once, would lose its processes at the end of that thread.
-    """
-
-    def __init__(self) -> None:
-        self._jobs: queue.Queue[
-            tuple[Callable[[], subprocess.Popen[bytes]], Future[subprocess.Popen[bytes]]]
-        ] = queue.Queue()
-        self._thread: threading.Thread | None = None
-        self._lock = threading.Lock()
-
-    def call(self, job: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Popen[bytes]:
-        with self._lock:
-            if self._thread is None or not self._thread.is_alive():  # not alive after a fork
-                self._thread = threading.Thread(target=self._work, name="rig-spawner", daemon=True)
-                self._thread.start()
-        future: Future[subprocess.Popen[bytes]] = Future()
-        self._jobs.put((job, future))
-        return future.result()
-
-    def _work(self) -> None:
-        while True:
-            job, future = self._jobs.get()
-            try:
-                future.set_result(job())
-            except BaseException as error:
-                future.set_exception(error)
-
-
-_spawner = _Spawner()

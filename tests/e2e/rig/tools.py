@@ -6,8 +6,8 @@ module of its own under `tests/e2e/tools/`, whose `go.sum` covers all dependenci
 The name of a cache entry is a digest of everything that decides the program's bytes. A finished
 entry is renamed into the cache, so each existing entry is complete.
 
-`python -m tests.e2e.rig.tools` builds all programs and prints how long each took. With `--for flux`
-it builds the programs of a rig with Flux.
+`python -m tests.e2e.rig.tools` builds all programs. With `--for flux` it builds the programs of a
+rig with Flux.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from . import gobuild
@@ -76,17 +77,13 @@ TOOLS = {
 }
 
 
-def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> dict[str, Path]:
-    """Return the paths of the named programs, by default of all; build those that the cache lacks.
+def ensure(names: Iterable[str], report: Report | None = None) -> dict[str, Path]:
+    """Return the paths of the named programs; build those that the cache lacks.
 
-    `report` gets lines of progress; by default they go to standard error. Raises RigError if a name
-    is unknown, if Go is missing or too old, or if a build fails.
+    `report` gets lines of progress; by default they go to standard error. Raises RigError if Go is
+    missing or too old, or if a build fails.
     """
-    wanted = list(TOOLS) if names is None else list(names)
-    unknown = sorted(set(wanted) - set(TOOLS))
-    if unknown:
-        raise RigError(f"no such tool: {', '.join(unknown)}; there are {', '.join(TOOLS)}")
-    say = report or _to_stderr
+    wanted, say = list(names), report or _to_stderr
     go = gobuild.Go.find()
     entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], go)}" for name in wanted}
     missing = [name for name in wanted if not entries[name].is_dir()]
@@ -94,8 +91,9 @@ def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> 
         with _turn(cache_root(), say):
             if not entries[name].is_dir():  # another run may have built it while we waited
                 workspace = gobuild.Workspace(cache_root() / f".go-{TOOLS[name].wrapper}")
-                step = _prefixed(say, place, len(missing), name)
-                _build(TOOLS[name], go, entries[name], workspace, step)
+                step = f"[{place}/{len(missing)}] {name}: "
+                report = partial(_say_with, say, step)
+                _build(TOOLS[name], go, entries[name], workspace, report)
                 if TOOLS[name].wrapper not in [TOOLS[other].wrapper for other in missing[place:]]:
                     workspace.remove()
     return {name: entries[name] / name for name in wanted}
@@ -181,23 +179,19 @@ def _build(
 ) -> None:
     staging = Path(tempfile.mkdtemp(prefix=f".building-{tool.name}-", dir=entry.parent))
     try:
-        start = time.monotonic()
-        wrapper = WRAPPERS / tool.wrapper
-        binary = staging / tool.name
+        start, wrapper, binary = time.monotonic(), WRAPPERS / tool.wrapper, staging / tool.name
         go.check(wrapper)
         say("fetching modules")
-        workspace.vendor(go, wrapper, say)
+        workspace.vendor(go, wrapper)
         if tool.crds_of:
             _copy_crds(Path(gobuild.module_folder(go, workspace, tool.crds_of)), staging / "crds")
         workspace.drop_modules()
         gobuild.build(go, tool.package, _flags(tool), binary, workspace, say)
-        seconds = round(time.monotonic() - start, 1)
-        (staging / "build.json").write_text(json.dumps({"tool": tool.name, "seconds": seconds}))
         with binary.open("rb") as written:
             os.fsync(written.fileno())  # otherwise a power cut could leave an empty file
         staging.chmod(0o755)
         staging.rename(entry)
-        say(f"built in {seconds:.0f} s")
+        say(f"built in {time.monotonic() - start:.0f} s")
     finally:
         shutil.rmtree(staging, ignore_errors=True)
 
@@ -212,8 +206,8 @@ def _copy_crds(module: Path, target: Path) -> None:
         (target / source.name).write_bytes(source.read_bytes())  # copies no read-only mode
 
 
-def _prefixed(say: Report, place: int, total: int, name: str) -> Report:
-    return lambda text: say(f"[{place}/{total}] {name}: {text}")
+def _say_with(say: Report, prefix: str, text: str) -> None:
+    say(prefix + text)
 
 
 def _to_stderr(text: str) -> None:
@@ -221,20 +215,14 @@ def _to_stderr(text: str) -> None:
 
 
 def _main() -> int:
-    start = time.monotonic()
-    names = sys.argv[1:]
-    if names and names[0] == "--for":
-        names = needed_with(*names[1:])
+    asked = sys.argv[1:]
     try:
-        paths = ensure(names or None)
+        paths = ensure(needed_with(*asked[1:]) if asked[:1] == ["--for"] else asked or TOOLS)
     except RigError as error:
         print(error, file=sys.stderr)
         return 1
     for name, path in paths.items():
-        seconds = json.loads((path.parent / "build.json").read_text())["seconds"]
-        size = path.stat().st_size / 1e6
-        print(f"{name:24} built in {seconds:7.1f} s  {size:6.1f} MB  {path}")
-    print(f"ready after {time.monotonic() - start:.1f} s")
+        print(f"{name:24} {path}")
     return 0
 
 
