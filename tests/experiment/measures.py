@@ -9,8 +9,8 @@ from functools import lru_cache
 
 from . import fleet
 from .outcome import Formed, Outcome
+from .process_runner import RunningPod
 from .rules import Event
-from .running_pod import RunningPod
 
 STAGES = ("demand", "commit", "pods", "fused")
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from html import escape
 
 from .checks import Check
-from .measures import STAGES, quantiles, running, savings, steps
+from .measures import STAGES, quantiles, running, steps
 from .outcome import Outcome
 from .participants import EGO_DATA
 from .routes import FAR_M
@@ -14,7 +14,7 @@ from .routes import FAR_M
 _COLORS = ("#0b6e99", "#c2571a", "#4b8b3b", "#8a4fa3")
 _WIDTH, _LEFT = 900, 150
 _MOST_ROWS = 8
-"""The plots draw up to this many vehicles one by one; they draw more vehicles as a crowd."""
+"""The timeline has rows for up to this many vehicles, and the map has their names."""
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #222; max-width: 960px; margin: 2em auto; }
 table { border-collapse: collapse; margin: 1em 0; } th, td { padding: .2em .9em .2em 0;
@@ -43,27 +43,24 @@ def plots(outcome: Outcome) -> dict[str, str]:
 def page(outcome: Outcome, checks: Iterable[Check]) -> str:
     settings, images = outcome.settings, plots(outcome)
     poses = f"the poses of {settings.bag}" if settings.bag else f"seed {settings.seed}"
-    title = f"The experiment with {settings.gitops} and {settings.connections}, {poses}"
-    parts = [
-        f"<h1>{escape(title)}</h1>",
-        _summary(outcome),
-        "<h2>What was checked</h2>",
-        _table(("", ""), [(_mark(check), _fault(check)) for check in checks]),
-        "<h2>The routes</h2>",
-        images["map"],
-        "<h2>Who was near, what ran, what arrived</h2>",
-        images["timeline"],
-        f"<p>{_TIMELINE}</p>",
-        "<h2>From an event to its consequences</h2>",
-        images["delays"],
-        f"<p>{_DELAYS}</p>",
-        "<h2>What running on demand saves</h2>",
-        _savings(outcome),
-        "<h2>The demands</h2>",
-        _demands(outcome),
-    ]
-    head = f'<meta charset="utf-8"><title>{escape(title)}</title><style>{_STYLE}</style>'
-    return f'<!doctype html><html lang="en"><head>{head}</head><body>{"".join(parts)}</body></html>'
+    title = escape(f"The experiment with {settings.gitops} and {settings.connections}, {poses}")
+    head = f'<meta charset="utf-8"><title>{title}</title><style>{_STYLE}</style>'
+    rows = "".join(f"<tr><td>{_mark(one)}</td><td>{_fault(one)}</td></tr>" for one in checks)
+    return f"""<!doctype html>
+<html lang="en"><head>{head}</head><body>
+<h1>{title}</h1>
+{_summary(outcome)}
+<h2>What was checked</h2>
+<table>{rows}</table>
+<h2>The routes</h2>
+{images["map"]}
+<h2>Who was near, what ran, what arrived</h2>
+{images["timeline"]}
+<p>{_TIMELINE}</p>
+<h2>From an event to its consequences</h2>
+{images["delays"]}
+<p>{_DELAYS}</p>
+</body></html>"""
 
 
 def _summary(outcome: Outcome) -> str:
@@ -89,12 +86,6 @@ def _mark(check: Check) -> str:
 
 def _fault(check: Check) -> str:
     return escape(check.fault[:2000])
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    top = "".join(f"<th>{cell}</th>" for cell in head) if any(head) else ""
-    body = "".join(f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in rows)
-    return f"<table><tr>{top}</tr>{body}</table>"
 
 
 def _svg(height: float, parts: Iterable[str]) -> str:
@@ -165,10 +156,8 @@ def _timeline(outcome: Outcome) -> str:
         return _LEFT + (min(max(at, outcome.set_off), outcome.over) - outcome.set_off) * scale
 
     rows = [route.vehicle for route in outcome.routes]
-    if len(rows) <= _MOST_ROWS:
-        parts, height = list(_bars(outcome, rows, x)), 24 * len(rows) + 30
-    else:
-        parts, height = list(_crowd(outcome, x)), 130
+    rows = rows if len(rows) <= _MOST_ROWS else []
+    parts, height = list(_bars(outcome, rows, x)), 24 * len(rows) + 30
     counts = list(running(outcome))
     most = max((count for _, count in counts), default=1)
     always = len({pod.service for pod in outcome.pods})
@@ -203,21 +192,6 @@ def _bars(outcome: Outcome, rows: Sequence[str], x: Callable[[float], float]) ->
             )
         for at in outcome.arrivals.get(EGO_DATA.format(vehicle), ())[::2]:
             yield _line(x(at), y + 9, x(at), y + 15, color)
-
-
-def _crowd(outcome: Outcome, x: Callable[[float], float]) -> Iterator[str]:
-    """Yield SVG elements that show how many vehicles were near over time."""
-    count, counts = 0, [(outcome.set_off, 0)]
-    for event in outcome.events:
-        count += 1 if event.joins else -1
-        counts.append((event.at, count))
-    most = max(number for _, number in counts)
-    unit = 90.0 / max(most, 1)
-    path = "".join(f" H{x(at):.1f} V{110 - number * unit:.1f}" for at, number in counts)
-    yield f'<path d="M{_LEFT} 110{path}" fill="none" stroke="{_COLORS[0]}"/>'
-    yield _line(_LEFT, 110, _WIDTH - 20, 110)
-    yield _text(_LEFT - 8, 24, f"{most} at most", "end")
-    yield _text(_LEFT - 8, 106, "vehicles near", "end")
 
 
 def _stays(outcome: Outcome, vehicle: str) -> Iterator[tuple[float, float]]:
@@ -257,30 +231,3 @@ def _delays(outcome: Outcome) -> str:
         parts.append(_line(x, y - 8, x, y + 8, "#b00020"))
         parts.append(_text(_WIDTH - 4, y + 4, f"median {median:.2f} s", "end"))
     return _svg(24 * len(rows) + 16, parts)
-
-
-def _savings(outcome: Outcome) -> str:
-    rows = [
-        (s.name, f"{s.on_demand:.2f} {s.unit}", f"{s.always:.2f} {s.unit}", f"{s.saved:.0%}")
-        for s in savings(outcome)
-    ]
-    caption = (
-        "Means over the drive. Always on means that each service that ran at all runs all the time "
-        "and that all messages of its topics are carried. The initial deployment does not count, "
-        "because it always runs."
-    )
-    return _table(("", "on demand", "always on", "saved"), rows) + f"<p>{caption}</p>"
-
-
-def _demands(outcome: Outcome) -> str:
-    rows = []
-    for step, formed in zip(steps(outcome), outcome.formed, strict=False):
-        held = "<br>".join(
-            f"{escape(row)}: {escape(', '.join(who))}"
-            for row, who in (formed.bookkeeping or {}).items()
-        )
-        if formed.bookkeeping is None:
-            continue
-        at = f"{step.event.at - outcome.set_off:.1f} s"
-        rows.append((at, escape(str(formed)), formed.commit[:10], held or "nothing is demanded"))
-    return _table(("event", "", "commit", "requesters after it"), rows)

@@ -14,9 +14,9 @@ from rosbags.rosbag2 import StoragePlugin
 from examples.experiment import paper
 from tests.experiment import fleet, routes
 from tests.experiment.bags import bag_tracks
+from tests.experiment.process_runner import path_in_pod, program_of, quantity
 from tests.experiment.routes import Way
 from tests.experiment.rules import Event, Near, Pose, causes, events_of, predicted
-from tests.experiment.running_pod import path_in_pod, program_of, quantity
 from tests.kit.bag import write_bag
 
 NEAR = Near.read()

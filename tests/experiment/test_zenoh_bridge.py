@@ -15,7 +15,7 @@ import rclpy
 from std_msgs.msg import String
 
 from tests.e2e.rig.net import free_port
-from tests.experiment.standins.image import image
+from tests.experiment.standins import image
 from tests.kit.generator import wait_until
 from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import reserved

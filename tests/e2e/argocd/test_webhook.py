@@ -37,13 +37,12 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
         ]
         for namespace, rules in documented_roles("argocd").items()
     }
-    access_file(
-        made.folder,
-        CLUSTER,
-        kubeconfig=limited(rig.kube, rig.kubeconfig, made.folder, rights),
-        webhook=f"{rig.url(SERVER)}/api/webhook",
-        secret_file=secret,
-    )
+    access = {
+        "kubeconfig": limited(rig.kube, rig.kubeconfig, made.folder, rights),
+        "webhook": f"{rig.url(SERVER)}/api/webhook",
+        "secret_file": secret,
+    }
+    access_file(made.folder, {CLUSTER: access})
     restart_generator(made, TIMEOUT_S)
     return made
 

@@ -16,11 +16,11 @@ _ACCOUNT = "generator"
 _STATUS_PAGE = Path(__file__).parents[3] / "docs" / "status.md"
 
 
-def access_file(folder: Path, cluster: str, **connection: object) -> Path:
-    """Write the file for ``--clusters`` with access to one cluster; return the file's path."""
+def access_file(folder: Path, clusters: Mapping[str, Mapping[str, object]]) -> Path:
+    """Write the file for ``--clusters`` with access to these clusters; return the file's path."""
     file = folder / "clusters.yaml"
-    clusters = {cluster: {key: str(value) for key, value in connection.items()}}
-    content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": clusters}
+    access = {name: {key: str(one[key]) for key in one} for name, one in clusters.items()}
+    content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": access}
     file.write_text(yaml.safe_dump(content))
     return file
 

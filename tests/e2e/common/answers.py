@@ -61,7 +61,7 @@ def limited_world(world: World, rig: Rig) -> World:
     world.bootstrap(CLUSTER, rig)
     rights = documented_roles(rig.gitops)
     kubeconfig = limited(rig.kube, rig.kubeconfig, world.folder, rights)
-    access_file(world.folder, CLUSTER, kubeconfig=kubeconfig)
+    access_file(world.folder, {CLUSTER: {"kubeconfig": kubeconfig}})
     restart_generator(world, TIMEOUT_S)
     return world
 

@@ -37,7 +37,7 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
     made = make_world()
     domain = made.bootstrap(CLUSTER, rig, interval="10m")
     kubeconfig = limited(rig.kube, rig.kubeconfig, made.folder, {domain.namespace: RIGHTS})
-    file = access_file(made.folder, CLUSTER, kubeconfig=kubeconfig)
+    file = access_file(made.folder, {CLUSTER: {"kubeconfig": kubeconfig}})
     made.generator.start("--clusters", str(file))
     return made
 
