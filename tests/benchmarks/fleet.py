@@ -7,10 +7,13 @@ makes the claims and the rendered files.
 
 from __future__ import annotations
 
+import json
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pygit2
@@ -22,12 +25,15 @@ from demandops.model.config.load import load
 from demandops.model.ledger import claim_file
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.history import commit_message
+from demandops.serve.generator import Generator
+from rich.console import Console
 from rich.table import Table
 
 from tests.kit import goals
 from tests.kit.config import configuration, state_of
 from tests.kit.repo import write_tree
 
+BUILD = Path("build")
 VEHICLES_PER_EDGE = 10
 RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
 
@@ -166,14 +172,36 @@ def _lay_down(
     return len(config.nodes) - len(config.hosts)
 
 
-def table(title: str, rows: Sequence[Mapping[str, object]]) -> Table:
-    """Return figures as a table for people; the columns are the keys of the first row."""
-    made = Table(title=title)
-    for column in rows[0]:
-        made.add_column(column.replace("_", " "), justify="right")
-    for row in rows:
-        made.add_row(*map(_cell, row.values()))
-    return made
+def costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
+    """Carry out a goal; return its wall-clock seconds and its CPU seconds."""
+    start, worked = time.perf_counter(), time.process_time()
+    generator.submit(goal).future.result()
+    return time.perf_counter() - start, time.process_time() - worked
+
+
+def workspace() -> TemporaryDirectory[str]:
+    """Return a folder for state repos, on the disk of the checkout."""
+    BUILD.mkdir(exist_ok=True)
+    return TemporaryDirectory(prefix="bench-", dir=BUILD)
+
+
+def report(name: str, **tables: Sequence[Mapping[str, object]]) -> None:
+    """Print figures as tables by their titles, and write them to ``build/<name>.json``.
+
+    The columns of a table are the keys of its first row.
+    """
+    out = Console(highlight=False)
+    for title, rows in tables.items():
+        made = Table(title=title)
+        for column in rows[0]:
+            made.add_column(column.replace("_", " "), justify="right")
+        for row in rows:
+            made.add_row(*map(_cell, row.values()))
+        out.print(made)
+    BUILD.mkdir(exist_ok=True)
+    file = BUILD / f"{name}.json"
+    file.write_text(json.dumps(tables, indent=2) + "\n")
+    out.print(f"written to {file}")
 
 
 def _cell(value: object) -> str:

@@ -2,14 +2,11 @@
 
 300 vehicles join at 30 intersections. One command reads all joins from a file, and each join
 becomes a commit. A second command books a single demand, which shows what the start costs. The two
-commands take turns, each on a fresh repo. The benchmark prints a table and writes
-``build/request.json``.
+commands take turns, each on a fresh repo.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import resource
 import statistics
@@ -17,11 +14,8 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import yaml
-from rich.console import Console
-from rich.progress import Progress
 
 from tests.benchmarks import fleet
 from tests.kit.repo import NO_GIT_CONFIG, commits
@@ -56,20 +50,12 @@ def _seconds(folder: Path, demands: int) -> tuple[float, float]:
     return seconds, worked
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
-    parser.add_argument("--rounds", type=int, default=ROUNDS)
-    parser.add_argument("--output", type=Path, default=Path("build/request.json"))
-    args = parser.parse_args()
-    args.output.parent.mkdir(parents=True, exist_ok=True)
-    out = Console(highlight=False)
+def main() -> None:
     sizes = (1, INTERSECTIONS * VEHICLES)
     times: dict[int, list[tuple[float, float]]] = {size: [] for size in sizes}
-    with Progress(console=out, transient=True) as progress:
-        for _ in progress.track(range(args.rounds), description="booking 300 demands"):
-            for size in sizes:
-                with TemporaryDirectory(prefix="request-", dir=args.output.parent) as folder:
-                    times[size].append(_seconds(Path(folder), size))
+    for size in sizes * ROUNDS:
+        with fleet.workspace() as folder:
+            times[size].append(_seconds(Path(folder), size))
     (one, one_cpu), (many, many_cpu) = (
         map(statistics.median, zip(*times[size], strict=True)) for size in sizes
     )
@@ -82,11 +68,8 @@ def main() -> int:
         "start_cpu_s": one_cpu,
         "all_cpu_s": many_cpu,
     }
-    out.print(fleet.table("Demands through `demandops request`", [row]))
-    args.output.write_text(json.dumps({"rows": [row], "seconds": times}, indent=2) + "\n")
-    out.print(f"written to {args.output}")
-    return 0
+    fleet.report("request", **{"Demands through `demandops request`": [row]})
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()
