@@ -43,7 +43,6 @@ def lay_down(folder: Path) -> Path:
 
 
 def timed(what: str, call: Callable[[], object]) -> None:
-    """Print ``what``, how many seconds ``call`` takes, and what ``call`` returns."""
     start = time.perf_counter()
     found = call()
     print(f"{what:<60} {time.perf_counter() - start:8.2f} s  {found}")

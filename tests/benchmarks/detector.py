@@ -133,7 +133,6 @@ def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
 
 
 def cpu(pid: int) -> float:
-    """Return the seconds of processor time that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

@@ -173,7 +173,6 @@ def _lay_down(
 
 
 def costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
-    """Carry out a goal; return its wall-clock seconds and its CPU seconds."""
     start, worked = time.perf_counter(), time.process_time()
     generator.submit(goal).future.result()
     return time.perf_counter() - start, time.process_time() - worked

@@ -25,7 +25,6 @@ ROUNDS = 5
 
 
 def _seconds(folder: Path, demands: int) -> tuple[float, float]:
-    """Book demands in a fresh repo by one command; return the command's seconds and CPU seconds."""
     laid = fleet.lay_down_idle(folder / "state-repo.git", INTERSECTIONS, VEHICLES)
     goals = [
         fleet.goal(fleet.edge_id(edge), fleet.vehicle_id(edge, vehicle))

@@ -44,7 +44,6 @@ def say(request: pytest.FixtureRequest) -> Report:
 
 @pytest.fixture(scope="session")
 def ros_domain() -> Iterator[int]:
-    """A ROS domain that only this process uses."""
     with reserved() as domain:
         yield domain
 
@@ -103,7 +102,6 @@ def edge_is_full(rig: Rig) -> Iterator[Callable[[], None]]:
 
 @pytest.fixture(scope="module")
 def neighbour(rig: Rig) -> Iterator[Any]:
-    """A namespace that belongs to no access domain."""
     rig.kube.apply(build_manifest("v1", "Namespace", NEIGHBOUR))
     # Kubernetes creates the service account and the ConfigMap
     rig.kube.wait("the account", lambda: rig.kube.get("ServiceAccount", "default", NEIGHBOUR))

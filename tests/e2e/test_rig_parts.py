@@ -73,7 +73,6 @@ def test_two_runs_at_once_build_once(runs: Path, monkeypatch: pytest.MonkeyPatch
 
 @contextmanager
 def killed(program: str) -> Iterator[subprocess.Popen[str]]:
-    """Run a program in another Python, and kill it after the block."""
     argv = [sys.executable, "-c", program]
     run = subprocess.Popen(argv, cwd=ROOT, stdout=subprocess.PIPE, text=True)
     try:

@@ -45,7 +45,6 @@ def _settings() -> Settings:
 
 
 def main() -> int:
-    """Run the experiment and write its report; return 0 if all checks pass, else 1."""
     settings = _settings()
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     folder = ROOT / "build" / "experiment"

@@ -43,8 +43,6 @@ Say = Callable[[str], None]
 
 
 class Experiment:
-    """A run of the experiment; it starts its parts one after the other."""
-
     def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
         self._settings, self._folder, self._say = settings, folder, say
         self._near, self._routes = Near.read(), settings.routes()
@@ -111,7 +109,6 @@ class Experiment:
         self._detect(fleet.rules(self._settings.connections))
 
     def _start_participants(self, station_cloud: str, *, poses_only: bool = False) -> None:
-        """Start the participants, which stand at first, and wait until they publish."""
         record, file = str(self._folder / "poses.jsonl"), self._folder / "plan.json"
         seed, origin = self._settings.seed, self._near.point
         plan = Plan(self._routes, origin, self._domains, seed, record, station_cloud, poses_only)
@@ -120,7 +117,6 @@ class Experiment:
         assert self._read()["ready"]
 
     def _detect(self, rules: str) -> None:
-        """Start the detector in the cloud, and wait until it is ready."""
         file = self._folder / "rules.yaml"
         file.write_text(rules)
         options = ["detect", str(file)]
@@ -223,7 +219,6 @@ class Experiment:
         return any(at >= event.at and own & set(seen) for at, seen in list(self._edge.tracks))
 
     def _runs(self, event: Event) -> bool:
-        """Return whether a client is running for the vehicle's connection to the edge."""
         carrier = self._settings.connections
         running = [pod for pod in list(self._runner.pods.values()) if pod.ended is None]
         return any(fleet.is_client(pod.service, event.vehicle, carrier) for pod in running)
@@ -241,7 +236,6 @@ class Experiment:
         return self._world.domain.lines()
 
     def _wait_until_as_before(self, seconds: float) -> None:
-        """Wait until the clusters have exactly the objects from before the first demand."""
         if not self._reaches(lambda: self._lines() == self._before, seconds):
             lines = self._lines()
             stays, lacks = sorted(lines - self._before), sorted(self._before - lines)

@@ -80,7 +80,6 @@ def rules(carrier: Carrier) -> str:
 
 
 def station_cloud(carrier: Carrier) -> str:
-    """Return the topic on which the station publishes its point cloud."""
     return STATION_CLOUD if carrier == "mqtt" else STATION_CLOUD_TARGET
 
 

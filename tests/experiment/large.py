@@ -43,8 +43,6 @@ class PodWatch(ProcessRunner):
 
 
 class LargeExperiment(Experiment):
-    """A run of the larger experiment; it starts its parts one after the other."""
-
     def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
         super().__init__(settings, folder, say)
         self._crossings = crowd.crossings(self._near)

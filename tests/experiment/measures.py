@@ -74,7 +74,6 @@ def _pods_of(outcome: Outcome, event: Event) -> list[RunningPod]:
 
 
 def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | None:
-    """Return the time at which the fusion first published a position of the vehicle, or None."""
     places = {
         (pose.x, pose.y)
         for pose in outcome.poses
@@ -156,7 +155,6 @@ def running(outcome: Outcome) -> Iterator[tuple[float, int]]:
 
 @lru_cache
 def quantiles(values: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return the minimum, the median and the maximum."""
     ordered = sorted(values)
     middle = len(ordered) // 2
     median = ordered[middle] if len(ordered) % 2 else sum(ordered[middle - 1 : middle + 1]) / 2

@@ -39,7 +39,6 @@ class Observer:
         self.arrivals: dict[str, list[float]] = defaultdict(list)
 
     def watch(self, kind: Any, topic: str) -> None:
-        """Record in `arrivals` when messages of a topic arrive."""
         arrived = self.arrivals[topic]
         self.node.create_subscription(kind, topic, lambda _: arrived.append(time.time()), 10)
 

@@ -58,8 +58,6 @@ class Formed:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The settings and all observations of a run; times are seconds since 1970."""
-
     settings: Settings
     routes: tuple[Way, ...]
     near: Near

@@ -31,7 +31,7 @@ from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from . import clouds
-from .routes import STATION, VEHICLES, Route, Track
+from .routes import STATION, VEHICLES, Route, Track, Way
 
 POSE = "/vehicles/{}/pose"
 EGO_DATA = "/vehicles/{}/ego_data"
@@ -57,7 +57,7 @@ class Plan:
     one ROS node in the cloud's domain sends all poses, and nothing else is sent.
     """
 
-    routes: tuple[Route | Track, ...]
+    routes: tuple[Way, ...]
     origin: tuple[float, float]
     domains: dict[str, int]
     seed: int
@@ -66,13 +66,11 @@ class Plan:
     poses_only: bool = False
 
     def write(self, file: Path) -> None:
-        """Write the plan to a file that the program can read."""
         routes = [vars(route) for route in self.routes]
         file.write_text(json.dumps(vars(self) | {"routes": routes}))
 
     @classmethod
     def read(cls, file: Path) -> Plan:
-        """Return the plan that :meth:`write` wrote to a file."""
         data = json.loads(file.read_text())
         routes = tuple(
             Track(**route) if "points" in route else Route(**route) for route in data.pop("routes")
@@ -108,8 +106,6 @@ class Participant:
 
 
 class Participants:
-    """All participants, and the time since the vehicles set off."""
-
     def __init__(self, plan: Plan) -> None:
         self._plan, self._chance = plan, random.Random(plan.seed)
         names = (*(route.vehicle for route in plan.routes), STATION)
@@ -124,7 +120,6 @@ class Participants:
         self._ticks = 0
 
     def tick(self) -> None:
-        """Publish what each participant sends now."""
         now, elapsed = time.time(), self._pass_time()
         self._ticks += 1
         if self._plan.poses_only and self._ticks % TICKS_PER_POSE_OF_MANY:

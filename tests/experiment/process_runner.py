@@ -75,7 +75,6 @@ class RunningPod:
 
     @property
     def node(self) -> str:
-        """The name of the cluster node on which the pod runs."""
         return str(self.manifest["spec"]["nodeName"])
 
     def requests(self) -> tuple[float, float]:
@@ -104,7 +103,6 @@ _UNITS = {"m": 1e-3, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
 
 
 def quantity(text: str) -> float:
-    """Return a Kubernetes quantity, such as `250m` or `1Gi`, as a number."""
     for unit, factor in _UNITS.items():
         if text.endswith(unit):
             return float(text.removesuffix(unit)) * factor
@@ -259,7 +257,6 @@ class ProcessRunner:
                         self._fill(pod, volume)
 
     def _kubeconfig(self, account: Path) -> Path:
-        """Write a kubeconfig with the token of the pod's account; return its path."""
         server = self._kube.api.configuration.host
         config: dict[str, Any] = {"apiVersion": "v1", "kind": "Config", "current-context": "c"}
         for part, content in {

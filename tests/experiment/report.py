@@ -30,7 +30,6 @@ _TEMPLATES = Environment(
 
 
 def plots(outcome: Outcome) -> dict[str, str]:
-    """Return the plots as SVG texts, by their names."""
     draw: Any = _TEMPLATES.get_template("plots.svg.j2").module
     return {
         "map": draw.map(**_map(outcome)),

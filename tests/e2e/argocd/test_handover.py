@@ -25,7 +25,6 @@ SUSPENDED = {"spec": {"suspend": True}}
 
 @pytest.fixture(scope="module")
 def both(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
-    """A cluster with Flux and Argo CD."""
     rig = Rig("both", gitops="flux", beside="argocd", nodes=NODES, report=say)
     with running(rig, request.session):
         yield rig
@@ -68,7 +67,6 @@ def test_every_pod_stays_there_and_back(
 
 
 def from_flux(domain: FluxDomain) -> None:
-    """Suspend the Flux objects that would otherwise remove the releases."""
     for kind in ("Kustomization", "HelmRelease"):
         for item in domain.find(kind):
             domain.kube.patch(kind, name_of(item), SUSPENDED, domain.namespace)
@@ -89,7 +87,6 @@ def upgrade(world: World, gitops: str) -> str:
 
 
 def to_argocd(world: World) -> Domain:
-    """Render the state repo for Argo CD, apply its bootstrap file, and demand step 2."""
     upgraded = upgrade(world, "argocd")
     manifests = world.manifests(CLUSTER)
     world.apply(world.rig.kube, manifests)
@@ -130,7 +127,6 @@ def forget_argocd(domain: Domain) -> None:
 
 
 def to_flux(world: World) -> None:
-    """Render the state repo for Flux, demand step 4, and apply the bootstrap file of Flux."""
     upgrade(world, "flux")
     world.demand(expected.demand(4))
     world.bootstrap(CLUSTER, world.rig)

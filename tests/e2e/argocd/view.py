@@ -91,7 +91,6 @@ class Domain(Namespace):
         self._refresh(self.name)
 
     def _refresh(self, name: str) -> None:
-        """Refresh one Application now, and wait until Argo CD has done so."""
         home = self._home(name)
         body = {"metadata": {"annotations": {_REFRESH: "normal"}}}
         self.kube.patch("Application", name, body, home)

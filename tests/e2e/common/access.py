@@ -17,7 +17,6 @@ _STATUS_PAGE = Path(__file__).parents[3] / "docs" / "status.md"
 
 
 def access_file(folder: Path, clusters: Mapping[str, Mapping[str, object]]) -> Path:
-    """Write the file for ``--clusters`` with access to these clusters; return the file's path."""
     file = folder / "clusters.yaml"
     access = {name: {key: str(one[key]) for key in one} for name, one in clusters.items()}
     content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": access}

@@ -38,7 +38,6 @@ _POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 
 
 def ego(vehicle: str) -> dict[str, str]:
-    """Return the ego data of a vehicle as an input of the fusion."""
     return {"topic": f"/vehicles/{vehicle}/ego_data", "source": vehicle}
 
 
@@ -72,14 +71,12 @@ def world(make_world: Callable[[], World], rig: Rig) -> World:
 
 
 def restart_generator(world: World, timeout_s: float) -> None:
-    """Restart the generator with a time-out for its answers."""
     world.generator.stop()
     file = str(world.folder / "clusters.yaml")
     world.generator.start("--clusters", file, "--ros-args", "-p", f"answer_timeout:={timeout_s}")
 
 
 def unavailable(domain: Namespace) -> list[str]:
-    """Return the Deployments that lack available replicas now."""
     return [
         name_of(item)
         for item in domain.find("Deployment")

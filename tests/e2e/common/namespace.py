@@ -68,7 +68,6 @@ class Namespace:
     # --- reading ----------------------------------------------------------------------------
 
     def get(self, kind: str, name: str) -> Manifest:
-        """Return an object that must exist."""
         found = self.kube.get(kind, name, self.namespace)
         assert found is not None, f"{kind} {self.namespace}/{name} does not exist"
         return found
@@ -172,7 +171,6 @@ class Namespace:
         """Make the controller read a release's chart again, if it does not do so by itself."""
 
     def take_away(self, kind: str, name: str) -> None:
-        """Delete an object that the controller restores."""
         self.kube.delete(kind, name, self.namespace)
 
     def restore(self, *releases: str) -> None:
@@ -188,7 +186,6 @@ class Namespace:
         return self._wait_same(self.lines, wanted)
 
     def wait_inventory(self, wanted: frozenset[str]) -> None:
-        """Wait until `inventory` returns exactly the wanted objects."""
         self._wait_same(self.inventory, wanted)
 
     def wait_refused(self, why: str, *releases: str) -> None:
@@ -220,7 +217,6 @@ class Namespace:
     # --- inside -----------------------------------------------------------------------------
 
     def _all_counted(self) -> bool:
-        """Return whether each Deployment and ReplicaSet reports all wanted pods as available."""
         return all(
             status.get("observedGeneration") == item["metadata"]["generation"]
             and status.get(counted, 0) == item["spec"]["replicas"]
@@ -278,7 +274,6 @@ def wait_for_pods(wanted: Mapping[Namespace, Pods]) -> None:
 
 
 def fusion_inputs(config: Manifest) -> list[str]:
-    """Return the fusion's input topics from its ConfigMap."""
     (parameters,) = yaml.safe_load(config["data"]["params.yml"]).values()
     inputs = parameters["ros__parameters"]["additional_inputs"]
     return [topic for topic in inputs["topics_egodata"] + inputs["topics_objectlist"] if topic]

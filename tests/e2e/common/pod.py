@@ -60,7 +60,6 @@ class Pod:
 
     @property
     def code(self) -> int | None:
-        """The exit code of the process; None while it runs."""
         return self._process.poll()
 
     def start(self) -> None:
@@ -106,12 +105,10 @@ class Pod:
         return self.log.read_bytes()[self._start :].decode(errors="replace")
 
     def kill(self) -> None:
-        """Kill the container, as if its cluster node had died."""
         self._process.kill()
         self._process.wait(10)
 
     def stop(self) -> int:
-        """Send the container a SIGTERM, wait for its end, and return its exit code."""
         self._process.send_signal(signal.SIGTERM)
         return self._process.wait(self.manifest["spec"]["terminationGracePeriodSeconds"])
 

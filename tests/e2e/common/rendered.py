@@ -17,7 +17,6 @@ ARGOCD = "argocd-"  # the prefix of the cases for Argo CD
 
 
 def golden(gitops: Gitops) -> Iterator[Manifest]:
-    """Yield the distinct manifests of all golden cases for one controller."""
     seen: set[str] = set()
     cases = sorted(case for case in CASES if case.startswith(ARGOCD) == (gitops == "argocd"))
     for folder in ("bootstrap/", "clusters/"):

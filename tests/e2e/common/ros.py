@@ -16,8 +16,6 @@ from tests.kit.ros import Sent
 
 
 class Client(ros.Client):
-    """Sends goals to the node of one ROS domain."""
-
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
         self._over = threading.Event()

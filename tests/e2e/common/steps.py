@@ -100,7 +100,6 @@ def change_image(namespace: Namespace, deployment: str) -> None:
 
 
 def overwrite(namespace: Namespace, config: str, key: str) -> None:
-    """Overwrite the only entry of a ConfigMap."""
     namespace.kube.patch("ConfigMap", config, {"data": {key: "by hand"}}, namespace.namespace)
     assert namespace.get("ConfigMap", config)["data"] == {key: "by hand"}
 

@@ -42,8 +42,6 @@ _READY = "taking demands on"
 
 
 class Generator:
-    """A `demandops serve` process that a test can kill and start again."""
-
     def __init__(self, state_repo: str, folder: Path, ros_domain: int, client: Client) -> None:
         self.log = folder / "generator.log"
         self._client = client
@@ -123,7 +121,6 @@ class World:
         return domain
 
     def manifests(self, cluster: str) -> list[Manifest]:
-        """Return the manifests of a cluster's bootstrap file."""
         return list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
 
     def apply(self, kube: Kube, manifests: list[Manifest]) -> None:
@@ -139,7 +136,6 @@ class World:
         ]
 
     def remove_wide(self) -> None:
-        """Remove the cluster-wide objects that :meth:`apply` made."""
         for kube, item in self._wide:
             kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
         self._wide.clear()
@@ -166,7 +162,6 @@ class World:
         return (self.person.folder / path).read_text()
 
     def tip(self) -> str:
-        """Return the newest commit on the remote's main branch."""
         self._pull()
         return self.person.git("rev-parse", "HEAD")
 
@@ -175,7 +170,6 @@ class World:
         return self.person.git("show", "--name-only", "--format=", commit).split()
 
     def commits_since(self, commit: str) -> int:
-        """Return how many commits the remote has after a commit."""
         self._pull()
         return int(self.person.git("rev-list", "--count", f"{commit}..HEAD"))
 
@@ -247,7 +241,6 @@ def running(rig: Rig, session: pytest.Session) -> Iterator[Rig]:
 
 
 def demandops(folder: Path, *arguments: str) -> str:
-    """Run a command of `demandops` with its data in `folder` and return its output."""
     command = [sys.executable, "-m", "demandops.cli.main", *arguments]
     done = subprocess.run(
         command, env=environment(folder), cwd=folder, capture_output=True, text=True, check=False

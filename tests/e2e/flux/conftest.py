@@ -14,7 +14,6 @@ from tests.e2e.rig.tools import Report
 
 @pytest.fixture(scope="session")
 def rig(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
-    """A cluster with a fake node for each node of the skeleton's inventory."""
     cluster = Rig(CLUSTER, gitops="flux", nodes=NODES, report=say)
     with running(cluster, request.session):
         yield cluster

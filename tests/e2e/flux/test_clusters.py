@@ -33,7 +33,6 @@ def fleet(rig: Rig, request: pytest.FixtureRequest, say: Report) -> Iterator[Rig
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig, fleet: Rig) -> Iterator[World]:
-    """A state repo that both clusters follow. It puts the vehicles into the second cluster."""
     made = make_world()
     clusters = yaml.safe_load(made.file(CLUSTERS))
     clusters["clusters"].append({"name": FLEET})
@@ -110,7 +109,6 @@ def follow(world: World, commit: str, step: int) -> None:
 
 
 def pulls(world: World, fleet: Rig) -> int:
-    """Return how often the vehicles' cluster has pulled the state repo."""
     return fleet.log("git").read_text().count(f'"POST /{world.name}/git-upload-pack ')
 
 

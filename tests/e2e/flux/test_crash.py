@@ -43,7 +43,6 @@ def helm_at_work(world: World, goal: dict[str, Any]) -> None:
 
 
 def helm_at_uninstall(world: World, goal: dict[str, Any]) -> None:
-    """Kill helm-controller as soon as the Kustomization has deleted the releases."""
     sent = world.demand(goal)
     world.domain.wake()
     world.domain.wait_applied(sent.commit)
@@ -51,7 +50,6 @@ def helm_at_uninstall(world: World, goal: dict[str, Any]) -> None:
 
 
 def kustomize(world: World, goal: dict[str, Any]) -> None:
-    """Kill kustomize-controller as soon as there is a new commit to apply."""
     sent = world.demand(goal)
     world.domain.wake()
     world.domain.wait_fetched(sent.commit)
@@ -59,7 +57,6 @@ def kustomize(world: World, goal: dict[str, Any]) -> None:
 
 
 def source(world: World, goal: dict[str, Any]) -> None:
-    """Tell source-controller to fetch, and kill it at once."""
     world.demand(goal)
     world.domain.wake()
     killed(world, "source-controller")

@@ -139,7 +139,6 @@ class Deployed:
         return dict(found.get("spec") or {})
 
     def subjects(self) -> str:
-        """Return the subject lines of all commits on main, newest first."""
         return git(self.repository, "log", "--format=%s", "main")
 
     def close(self) -> None:
@@ -173,7 +172,6 @@ def deployed(
 
 @pytest.fixture
 def active(deployed: Deployed) -> Pod:
-    """The pod that is the leader."""
     (pod,) = [pod for pod in deployed.pods if _leads(pod)]
     return pod
 

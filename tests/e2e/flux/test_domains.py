@@ -52,7 +52,6 @@ def test_a_foreign_namespace_is_refused_and_nothing_else_of_the_commit_is_applie
 
 
 def release(**spec: Any) -> Manifest:
-    """Return a HelmRelease of the detection's chart that targets the neighbour's namespace."""
     spec = {"interval": "10m", "chartRef": CHART, "targetNamespace": NEIGHBOUR, **spec}
     return build_manifest(
         "helm.toolkit.fluxcd.io/v2", "HelmRelease", "foreign", "perception", spec=spec

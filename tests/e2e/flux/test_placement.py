@@ -73,7 +73,6 @@ def application(id: str, vehicle: str) -> dict[str, Any]:
 
 
 def fused(id: str, vehicle: str, node: str, *, delivered: bool = False) -> Pods:
-    """Return the expected pods of an application."""
     ways = [(vehicle, node), *([(node, vehicle)] if delivered else [])]
     clients = {
         (f"mqtt-derived-{source}-{target}-{side}", end)

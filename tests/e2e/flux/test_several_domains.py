@@ -43,7 +43,6 @@ CITYS = {
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig, ros_domain: int) -> Iterator[World]:
-    """A state repo with two access domains and no demand, which the cluster follows."""
     made = make_world()
     made.push(two_domains(made))
     made.generator.start()
@@ -133,7 +132,6 @@ def granted(where: Domain, *, of: Domain) -> set[str]:
 
 
 def ros_domains(domain: Domain) -> set[int]:
-    """Return the ROS domains of all containers in an access domain."""
     return {
         int(variable["value"])
         for deployment in domain.find("Deployment")

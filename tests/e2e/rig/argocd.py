@@ -52,7 +52,6 @@ def prerequisites() -> list[Manifest]:
 
 
 def components(binaries: dict[str, Path], folder: Path, kubeconfig: Path) -> list[Component]:
-    """Return Redis and the components of Argo CD."""
     redis, repo_server, server_port, data = free_port(), free_port(), free_port(), folder / "argocd"
     data.mkdir(parents=True, exist_ok=True)
     cache = f"--redis={LOOPBACK}:{redis}"

@@ -117,14 +117,12 @@ class Rig:
                 self._clear(work, failed)
 
     def check(self) -> None:
-        """Raise RigError if a part has died without being stopped."""
         if self._processes is not None:
             self._processes.check()
 
     # --- what tests use ---------------------------------------------------------------------
 
     def git_url(self, repository: str) -> str:
-        """Return the URL by which the cluster reads a repository (`state.git`)."""
         return f"{self._git_url}/{repository}"
 
     def push_url(self, repository: str) -> str:
@@ -132,13 +130,11 @@ class Rig:
         return f"{self._push_url}/{repository}"
 
     def repository(self, name: str) -> Path:
-        """Return the folder of a bare repository on this disk."""
         work = (self._git_of or self)._work
         assert work is not None and not self.existing
         return work.repositories / name
 
     def helm(self, *arguments: str) -> str:
-        """Run the helm command on this cluster and return what it prints."""
         helm = self.helm_program()
         # The kubeconfig of an existing cluster may call a login command that needs the environment.
         clean = self._work.environment() if self._work and not self.existing else dict(os.environ)
@@ -171,7 +167,6 @@ class Rig:
         self._own().kill(component)
 
     def stop_component(self, component: str) -> None:
-        """Ask a component to end, and kill it if it does not end."""
         self._own().stop(component)
 
     def start_component(self, component: str) -> None:

@@ -87,7 +87,6 @@ class ControlPlane:
         return Component("kube-controller-manager", tuple(argv), probe)
 
     def scheduler(self, kubeconfig: Path) -> Component:
-        """Return the scheduler, which evaluates node selectors."""
         port = free_port()
         program = str(self.binaries["kube-scheduler"])
         argv = [program, f"--kubeconfig={kubeconfig}", *self._serving(port)]

@@ -22,12 +22,10 @@ CONTROLLERS = ("source-controller", "kustomize-controller", "helm-controller")
 
 
 def prerequisites() -> list[Manifest]:
-    """Return the manifests that must exist before the controllers start."""
     return [{"apiVersion": "v1", "kind": "Namespace", "metadata": {"name": NAMESPACE}}]
 
 
 def components(binaries: dict[str, Path], folder: Path, kubeconfig: Path) -> list[Component]:
-    """Return the three controllers."""
     storage = folder / "artifacts"
     storage.mkdir(parents=True, exist_ok=True)
     artifacts = f"{LOOPBACK}:{free_port()}"

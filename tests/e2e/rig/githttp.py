@@ -44,8 +44,6 @@ _CONFIGURATION = {
 
 
 class GitServer(ThreadingHTTPServer):
-    """Serves all repositories below a folder."""
-
     daemon_threads = True
     request_queue_size = 128
 
@@ -81,8 +79,6 @@ def _environment(root: Path) -> dict[str, str]:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers git's requests with `git http-backend`."""
-
     protocol_version = "HTTP/1.1"  # with 1.0 a client that sends "Expect: 100-continue" would wait
     server: GitServer
 
@@ -217,7 +213,6 @@ class Handler(BaseHTTPRequestHandler):
 
 
 def init_bare(repository: Path, git: str = "git") -> None:
-    """Create an empty bare repository whose default branch is `main`."""
     repository.parent.mkdir(parents=True, exist_ok=True)
     subprocess.run(
         [git, "init", "--quiet", "--bare", "--initial-branch=main", str(repository)],

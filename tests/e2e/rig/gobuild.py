@@ -74,7 +74,6 @@ class Workspace:
         return self.folder / "wrapper"
 
     def go(self, go: Go, *arguments: str) -> str:
-        """Run a command of Go in the copy of the wrapper, and return what it prints."""
         argv = launch.command(go.program, *arguments, niceness=19)
         own = {"GOMODCACHE": "modules", "GOCACHE": "compiled", "GOTMPDIR": ""}
         return _run(argv, self.module, {key: str(self.folder / own[key]) for key in own})
@@ -94,7 +93,6 @@ class Workspace:
         (self.module / "fetched").rename(self.module / "vendor")
 
     def drop_modules(self) -> None:
-        """Remove the downloaded modules; the vendor folder has what the build needs."""
         shutil.rmtree(self.folder / "modules", ignore_errors=True)
 
     def remove(self) -> None:
@@ -104,7 +102,6 @@ class Workspace:
 def build(
     go: Go, package: str, flags: list[str], target: Path, workspace: Workspace, report: Report
 ) -> None:
-    """Build `package` from the workspace's vendor folder into the file `target`."""
     flags = ["-mod=vendor", *flags]
     packages = workspace.go(go, "list", *flags, "-deps", package).split()
     # Go keeps a second copy of what a command compiles until the command ends. So each command

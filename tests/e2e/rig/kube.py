@@ -148,7 +148,6 @@ class Kube:
         return list(review["status"]["resourceRules"])
 
     def reconcile(self, kind: str, name: str, namespace: str) -> None:
-        """Trigger a reconcile of an object by Flux."""
         annotations = {"reconcile.fluxcd.io/requestedAt": f"{time.time():.6f}"}
         self.patch(kind, name, {"metadata": {"annotations": annotations}}, namespace)
 
@@ -171,7 +170,6 @@ class Kube:
             time.sleep(_POLL_SECONDS)
 
     def wait_ready(self, kind: str, name: str, namespace: str = "") -> None:
-        """Wait until an object's newest generation is Ready."""
         last = "does not exist"
 
         def ready() -> bool:

@@ -65,8 +65,6 @@ def answers(port: int, path: str, authority: Path | None = None) -> Probe:
 
 
 def accepts(port: int) -> Probe:
-    """Return a probe that checks that the port accepts connections."""
-
     def probe() -> str | None:
         try:
             socket.create_connection((LOOPBACK, port), timeout=5).close()

@@ -99,7 +99,6 @@ class Processes:
                 raise RigError(self._with_log(name, ended))
 
     def stop(self, name: str) -> None:
-        """Ask a component to end, if it runs, and kill it if it does not end."""
         self._known(name)
         self._stop_batch([name])
 
@@ -130,7 +129,6 @@ class Processes:
         return {name: process.pid for name, process in self._running.items()}
 
     def url(self, name: str) -> str:
-        """Return the URL of a component that has one."""
         return self._known(name).url
 
     def log(self, name: str) -> Path:

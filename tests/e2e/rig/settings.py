@@ -15,8 +15,6 @@ from .errors import RigError
 
 @dataclass(frozen=True)
 class Existing:
-    """An existing cluster and the Git server that it reads."""
-
     kubeconfig: Path
     git_url: str
     push_url: str

@@ -100,12 +100,10 @@ def ensure(names: Iterable[str], report: Report | None = None) -> dict[str, Path
 
 
 def needed_with(*gitops: str) -> list[str]:
-    """Return the names of the programs that a rig with these GitOps controllers needs."""
     return [tool.name for tool in TOOLS.values() if tool.gitops in ("", *gitops)]
 
 
 def crd_files(binaries: dict[str, Path]) -> list[Path]:
-    """Return the CRD manifests in the cache entries of these programs."""
     return sorted(
         path for binary in binaries.values() for path in binary.parent.glob("crds/*.yaml")
     )

@@ -46,7 +46,6 @@ class Workdir:
         }
 
     def clear(self, *, keep_logs: bool) -> None:
-        """Remove the data, and the logs too unless `keep_logs`."""
         for entry in {*self.path.iterdir()} - ({self.logs} if keep_logs else set()):
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry, ignore_errors=True)
