@@ -86,10 +86,7 @@ def reference(edge: int, *, placed: bool) -> list[dict[str, Any]]:
 
 
 def demand(edge: int, *, placed: bool) -> list[dict[str, Any]]:
-    """Return a put and a release for the action ``Demand``.
-
-    If ``placed``, the put leaves the choice of the node to the generator.
-    """
+    """Return a put and a release for the action ``Demand``; if ``placed``, without a node."""
     who, node = fleet.spare_id(edge), fleet.edge_id(edge)
     made = goals.put(f"of-{who}", who, topic=(f"/{who}/ego", who), node="" if placed else node)
     made["applications"][0]["connect"] = "mqtt"

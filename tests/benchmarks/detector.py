@@ -78,10 +78,7 @@ def engine() -> None:
 
 
 def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
-    """Send poses of ``entities`` to the detector over ROS.
-
-    Return how many messages were sent, how many the detector read, and its share of a core.
-    """
+    """Return how many poses were sent over ROS and read, and the detector's share of a core."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseStamped

@@ -118,11 +118,7 @@ def lay_down(
 
 
 def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
-    """Make a bare state repo with one application that many vehicles hold; return its path.
-
-    ``vehicles`` is the number of vehicles that hold the application. ``further`` is the number of
-    other vehicles in the inventory, which demand nothing yet.
-    """
+    """Make a state repo with an application of many vehicles; ``further`` ones demand nothing."""
     _lay_down(path, 1, 1, vehicles, further)
     return path
 
@@ -185,10 +181,7 @@ def workspace() -> TemporaryDirectory[str]:
 
 
 def report(name: str, **tables: Sequence[Mapping[str, object]]) -> None:
-    """Print figures as tables by their titles, and write them to ``build/<name>.json``.
-
-    The columns of a table are the keys of its first row.
-    """
+    """Print tables, with the keys of the first row as columns; write build/<name>.json."""
     out = Console(highlight=False)
     for title, rows in tables.items():
         made = Table(title=title)

@@ -36,10 +36,7 @@ Row = dict[str, Any]
 
 
 def _on_server(url: str) -> tuple[float, int]:
-    """Return how many seconds the server takes for a view, and the view's size in bytes.
-
-    The server has already served the view once.
-    """
+    """Return the server's seconds for a view that it has served already, and its bytes."""
     for _ in range(2):
         start = time.perf_counter()
         with urllib.request.urlopen(url) as answer:  # noqa: S310 - the page on this machine
@@ -48,11 +45,7 @@ def _on_server(url: str) -> tuple[float, int]:
 
 
 def _row(browser: Browser, generator: Generator, server: WebServer, view: str) -> Row:
-    """Return the figures of a view.
-
-    The browser's figures are the best of several rounds, so that other work on the machine counts
-    less.
-    """
+    """Return a view's figures; those of the browser are the best of several rounds."""
     server_s, size = _on_server(server.url + view)
     first, updates = list[float](), list[tuple[float, float]]()
     for _ in range(ROUNDS):

@@ -13,13 +13,7 @@ from .rules import RULES, Near
 
 
 def bag_tracks(bag: Path, near: Near) -> tuple[Track, ...]:
-    """Return the track of each vehicle in a bag.
-
-    Raises:
-        InvalidInput: if the bag cannot be read, or has none of the topics that the rules name.
-        SystemExit: if the bag has a vehicle that the experiment lacks, or one that begins near
-            the station.
-    """
+    """Return the track of each vehicle in a bag, or end with the reason why it cannot be played."""
     reader = RecordedBag(bag, rule_file.read(RULES.read_text(), RULES.name))
     try:
         seen = [(one.at, one.entity, one.position) for one in reader.observations()]

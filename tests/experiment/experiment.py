@@ -242,10 +242,7 @@ class Experiment:
             raise AssertionError(f"after {seconds:.0f} s, left over: {stays}; missing: {lacks}")
 
     def _bookkeeping(self, commit: str) -> dict[str, list[str]]:
-        """Return the requesters of each service and connection after a commit.
-
-        The result leaves out the initial deployment.
-        """
+        """Return the requesters after a commit, without the initial deployment."""
         repository = str(self._rig.repository(self._world.name))
         options = ("--state-repo", repository, "--at", commit, "--output", "json")
         printed = json.loads(demandops(self._made("reader"), "bookkeeping", *options))
@@ -321,10 +318,7 @@ class Experiment:
 
 
 def _stand(happens: list[float], number: int) -> float:
-    """Return when the vehicles must stop so that they cause only the first `number` events.
-
-    The time is shortly before the cause of the next event, or infinity if no event is left.
-    """
+    """Return the time shortly before the cause of the event after the first `number`."""
     if number == len(happens):
         return math.inf
     before, after = happens[number - 1 : number + 1]

@@ -116,10 +116,7 @@ def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:
 
 
 def requesters(inside: Collection[str]) -> dict[str, list[str]]:
-    """Return the requesters of each service and connection while these vehicles are near.
-
-    The result extends the paper's table to any set of vehicles.
-    """
+    """Extend the paper's table to any set of vehicles."""
     if not inside:
         return {}
     everybody = sorted({S, *inside})

@@ -118,10 +118,7 @@ class LargeExperiment(Experiment):
         return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demand of each commit after ``since``.
-
-        Of these demands, about :data:`_LOOKS` come with the bookkeeping.
-        """
+        """Yield each commit's demand, about :data:`_LOOKS` of them with the bookkeeping."""
         stages, commits = self._cloud.commits(), self._commits(since)
         looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}
         for commit in commits:

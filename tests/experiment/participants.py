@@ -136,10 +136,7 @@ class Participants:
             self._send_clouds(where, elapsed, now)
 
     def _pass_time(self) -> float:
-        """Count the time since the last call; return how many seconds the vehicles have driven.
-
-        The result is -1 before the vehicles set off.
-        """
+        """Return the seconds of driving so far; -1 before the vehicles set off."""
         passed, self._last = time.monotonic() - self._last, time.monotonic()
         if self.set_off is not None:
             driven = min(passed, max(0.0, self.until - self._elapsed))

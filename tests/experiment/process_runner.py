@@ -231,10 +231,7 @@ class ProcessRunner:
             )
 
     def _entry_point(self, image: str) -> list[str]:
-        """Return the stand-in for the image's entry point, or nothing if there is none.
-
-        Without a stand-in, the container's arguments are its whole command.
-        """
+        """Return the stand-in for an image's entry point; without it arguments are the command."""
         program = program_of(image)
         return [program] if (self._image / program).exists() else []
 

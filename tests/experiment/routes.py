@@ -117,10 +117,7 @@ Way = Route | Track
 def tracks(
     poses: Iterable[tuple[float, str, float, float]], origin: tuple[float, float]
 ) -> tuple[Track, ...]:
-    """Return the track of each vehicle from recorded poses: time, vehicle, x and y.
-
-    ``origin`` is the position of the intersection in the recording.
-    """
+    """Return each vehicle's track; ``origin`` is the intersection's position in the recording."""
     found: dict[str, list[tuple[float, float, float]]] = {}
     first: float | None = None
     for at, vehicle, x, y in poses:
@@ -153,10 +150,7 @@ def one(seed: int, gap: float) -> tuple[Route, ...]:
 
 
 def many(seed: int, count: int) -> tuple[Route, ...]:
-    """Return the routes of many vehicles, each through one of the intersections in ``MIDDLES``.
-
-    About every ``SPACING_S`` seconds one vehicle enters, at 20 to 50 km/h.
-    """
+    """Return routes through ``MIDDLES``; every ``SPACING_S`` s one enters, at 20 to 50 km/h."""
     chance = random.Random(seed)
     found = []
     for number in range(count):

@@ -73,10 +73,7 @@ def from_flux(domain: FluxDomain) -> None:
 
 
 def upgrade(world: World, gitops: str) -> str:
-    """Render the state repo for a controller while the generator runs; return the commit.
-
-    Fail unless this makes exactly one commit.
-    """
+    """Render the state repo anew while the generator runs; return the only commit of this."""
     before = world.tip()
     options = ("--gitops", gitops, "--output", "json")
     output = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
@@ -101,10 +98,7 @@ def to_argocd(world: World) -> Domain:
 
 
 def forget_flux(domain: FluxDomain) -> None:
-    """Delete Helm's records and Flux's objects.
-
-    Flux's objects are suspended, so their deletion removes no release.
-    """
+    """Delete Helm's records and Flux's objects; as these are suspended, no release goes."""
     for kind in FLUX_KINDS:
         for item in domain.find(kind):
             domain.take_away(kind, name_of(item))

@@ -49,10 +49,7 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 
 @pytest.fixture
 def refreshed(rig: Rig) -> Callable[[], set[str]]:
-    """Return a function that names the Applications that the webhook has refreshed.
-
-    Each call names those that were refreshed after the previous call.
-    """
+    """Return a function that names what the webhook has refreshed since the last call."""
     log, seen = rig.log(SERVER), rig.log(SERVER).stat().st_size
 
     def names() -> set[str]:

@@ -36,10 +36,7 @@ def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
 def limited(
     kube: Kube, administrator: Path, folder: Path, rights: Mapping[str, Sequence[Manifest]]
 ) -> Path:
-    """Create an account with only these rights, and return the path of a kubeconfig for it.
-
-    ``rights`` has the account's role rules by namespace.
-    """
+    """Create an account with these role rules by namespace; return the path of its kubeconfig."""
     home, *_ = rights
     subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": home}
     role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}

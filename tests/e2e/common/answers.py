@@ -85,10 +85,7 @@ def unavailable(domain: Namespace) -> list[str]:
 
 
 def push_chart(world: World, added: str) -> dict[str, str]:
-    """Push a new version of the detection's chart with added text.
-
-    Return the former content of the changed files by path.
-    """
+    """Add text to the detection's chart, as a new version; return the former content by path."""
     old = {path: world.file(path) for path in (CHART, *_VERSIONS)}
     new = {
         path: old[path].replace(f"{before}0.1.0", f"{before}0.1.1")

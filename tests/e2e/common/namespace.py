@@ -39,31 +39,28 @@ Pods = set[tuple[str, str]]
 
 
 class Namespace:
-    """An access domain's namespace; each release of a service is an object of the kind `RELEASE`.
-
-    `name` is the name of the controller's object that applies the domain's folder.
-    """
+    """An access domain's namespace; its releases are objects of the kind `RELEASE`."""
 
     RELEASE: ClassVar[str]
     OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's objects
     STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that a commit must not touch without need
 
+    # What the view of each controller adds. The times are those of `time.monotonic`.
+    all_in: ClassVar[Callable[..., list[Any]]]  # the domains that a bootstrap file lays down
+    settle: Callable[[str], None]  # wait until the bootstrap file and a commit are applied
+    remove: Callable[[], None]  # the controller's objects, with all releases
+    wake: Callable[[], None]  # make the controller fetch from the remote now
+    wait_fetched: Callable[[str], float]  # wait for a commit; return the time
+    wait_applied: Callable[[str], float]
+    wait_attempted: Callable[[str], None]  # wait until a commit is applied or refused
+    wait_releases: Callable[[], None]  # until all are applied; their pods need not be ready
+    wait_checked: Callable[[str], None]  # until every release was compared with a commit
+    trouble: Callable[[str, str], str]  # why an object (kind, name) is not ready, or nothing
+    folder_trouble: Callable[[], str]  # why the domain's folder cannot be applied, or nothing
+
     def __init__(self, kube: Kube, namespace: str, name: str) -> None:
         self.kube, self.namespace, self.name = kube, namespace, name
         self._node_ids: dict[str, str] = {}
-
-    @classmethod
-    def all_in(cls, kube: Kube, bootstrap: Iterable[Manifest]) -> list[Any]:
-        """Return the access domains that a bootstrap file lays down on a cluster."""
-        raise NotImplementedError
-
-    def settle(self, commit: str) -> None:
-        """Wait until the controller has taken up the bootstrap file and applied a commit."""
-        raise NotImplementedError
-
-    def remove(self) -> None:
-        """Remove the controller's objects and with them all releases; the namespace stays."""
-        raise NotImplementedError
 
     # --- reading ----------------------------------------------------------------------------
 
@@ -112,20 +109,16 @@ class Namespace:
         }
 
     def identity(self, name: str) -> tuple[object, ...]:
-        """Return ids that change if a Deployment's pods restart or are about to restart.
-
-        These are the UID and generation of the Deployment, and the UIDs of pods and ReplicaSets.
-        """
+        """Return what changes if a Deployment's pods restart or are about to restart."""
         metadata = self.get("Deployment", name)["metadata"]
         pods = sorted(pod["metadata"]["uid"] for pod in self.find("Pod", name))
         sets = sorted(item["metadata"]["uid"] for item in self.find("ReplicaSet", name))
         return metadata["uid"], metadata["generation"], *pods, *sets
 
     def uids(self) -> dict[str, tuple[object, ...]]:
-        """Return the UIDs of each Deployment, its pods and ReplicaSets, by the Deployment's name.
+        """Return `identity` of each Deployment, without the generation.
 
-        `identity` has the Deployment's generation too. The generation changes when another
-        controller applies the Deployment and writes a default value explicitly.
+        It changes when another controller applies a Deployment and writes out a default value.
         """
         found = {}
         for item in self.find("Deployment"):
@@ -135,38 +128,6 @@ class Namespace:
 
     # --- what the controller does -------------------------------------------------------------
 
-    def wake(self) -> None:
-        """Make the controller fetch from the remote now."""
-        raise NotImplementedError
-
-    def wait_fetched(self, commit: str) -> float:
-        """Wait until the controller has fetched a commit; return the time (`time.monotonic`)."""
-        raise NotImplementedError
-
-    def wait_applied(self, commit: str) -> float:
-        """Wait until the controller has applied a commit; return the time (`time.monotonic`)."""
-        raise NotImplementedError
-
-    def wait_attempted(self, commit: str) -> None:
-        """Wait until the controller has tried to apply a commit, with or without success."""
-        raise NotImplementedError
-
-    def wait_releases(self) -> None:
-        """Wait until the controller has applied all releases; their pods need not be ready."""
-        raise NotImplementedError
-
-    def wait_checked(self, commit: str) -> None:
-        """Wait until the controller has compared every release with the given commit."""
-        raise NotImplementedError
-
-    def trouble(self, kind: str, name: str) -> str:
-        """Return why an object of the controller is not ready; empty if it has no reason."""
-        raise NotImplementedError
-
-    def folder_trouble(self) -> str:
-        """Return why the domain's folder cannot be applied; empty if it can."""
-        raise NotImplementedError
-
     def read_chart(self, release: str) -> None:
         """Make the controller read a release's chart again, if it does not do so by itself."""
 
@@ -174,10 +135,7 @@ class Namespace:
         self.kube.delete(kind, name, self.namespace)
 
     def restore(self, *releases: str) -> None:
-        """Make the controller restore these releases, or the domain's folder if none is named.
-
-        A subclass overrides this empty method if its controller does not restore by itself.
-        """
+        """Make the controller restore these releases, or without any the folder, if it must."""
 
     # --- waiting ----------------------------------------------------------------------------
 
@@ -198,10 +156,7 @@ class Namespace:
         self.kube.wait(f"'{why}' to be reported", refused)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
-        """Wait until no object of a release has changed for ``seconds``; return `versions`.
-
-        The status of a Deployment counts too; Kubernetes updates it after the pods are ready.
-        """
+        """Wait until no release has changed for ``seconds``, nor its status; return `versions`."""
         seen, since = self.versions(), time.monotonic()
 
         def quiet() -> bool:

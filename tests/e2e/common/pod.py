@@ -15,7 +15,6 @@ names a folder, the image is the root file system in that folder (made by ``depl
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -33,10 +32,7 @@ _START = Path(__file__).with_name("start-pod.sh")
 
 
 class Pod:
-    """A pod's only container as a process.
-
-    When the pod has ended, ``folder`` still has its log and the data of its volume claims.
-    """
+    """A pod's only container as a process; ``folder`` has its log and volume claims."""
 
     def __init__(self, kube: Kube, name: str, namespace: str, server: str, folder: Path) -> None:
         """Read the pod from the API; ``server`` is the API server's host and port."""
@@ -107,10 +103,6 @@ class Pod:
     def kill(self) -> None:
         self._process.kill()
         self._process.wait(10)
-
-    def stop(self) -> int:
-        self._process.send_signal(signal.SIGTERM)
-        return self._process.wait(self.manifest["spec"]["terminationGracePeriodSeconds"])
 
     def _volume(self, volume: dict[str, Any], group: int) -> Path:
         """Return a folder with the content of a volume, readable by the pod's group."""

@@ -190,10 +190,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
         domain.wait_applied(world.tip())
 
     def scale_and_change_image(to: int, *names: str) -> None:
-        """Scale Deployments as an autoscaler does, and change their images.
-
-        Return once the controller has restored each former image.
-        """
+        """Scale as an autoscaler does, change the images, and wait until these are restored."""
         for each in names:
             template = pod_template(domain, each)
             domain.kube.scale(each, to, domain.namespace)

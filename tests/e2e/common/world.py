@@ -86,10 +86,7 @@ class Generator:
 
 
 class World:
-    """A state repo for the GitOps controller of a rig, and the generator that writes it.
-
-    `domains` maps each cluster that follows the state repo to the access domain there.
-    """
+    """A state repo, its generator, and the access domain on each cluster that follows it."""
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
         self.rig, self.client, self.folder = rig, client, folder
@@ -124,10 +121,7 @@ class World:
         return list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
 
     def apply(self, kube: Kube, manifests: list[Manifest]) -> None:
-        """Apply the manifests of a bootstrap file.
-
-        `remove_wide` later removes those that are cluster-wide.
-        """
+        """Apply a bootstrap file's manifests; `remove_wide` removes those that are cluster-wide."""
         kube.apply(*manifests)
         self._wide += [
             (kube, item)
@@ -141,10 +135,7 @@ class World:
         self._wide.clear()
 
     def remove(self) -> None:
-        """Stop the generator and remove the state repo's objects from its clusters.
-
-        The namespaces stay.
-        """
+        """Stop the generator and remove the state repo's objects; the namespaces stay."""
         self.generator.stop()
         for domain in self.domains.values():
             domain.remove()
@@ -215,10 +206,7 @@ class World:
 
 
 def show_times(say: Report, heading: str, rows: Mapping[str, list[float]]) -> None:
-    """Print how long each demand took to each stage; `rows` has the times of :meth:`World.follow`.
-
-    The test finds the times after the push by polling every 0.1 s.
-    """
+    """Print how long each demand took to each stage; `rows` has results of :meth:`World.follow`."""
     width = max(map(len, rows))
     say(f"\n{heading} (seconds)")
     say(" " * (width + 2) + "".join(f"{stage:>11}" for stage in (*STAGES, "in all")))

@@ -72,10 +72,7 @@ def test_every_golden_release_gives_what_the_server_takes(
 
 @pytest.mark.parametrize("case", CASES_OF_GOLDEN)
 def test_kustomize_builds_the_folder_of_a_domain(case: str, tmp_path: Path) -> None:
-    """`kubectl kustomize` builds exactly the objects that the folder contains.
-
-    The folder itself has no kustomization.yaml, because each new release would change that file.
-    """
+    """The folder has no kustomization.yaml, because each new release would change that file."""
     under = "clusters/c-its/perception/"
     files = {
         path.removeprefix(under): text
@@ -100,10 +97,7 @@ def test_kustomize_builds_the_folder_of_a_domain(case: str, tmp_path: Path) -> N
 
 @pytest.fixture
 def check(rig: Rig, checkout: Path, demandops: Run, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Return a function that runs `demandops check` with the real helm.
-
-    The function returns the exit code, the lines of errors, and the second line of the output.
-    """
+    """Return what runs `check` with the real helm; it gives code, errors and second line."""
     monkeypatch.setenv(HELM_BIN, str(rig.helm_program()))
 
     def check() -> tuple[int, list[str], str]:

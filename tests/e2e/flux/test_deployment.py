@@ -260,24 +260,6 @@ def test_an_upgrade_leaves_the_lease_to_its_holder(deployed: Deployed, active: P
     assert active.code is None
 
 
-def test_a_pod_that_ends_leaves_the_lease_at_once(
-    deployed: Deployed, active: Pod, standby: Pod
-) -> None:
-    holder = deployed.lease["holderIdentity"]
-    assert active.stop() == 0
-    assert deployed.lease["holderIdentity"] != holder
-    deployed.wait_text(standby, "taking demands on")
-    deployed.start(active)
-
-
-def test_a_pod_that_loses_the_lease_ends(deployed: Deployed, active: Pod) -> None:
-    spec = {"holderIdentity": "a person", "leaseDurationSeconds": 3}
-    deployed.rig.kube.patch("Lease", RELEASE, {"spec": spec}, NAMESPACE)
-    assert deployed.rig.kube.wait("the pod's end", lambda: active.code) == 3
-    told = f"the Lease {NAMESPACE}/{RELEASE} is held by 'a person'; another process may be the "
-    assert f"error: {told}leader now, so this one must start again" in active.text()
-
-
 def _leads(pod: Pod) -> bool:
     """Return whether a pod is the leader, which serves the ROS actions."""
     return pod.code is None and "taking demands on" in pod.text()

@@ -122,10 +122,7 @@ def two_domains(world: World) -> dict[str, str]:
 
 
 def granted(where: Domain, *, of: Domain) -> set[str]:
-    """Return what the account of domain `of` may use in the namespace of `where`.
-
-    Every account may also ask for its own rights.
-    """
+    """Return what domain `of`'s account may use elsewhere; each account may ask for its rights."""
     rules = where.kube.rules("demandops", where.namespace, of.namespace)
     asked = {"authorization.k8s.io", "authentication.k8s.io"}
     return {one for rule in rules if {*rule["apiGroups"]} - asked for one in rule["resources"]}

@@ -158,10 +158,7 @@ class Handler(BaseHTTPRequestHandler):
         return {name: value for name, value in variables.items() if value}
 
     def _feed(self, stdin: IO[bytes]) -> None:
-        """Forward the request's body to the backend.
-
-        Read the whole body even if the backend does not take all of it.
-        """
+        """Forward the request's body; read all of it even if the backend does not."""
         listening = True
         try:
             for chunk in self.body():

@@ -79,10 +79,7 @@ class Workspace:
         return _run(argv, self.module, {key: str(self.folder / own[key]) for key in own})
 
     def vendor(self, go: Go, wrapper: Path) -> None:
-        """Copy the sources of all packages that the wrapper needs into its vendor folder.
-
-        Go compares the sources with `go.sum`.
-        """
+        """Copy the sources that the wrapper needs; Go compares them with `go.sum`."""
         pins = [folder / name for folder in (self.module, wrapper) for name in ("go.mod", "go.sum")]
         texts = [path.read_bytes() if path.exists() else b"" for path in pins]
         if (self.module / "vendor").is_dir() and texts[:2] == texts[2:]:

@@ -52,10 +52,7 @@ _VERSIONS = {
 
 
 class Kube:
-    """A cluster's API.
-
-    The API version of a kind is `version` if given, else the one in `_VERSIONS`, else `v1`.
-    """
+    """A cluster's API; without `version`, a kind's is that of `_VERSIONS`, or `v1`."""
 
     def __init__(
         self, kubeconfig: Path, cache: Path, check: Callable[[], None] = lambda: None
@@ -137,10 +134,7 @@ class Kube:
         return str(call(account, namespace, {"spec": {"expirationSeconds": 3607}}).status.token)
 
     def rules(self, account: str, namespace: str, home: str = "") -> list[Manifest]:
-        """Return the rules that say which resources of a namespace a service account may use.
-
-        `home` is the namespace of the account; the default is `namespace`.
-        """
+        """Return the rules of a namespace for an account, whose own namespace is `home`."""
         who = f"system:serviceaccount:{home or namespace}:{account}"
         api: Any = ApiClient(self.api.configuration, "Impersonate-User", who)
         call: Any = AuthorizationV1Api(api).create_self_subject_rules_review

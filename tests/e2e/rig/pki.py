@@ -23,10 +23,7 @@ _AUTHORITY = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rig-authority")
 
 
 class Pki:
-    """The files of a control plane's certificates and keys.
-
-    The keys `account_*` sign the tokens of service accounts.
-    """
+    """The files of certificates and keys; `account_*` signs the tokens of service accounts."""
 
     def __init__(self, folder: Path) -> None:
         self.authority = folder / "ca.crt"
@@ -63,10 +60,7 @@ def make(folder: Path) -> Pki:
 
 
 def write_kubeconfig(target: Path, name: str, server: str, pki: Pki) -> Path:
-    """Write an administrator's kubeconfig that contains all certificates; return its path.
-
-    The file is JSON, which is valid YAML.
-    """
+    """Write an administrator's kubeconfig with all certificates, as JSON, which is YAML."""
 
     def inline(path: Path) -> str:
         return base64.b64encode(path.read_bytes()).decode()

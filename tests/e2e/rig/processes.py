@@ -72,10 +72,7 @@ class Processes:
         self.wait_ready(name)
 
     def wait_ready(self, name: str) -> None:
-        """Wait until a component's probe reports that it is ready.
-
-        Raises RigError with the probe's reason and the end of the log.
-        """
+        """Wait until a component is ready; RigError has the reason and the end of the log."""
         component = self._known(name)
         deadline = time.monotonic() + component.ready_seconds
         while (reason := component.probe()) is not None:
@@ -87,10 +84,7 @@ class Processes:
         self.check(name)  # another server may have answered on the port
 
     def check(self, *names: str) -> None:
-        """Raise RigError if one of these components has ended by itself.
-
-        If no name is given, check all components.
-        """
+        """Raise RigError if one of these components, or of all, has ended by itself."""
         for name in names or list(self._running):
             process = self._running.get(name)
             if process is not None and (code := _exit_code(process)) is not None:

@@ -78,11 +78,7 @@ TOOLS = {
 
 
 def ensure(names: Iterable[str], report: Report | None = None) -> dict[str, Path]:
-    """Return the paths of the named programs; build those that the cache lacks.
-
-    `report` gets lines of progress; by default they go to standard error. Raises RigError if Go is
-    missing or too old, or if a build fails.
-    """
+    """Return the paths of these programs, after building what the cache lacks; raise RigError."""
     wanted, say = list(names), report or _to_stderr
     go = gobuild.Go.find()
     entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], go)}" for name in wanted}
