@@ -13,8 +13,8 @@ from tests.e2e.common import expected
 from tests.e2e.common.intrusion import NEIGHBOUR, binding, config, privileged_deployment
 from tests.e2e.common.world import World
 from tests.e2e.conftest import SlipIn
-from tests.e2e.rig.argocd import NAMESPACE as CONTROL
 from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.components import ARGOCD as CONTROL
 from tests.e2e.rig.kube import build_manifest
 
 ARGOCD = "argoproj.io/v1alpha1"

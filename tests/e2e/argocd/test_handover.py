@@ -13,8 +13,8 @@ from tests.e2e.common.namespace import name_of
 from tests.e2e.common.ros import Client
 from tests.e2e.common.world import World, demandops, running
 from tests.e2e.flux.view import Domain as FluxDomain
-from tests.e2e.rig.argocd import NAMESPACE as CONTROL
 from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.components import ARGOCD as CONTROL
 from tests.e2e.rig.tools import Report
 
 from .view import Domain

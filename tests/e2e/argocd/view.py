@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from tests.e2e.common.namespace import Namespace
-from tests.e2e.rig.argocd import NAMESPACE
+from tests.e2e.rig.components import ARGOCD as NAMESPACE
 from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube, Manifest
 

@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.e2e.rig.cluster import PARTS, Rig
+from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.components import KINDS
 from tests.e2e.rig.kube import build_manifest
 from tests.e2e.rig.tools import Report
 from tests.kit.config import override
@@ -280,7 +281,7 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
 def _prepare_golden(rig: Rig) -> list[str]:
     """Create the golden manifests' namespace; return kinds that the manifests must include."""
     rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
-    return [*PARTS[rig.gitops].KINDS, "Deployment"]
+    return [*KINDS[rig.gitops], "Deployment"]
 
 
 def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:

@@ -16,11 +16,11 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from types import ModuleType, TracebackType
+from types import TracebackType
 from typing import Literal
 
-from . import argocd, flux, githttp, kwok, pki, settings, tools
-from .controlplane import ControlPlane
+from . import githttp, kwok, pki, settings, tools
+from .components import KINDS, Components, prerequisites
 from .errors import RigError
 from .kube import Kube
 from .net import answers, free_port, url
@@ -30,8 +30,6 @@ from .workdir import Workdir
 KEEP_VARIABLE = "E2E_KEEP"
 
 Gitops = Literal["flux", "argocd"]
-
-PARTS: dict[Gitops, ModuleType] = {"flux": flux, "argocd": argocd}
 
 
 class Rig:
@@ -191,35 +189,29 @@ class Rig:
         self._git_url, self._push_url = existing.git_url, existing.push_url
         work = self._work = Workdir(self.name)
         self.kube = Kube(existing.kubeconfig, work.path / "discovery.json")
-        for part in (PARTS[controller] for controller in self._controllers):
-            for kind in part.KINDS:
-                try:
-                    self.kube.find(kind)
-                except Exception as error:
-                    where = existing.kubeconfig
-                    raise RigError(f"{where}: no {kind}s: {error}; {part.REMEDY}") from error
+        for kind in (kind for controller in self._controllers for kind in KINDS[controller]):
+            try:
+                self.kube.find(kind)
+            except Exception as error:
+                remedy = f"set {' and '.join(self._controllers)} up there first, as docs/ says"
+                raise RigError(f"{existing.kubeconfig}: no {kind}s: {error}; {remedy}") from error
 
     def _start_own(self) -> None:
         self._binaries = tools.ensure(tools.needed_with(*self._controllers), self._report)
         work = self._work = Workdir(self.name)
         running = self._processes = Processes(work.logs, work.environment())
         certificates = pki.make(work.path / "pki")
-        plane = ControlPlane(self._binaries, work.path, certificates)
-        running.start_together([plane.etcd(), self._git()])
-        running.start_together([plane.apiserver()])
-        path = work.path / "kubeconfig"
-        self.kubeconfig = pki.write_kubeconfig(path, self.name, plane.server, certificates)
+        parts = Components(self._binaries, work.path, certificates)
+        running.start_together([*parts.of("store"), self._git()])
+        running.start_together(parts.of("api"))
+        self.kubeconfig, server = parts["kubeconfig"], url(parts["api_port"], "https")
+        pki.write_kubeconfig(self.kubeconfig, self.name, server, certificates)
         self.kube = Kube(self.kubeconfig, work.path / "discovery.json", self.check)
         self.kube.install_crds(tools.crd_files(self._binaries))
-        started = [
-            plane.controller_manager(path),
-            plane.scheduler(path),
-            kwok.component(self._binaries["kwok"], path, certificates),
-        ]
+        started = [*parts.of("control")]
         for controller in self._controllers:
-            part = PARTS[controller]
-            self.kube.apply(*part.prerequisites())
-            started += part.components(self._binaries, work.path, path)
+            self.kube.apply(*prerequisites(controller))
+            started += parts.of(controller)
         running.start_together(started)
         # A namespace accepts no pods until the controller manager has created its account.
         account = ("ServiceAccount", "default", "default")

@@ -1,4 +1,4 @@
-"""Fake nodes, and the kwok process that reports them and their pods as running.
+"""Fake nodes, which kwok reports as running, with their pods.
 
 A fake node represents a node of the inventory. It has the label `node_id`, which releases select,
 and the annotation that makes kwok manage it, also in an existing cluster.
@@ -8,39 +8,14 @@ from __future__ import annotations
 
 import hashlib
 import re
-from pathlib import Path
 from typing import Any
 
 from .errors import RigError
-from .net import LOOPBACK, answers, free_port
-from .pki import Pki
-from .processes import Component
 
 NODE_ID_LABEL = "node_id"
-_STAGES = Path(__file__).resolve().parent / "stages.yaml"
 _FAKE = "kwok.x-k8s.io/node"
 _LABEL_VALUE = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
 _CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods": "1000"}
-
-
-def component(binary: Path, kubeconfig: Path, certificates: Pki) -> Component:
-    """Return the kwok process, which manages all nodes made by `manifest`."""
-    port = free_port()
-    argv = [
-        str(binary),
-        f"--kubeconfig={kubeconfig}",
-        "--manage-all-nodes=false",
-        f"--manage-nodes-with-annotation-selector={_FAKE}=fake",
-        "--node-lease-duration-seconds=40",
-        f"--node-ip={LOOPBACK}",
-        "--cidr=10.244.0.0/16",
-        f"--server-address={LOOPBACK}:{port}",
-        f"--node-port={port}",
-        f"--tls-cert-file={certificates.server_certificate}",
-        f"--tls-private-key-file={certificates.server_key}",
-        f"--config={_STAGES}",
-    ]
-    return Component("kwok", tuple(argv), answers(port, "/healthz"))
 
 
 def node_name(node_id: str) -> str:
