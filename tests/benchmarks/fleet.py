@@ -86,7 +86,7 @@ def _region(number: int, edges_per_cluster: int) -> str:
 
 def _nodes(edges: int, edges_per_cluster: int, vehicles: int) -> str:
     nodes: list[dict[str, str]] = [
-        {"id": "cloud", "type": "cloud", "cluster": _region(0, edges_per_cluster)},
+        {"id": "cloud", "type": "cloud", "cluster": _region(0, edges_per_cluster)}
     ]
     for number in range(edges):
         edge = edge_id(number)

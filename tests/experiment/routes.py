@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import random
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -112,18 +112,6 @@ class Track:
 
 Way = Route | Track
 """Where a vehicle is at each time; nothing of interest happens after `ends`."""
-
-
-def tracks(
-    poses: Iterable[tuple[float, str, float, float]], origin: tuple[float, float]
-) -> tuple[Track, ...]:
-    """Return each vehicle's track; ``origin`` is the intersection's position in the recording."""
-    found: dict[str, list[tuple[float, float, float]]] = {}
-    first: float | None = None
-    for at, vehicle, x, y in poses:
-        first = at if first is None else first
-        found.setdefault(vehicle, []).append((at - first + LEAD_S, x - origin[0], y - origin[1]))
-    return tuple(Track(vehicle, tuple(found[vehicle])) for vehicle in sorted(found))
 
 
 def four(seed: int, gap: float) -> tuple[Route, ...]:

@@ -92,10 +92,8 @@ def test_healthy_means_that_a_chart_edited_in_its_folder_runs(
 def test_a_call_with_another_signature_or_none_is_refused(
     world: World, rig: Rig, secret: bytes | None
 ) -> None:
-    url, pushed = (
-        f"{rig.url(ARGOCD_SERVER)}/api/webhook",
-        (rig.git_url(world.name), "", world.tip(), None),
-    )
+    url = f"{rig.url(ARGOCD_SERVER)}/api/webhook"
+    pushed = (rig.git_url(world.name), "", world.tip(), None)
     with pytest.raises(NoAnswer, match=r"^it answered 400$"):
         reconcile_trigger.call_argocd(url, secret, *pushed)
     reconcile_trigger.call_argocd(url, WEBHOOK_SECRET.encode(), *pushed)

@@ -49,12 +49,7 @@ def limited(
         kube.apply(
             build_manifest(f"{_RBAC}/v1", "Role", _ACCOUNT, namespace, rules=list(rules)),
             build_manifest(
-                f"{_RBAC}/v1",
-                "RoleBinding",
-                _ACCOUNT,
-                namespace,
-                roleRef=role,
-                subjects=[subject],
+                f"{_RBAC}/v1", "RoleBinding", _ACCOUNT, namespace, roleRef=role, subjects=[subject]
             ),
         )
 

@@ -21,9 +21,7 @@ CHART = "appdefs/object-detection-fusion/charts/object-fusion/Chart.yaml"
 REGISTRY = "registry/charts.yaml"
 
 
-def test_a_new_version_of_a_chart_restarts_no_pod_that_it_does_not_change(
-    world: World,
-) -> None:
+def test_a_new_version_of_a_chart_restarts_no_pod_that_it_does_not_change(world: World) -> None:
     domain = running(world)
     domain.wait_quiet()
     charts, pods = helm_charts(domain), domain.identity(FUSION)
