@@ -39,7 +39,7 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
     }
     access = {
         "kubeconfig": limited(rig.kube, rig.kubeconfig, made.folder, rights),
-        "webhook": f"{rig.url(ARGOCD_SERVER)}/api/webhook",
+        "webhook": f"{rig.parts.url(ARGOCD_SERVER)}/api/webhook",
         "secret_file": secret,
     }
     access_file(made.folder, {CLUSTER: access})
@@ -50,7 +50,7 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
 @pytest.fixture
 def refreshed(rig: Rig) -> Callable[[], set[str]]:
     """Return a function that names what the webhook has refreshed since the last call."""
-    log, seen = rig.log(ARGOCD_SERVER), rig.log(ARGOCD_SERVER).stat().st_size
+    log, seen = rig.parts.log(ARGOCD_SERVER), rig.parts.log(ARGOCD_SERVER).stat().st_size
 
     def names() -> set[str]:
         nonlocal seen
@@ -92,7 +92,7 @@ def test_healthy_means_that_a_chart_edited_in_its_folder_runs(
 def test_a_call_with_another_signature_or_none_is_refused(
     world: World, rig: Rig, secret: bytes | None
 ) -> None:
-    url = f"{rig.url(ARGOCD_SERVER)}/api/webhook"
+    url = f"{rig.parts.url(ARGOCD_SERVER)}/api/webhook"
     pushed = (rig.git_url(world.name), "", world.tip(), None)
     with pytest.raises(NoAnswer, match=r"^it answered 400$"):
         reconcile_trigger.call_argocd(url, secret, *pushed)

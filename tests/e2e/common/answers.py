@@ -186,7 +186,7 @@ def test_an_api_server_that_is_killed_delays_the_answer_and_loses_nothing(
     if rig.existing:
         pytest.skip("the tests may not kill the API server of an existing cluster")
     restart_generator(world, RECOVERY_S)
-    rig.kill("kube-apiserver")
+    rig.parts.kill("kube-apiserver")
     try:
         with ThreadPoolExecutor(1) as pool:
             pushed = threading.Event()
@@ -199,9 +199,9 @@ def test_an_api_server_that_is_killed_delays_the_answer_and_loses_nothing(
             )
             assert pushed.wait(TIMEOUT_S)
             assert not waiting.done()
-            rig.start_component("kube-apiserver")
+            rig.parts.start("kube-apiserver")
             assert waiting.result(RECOVERY_S + 10).reached == "healthy"
     finally:
-        rig.restart("kube-apiserver")
+        rig.parts.start("kube-apiserver")
     assert unavailable(world.domain) == []
     requester.release("d")

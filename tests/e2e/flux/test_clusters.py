@@ -77,7 +77,7 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(world: World, fleet
     first = world.demand(expected.demand(1))
     follow(world, first.commit, 1)
     before, pods = pulls(world, fleet), there.uids()
-    fleet.stop_component("git")
+    fleet.parts.stop("git")
     for step in (2, 3, 4, 5, 6):
         sent = world.demand(expected.demand(step))
         for domain in (here, there):
@@ -86,7 +86,7 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(world: World, fleet
     there.kube.wait("the cut to be noticed", lambda: there.trouble("GitRepository", SOURCE) or None)
     assert there.lines() == expected.after(1, VEHICLES)
     assert there.uids() == pods, "a pod was restarted during the cut"
-    fleet.start_component("git")
+    fleet.parts.start("git")
     there.wait_applied(sent.commit)
     there.wait_lines(expected.after(6, VEHICLES))
     assert pulls(world, fleet) == before + 1
@@ -109,7 +109,7 @@ def follow(world: World, commit: str, step: int) -> None:
 
 
 def pulls(world: World, fleet: Rig) -> int:
-    return fleet.log("git").read_text().count(f'"POST /{world.name}/git-upload-pack ')
+    return fleet.parts.log("git").read_text().count(f'"POST /{world.name}/git-upload-pack ')
 
 
 def applied_since(domain: Domain, commit: str) -> list[str]:

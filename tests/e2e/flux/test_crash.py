@@ -70,12 +70,12 @@ def send_until_committed(world: World, goal: dict[str, Any]) -> None:
 def generator_without_git(world: World, goal: dict[str, Any]) -> None:
     """Kill the generator while it cannot push its commit; the next generator pushes the commit."""
     before = world.tip()
-    world.rig.stop_component("git")
+    world.rig.parts.stop("git")
     try:
         send_until_committed(world, goal)
         world.generator.kill()
     finally:
-        world.rig.start_component("git")
+        world.rig.parts.start("git")
     assert world.tip() == before
     world.generator.start()
     world.domain.kube.wait(
@@ -91,21 +91,21 @@ def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
     the repeated goal makes no second commit. The goal must be a join: a repeated shutdown never
     makes a second commit, so it would prove nothing.
     """
-    world.rig.pause("git")
+    world.rig.parts.pause("git")
     try:
         send_until_committed(world, goal)
         time.sleep(0.2)
         world.generator.kill()
     finally:
-        world.rig.resume("git")
+        world.rig.parts.resume("git")
     world.generator.start()
     world.demand(goal)
     world.domain.wake()
 
 
 def killed(world: World, controller: str) -> None:
-    world.rig.kill(controller)
-    world.rig.start_component(controller)
+    world.rig.parts.kill(controller)
+    world.rig.parts.start(controller)
 
 
 KILLS: dict[int, tuple[str, Act]] = {

@@ -11,13 +11,12 @@ from __future__ import annotations
 
 import os
 import shutil
-import signal
 import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
 from types import TracebackType
-from typing import Literal
+from typing import Any, Literal
 
 from . import githttp, kwok, pki, settings, tools
 from .components import KINDS, Components, prerequisites
@@ -65,7 +64,8 @@ class Rig:
         self._nodes = [kwok.manifest(node_id) for node_id in nodes]
         self._binaries: dict[str, Path] = {}
         self._work: Workdir | None = None
-        self._processes: Processes | None = None
+        self.parts: Any = None
+        """The processes of a cluster that this rig has started."""
         self._git_url = self._push_url = ""
 
     def __enter__(self) -> Rig:
@@ -100,7 +100,7 @@ class Rig:
 
     def stop(self, *, failed: bool = False) -> None:
         """Stop everything; keep the logs if `failed`. A second call is allowed."""
-        work, processes, kube = self._work, self._processes, getattr(self, "kube", None)
+        work, processes, kube = self._work, self.parts, getattr(self, "kube", None)
         try:
             if kube is not None and self.existing:
                 for node in self._nodes:  # a cluster that the rig started goes as a whole
@@ -108,15 +108,15 @@ class Rig:
             if kube is not None:
                 kube.close()
         finally:
-            self._work = self._processes = None
+            self._work = self.parts = None
             if processes is not None:
                 processes.stop_all()
             if work is not None:
                 self._clear(work, failed)
 
     def check(self) -> None:
-        if self._processes is not None:
-            self._processes.check()
+        if self.parts is not None:
+            self.parts.check()
 
     # --- what tests use ---------------------------------------------------------------------
 
@@ -151,37 +151,6 @@ class Rig:
             found = self._binaries["helm"] = tools.ensure(["helm"], self._report)["helm"]
         return Path(found)
 
-    # --- single parts -----------------------------------------------------------------------
-
-    def log(self, component: str) -> Path:
-        return self._own().log(component)
-
-    def url(self, component: str) -> str:
-        """Return the URL at which tests call a component."""
-        return self._own().url(component)
-
-    def kill(self, component: str) -> None:
-        """Kill a component, as a crash would; `start_component` starts it again."""
-        self._own().kill(component)
-
-    def stop_component(self, component: str) -> None:
-        self._own().stop(component)
-
-    def start_component(self, component: str) -> None:
-        """Start a component again, on the same ports and data, and wait until it is ready."""
-        self._own().start(component)
-
-    def restart(self, component: str) -> None:
-        self.stop_component(component)
-        self.start_component(component)
-
-    def pause(self, component: str) -> None:
-        """Pause a component: it accepts connections and never answers."""
-        self._own().signal(component, signal.SIGSTOP)
-
-    def resume(self, component: str) -> None:
-        self._own().signal(component, signal.SIGCONT)
-
     # --- starting ---------------------------------------------------------------------------
 
     def _adopt(self, existing: settings.Existing) -> None:
@@ -199,7 +168,7 @@ class Rig:
     def _start_own(self) -> None:
         self._binaries = tools.ensure(tools.needed_with(*self._controllers), self._report)
         work = self._work = Workdir(self.name)
-        running = self._processes = Processes(work.logs, work.environment())
+        running = self.parts = Processes(work.logs, work.environment())
         certificates = pki.make(work.path / "pki")
         parts = Components(self._binaries, work.path, certificates)
         running.start_together([*parts.of("store"), self._git()])
@@ -225,11 +194,6 @@ class Rig:
         return Component("git", tuple(argv), answers(port, githttp.HEALTH))
 
     # --- inside -----------------------------------------------------------------------------
-
-    def _own(self) -> Processes:
-        if self._processes is None:
-            raise RigError(f"rig {self.name}: not started, or an existing cluster")
-        return self._processes
 
     def _clear(self, work: Workdir, failed: bool) -> None:
         if os.environ.get(KEEP_VARIABLE):

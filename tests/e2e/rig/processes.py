@@ -58,22 +58,18 @@ class Processes:
             self._components[component.name] = component
             self._launch(component)
         for component in batch:
-            self.wait_ready(component.name)
+            self._wait_ready(component.name)
 
     def start(self, name: str) -> None:
         """Start a component again, with the same arguments and ports; wait until it is ready."""
-        component = self._known(name)
-        process = self._running.get(name)
-        if process is not None:
-            if _exit_code(process) is None:
-                raise RigError(f"{name}: already running as {process.pid}; stop it first")
-            _end(process)
-        self._launch(component)
-        self.wait_ready(name)
+        if name in self._running:
+            self.kill(name)
+        self._launch(self._components[name])
+        self._wait_ready(name)
 
-    def wait_ready(self, name: str) -> None:
+    def _wait_ready(self, name: str) -> None:
         """Wait until a component is ready; RigError has the reason and the end of the log."""
-        component = self._known(name)
+        component = self._components[name]
         deadline = time.monotonic() + component.ready_seconds
         while (reason := component.probe()) is not None:
             self.check(name)
@@ -93,21 +89,19 @@ class Processes:
                 raise RigError(self._with_log(name, ended))
 
     def stop(self, name: str) -> None:
-        self._known(name)
+        """Ask a component to end, and kill it if it does not."""
         self._stop_batch([name])
 
     def kill(self, name: str) -> None:
-        self._known(name)
-        process = self._running.pop(name, None)
-        if process is not None:
-            _end(process)
+        """Kill a component, as a crash would."""
+        _end(self._running.pop(name))
 
-    def signal(self, name: str, number: signal.Signals) -> None:
-        """Send a signal to a component and its children (SIGSTOP makes a server hang)."""
-        process = self._running.get(self._known(name).name)
-        if process is None:
-            raise RigError(f"{name}: not running, cannot receive {number.name}; start it first")
-        os.killpg(process.pid, number)
+    def pause(self, name: str) -> None:
+        """Pause a component: it accepts connections and never answers."""
+        os.killpg(self._running[name].pid, signal.SIGSTOP)
+
+    def resume(self, name: str) -> None:
+        os.killpg(self._running[name].pid, signal.SIGCONT)
 
     def stop_all(self) -> None:
         """Stop all components, the newest first; an interrupt meanwhile kills all that are left."""
@@ -123,16 +117,11 @@ class Processes:
         return {name: process.pid for name, process in self._running.items()}
 
     def url(self, name: str) -> str:
-        return self._known(name).url
+        return self._components[name].url
 
     def log(self, name: str) -> Path:
         """Return the log file of a component; restarts append to it."""
         return self._logs / f"{name}.log"
-
-    def _known(self, name: str) -> Component:
-        if name not in self._components:
-            raise RigError(f"no component {name!r}; choose one of {', '.join(self._components)}")
-        return self._components[name]
 
     def _launch(self, component: Component) -> None:
         argv = launch.command(component.argv[0], *component.argv[1:])
