@@ -151,7 +151,6 @@ class Experiment:
                 pod for pod in self._runner.pods.values() if not pod.service.startswith(_INITIAL)
             ],
             inputs=self._edge.inputs,
-            fused=self._edge.fused,
             tracks=self._edge.tracks,
             arrivals=dict(self._edge.arrivals),
             early=early,
@@ -188,7 +187,7 @@ class Experiment:
         return poses_in(self._folder / "poses.jsonl")
 
     def _arrived(self) -> int:
-        return sum(len(times) for times in self._edge.arrivals.values()) + len(self._edge.fused)
+        return sum(map(len, self._edge.arrivals.values()))
 
     def _commits(self, since: str) -> list[str]:
         repository = self._rig.repository(self._world.name)

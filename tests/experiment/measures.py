@@ -123,12 +123,9 @@ def savings(outcome: Outcome) -> list[Saving]:
     found = [Saving(name, unit, mean(use), always(use)) for name, unit, use in amounts]
     if not outcome.carried:
         return found
-    carried = sum(_payload(outcome).values())
-    published = sum(
-        outcome.published[topic]["bytes"]
-        for topic in _payload(outcome)
-        if topic in outcome.published
-    )
+    topics = _payload(outcome)
+    carried = sum(topics.values())
+    published = sum(outcome.published.get(topic, 0) for topic in topics)
     rate = [size / seconds / 1024 for size in (carried, published)]
     return [*found, Saving("carried to the edge", "KiB/s", *rate)]
 

@@ -70,12 +70,11 @@ class Outcome:
     before: frozenset[str]
     pods: list[RunningPod] = field(default_factory=list)
     node_ids: dict[str, str] = field(default_factory=dict)
-    published: dict[str, dict[str, int]] = field(default_factory=dict)
+    published: dict[str, int] = field(default_factory=dict)
     held: float = 0.0
     early: int = 0
     # what the edge received; empty in the larger experiment
     inputs: list[tuple[float, frozenset[str]]] = field(default_factory=list)
-    fused: list[tuple[float, float, int]] = field(default_factory=list)
     tracks: list[tuple[float, list[tuple[float, float]]]] = field(default_factory=list)
     arrivals: dict[str, list[float]] = field(default_factory=dict)
     carried: dict[str, int] = field(default_factory=dict)

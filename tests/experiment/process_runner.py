@@ -65,10 +65,6 @@ class RunningPod:
     ended: float | None = None
 
     @property
-    def name(self) -> str:
-        return str(self.manifest["metadata"]["name"])
-
-    @property
     def service(self) -> str:
         """The name of the pod's release or connection client."""
         return str(self.manifest["metadata"]["labels"]["app.kubernetes.io/instance"])

@@ -24,7 +24,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 
 from . import gobuild
@@ -87,9 +86,8 @@ def ensure(names: Iterable[str], report: Report | None = None) -> dict[str, Path
         with _turn(cache_root(), say):
             if not entries[name].is_dir():  # another run may have built it while we waited
                 workspace = gobuild.Workspace(cache_root() / f".go-{TOOLS[name].wrapper}")
-                step = f"[{place}/{len(missing)}] {name}: "
-                report = partial(_say_with, say, step)
-                _build(TOOLS[name], go, entries[name], workspace, report)
+                say(f"building program {place} of {len(missing)}, {name}")
+                _build(TOOLS[name], go, entries[name], workspace, say)
                 if TOOLS[name].wrapper not in [TOOLS[other].wrapper for other in missing[place:]]:
                     workspace.remove()
     return {name: entries[name] / name for name in wanted}
@@ -153,16 +151,11 @@ def _turn(root: Path, say: Report) -> Iterator[None]:
     """Hold the build lock, because two builds of Kubernetes at once do not fit into memory."""
     root.mkdir(parents=True, exist_ok=True)
     with (root / "build.lock").open("w") as lock:
-        waited = False
-        while True:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel on death
-                break
-            except BlockingIOError:
-                if not waited:
-                    say(f"another run is building into {root}, waiting for it")
-                waited = True
-                time.sleep(0.5)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel on death
+        except BlockingIOError:
+            say(f"another run is building into {root}, waiting for it")
+            fcntl.flock(lock, fcntl.LOCK_EX)
         for leftover in root.glob(".building-*"):  # only of killed builds, as we hold the lock
             shutil.rmtree(leftover, ignore_errors=True)
         yield
@@ -198,10 +191,6 @@ def _copy_crds(module: Path, target: Path) -> None:
         raise RigError(f"{module}: no CRDs in {' or '.join(_CRD_FOLDERS)}; have they moved?")
     for source in sources:
         (target / source.name).write_bytes(source.read_bytes())  # copies no read-only mode
-
-
-def _say_with(say: Report, prefix: str, text: str) -> None:
-    say(prefix + text)
 
 
 def _to_stderr(text: str) -> None:
