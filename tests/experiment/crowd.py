@@ -14,6 +14,7 @@ import yaml
 
 from tests.e2e.common.expected import CLUSTER
 
+from . import fleet
 from .checks import Check, check_nodes, differ
 from .outcome import Formed, Outcome
 from .routes import MIDDLES
@@ -83,16 +84,7 @@ def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
     """Return the requesters while each vehicle is near the intersection of this number."""
     rows: dict[str, list[str]] = {}
     for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):
-        here = sorted(vehicle for vehicle, at in inside.items() if at == number)
-        if not here:
-            continue
-        everybody = sorted({station, *here})
-        rows |= {
-            f"connection {station} to {edge}": everybody,
-            f"object-detection {station}": everybody,
-            f"object-fusion {edge}/object_detection_fusion": everybody,
-        }
-        rows |= {f"connection {one} to {edge}": sorted({station, one}) for one in here}
+        rows |= fleet.requesters([one for one, at in inside.items() if at == number], edge, station)
     return dict(sorted(rows.items()))
 
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from statistics import median
 
 from . import fleet
 from .outcome import Formed, Outcome
@@ -150,9 +150,5 @@ def running(outcome: Outcome) -> Iterator[tuple[float, int]]:
         yield at, count
 
 
-@lru_cache
-def quantiles(values: tuple[float, ...]) -> tuple[float, float, float]:
-    ordered = sorted(values)
-    middle = len(ordered) // 2
-    median = ordered[middle] if len(ordered) % 2 else sum(ordered[middle - 1 : middle + 1]) / 2
-    return ordered[0], median, ordered[-1]
+def quantiles(values: Sequence[float]) -> tuple[float, float, float]:
+    return min(values), median(values), max(values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -40,11 +39,7 @@ def limited(
     home, *_ = rights
     subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": home}
     role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}
-    secret = build_manifest(
-        "v1", "Secret", _ACCOUNT, home, type="kubernetes.io/service-account-token"
-    )
-    secret["metadata"]["annotations"] = {"kubernetes.io/service-account.name": _ACCOUNT}
-    kube.apply(build_manifest("v1", "ServiceAccount", _ACCOUNT, home), secret)
+    kube.apply(build_manifest("v1", "ServiceAccount", _ACCOUNT, home))
     for namespace, rules in rights.items():
         kube.apply(
             build_manifest(f"{_RBAC}/v1", "Role", _ACCOUNT, namespace, rules=list(rules)),
@@ -52,9 +47,6 @@ def limited(
                 f"{_RBAC}/v1", "RoleBinding", _ACCOUNT, namespace, roleRef=role, subjects=[subject]
             ),
         )
-
-    def token() -> str:
-        return str(((kube.get("Secret", _ACCOUNT, home) or {}).get("data") or {}).get("token", ""))
 
     def in_force() -> bool:  # the API server applies new roles only a moment later
         return all(
@@ -65,9 +57,8 @@ def limited(
         )
 
     kube.wait("the rights", in_force)
-    token_text = base64.b64decode(kube.wait("a token", token)).decode()
     config = yaml.safe_load(administrator.read_text())
-    config["users"] = [{"name": _ACCOUNT, "user": {"token": token_text}}]
+    config["users"] = [{"name": _ACCOUNT, "user": {"token": kube.token(_ACCOUNT, home)}}]
     (context,) = [c for c in config["contexts"] if c["name"] == config["current-context"]]
     context["context"]["user"] = _ACCOUNT
     config["contexts"] = [context]

@@ -15,7 +15,6 @@ import subprocess
 import sys
 from collections.abc import Iterable
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal
 
 from . import githttp, kwok, pki, settings, tools
@@ -72,12 +71,7 @@ class Rig:
         self.start()
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self.stop(failed=kind is not None)
 
     # --- start and stop ---------------------------------------------------------------------
