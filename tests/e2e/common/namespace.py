@@ -21,8 +21,10 @@ from .expected import FUSION
 _INSTANCE = "app.kubernetes.io/instance"
 
 # Kinds that commits of the generator can create in a domain's namespace.
-_OF_RELEASES = ("ConfigMap", "Deployment", "Pod", "ReplicaSet", "Secret")
-_OF_RELEASES += ("Role", "RoleBinding", "ServiceAccount")
+_OF_RELEASES = (
+    *("ConfigMap", "Deployment", "Pod", "ReplicaSet", "Secret"),
+    *("Role", "RoleBinding", "ServiceAccount"),
+)
 _OTHERS = ("Job", "Service")
 _READY_POD = re.compile(r"pod of (?P<name>\S+?)(-[0-9a-f]{12})? on (?P<node>\S+), ready")
 

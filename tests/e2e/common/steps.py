@@ -278,24 +278,14 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
         world.step(step, expected.after(step))
 
 
-def _prepare_golden(rig: Rig) -> list[str]:
-    """Create the golden manifests' namespace; return kinds that the manifests must include."""
-    rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
-    return [*KINDS[rig.gitops], "Deployment"]
-
-
-def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:
+def test_the_server_takes_every_golden_manifest_and_no_unknown_field(rig: Rig) -> None:
     """The manifests use the controller's own kinds, whose CRDs the API server knows."""
-    kinds = _prepare_golden(rig)
-    manifests = list(golden(rig.gitops))
+    rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
+    manifests, kinds = list(golden(rig.gitops)), (*KINDS[rig.gitops], "Deployment")
     assert {*kinds, "Role"} <= {manifest["kind"] for manifest in manifests}
     rig.kube.apply(*manifests, dry_run=True)
-
-
-def test_the_dry_run_refuses_an_unknown_field(rig: Rig) -> None:
-    """Without this check, `test_the_server_takes_every_golden_manifest` might prove nothing."""
-    for kind in _prepare_golden(rig):
-        broken = copy.deepcopy(next(item for item in golden(rig.gitops) if item["kind"] == kind))
+    for kind in kinds:
+        broken = copy.deepcopy(next(item for item in manifests if item["kind"] == kind))
         broken["spec"]["interwal"] = "1m"
         with pytest.raises(Exception, match="field not declared in schema"):
             rig.kube.apply(broken, dry_run=True)

@@ -16,8 +16,7 @@ from demandops.repo.pull_request.helm import HELM_BIN
 from tests.e2e.common.expected import NAMESPACE
 from tests.e2e.common.rendered import check_chart, golden
 from tests.e2e.common.steps import (
-    test_the_dry_run_refuses_an_unknown_field,
-    test_the_server_takes_every_golden_manifest,
+    test_the_server_takes_every_golden_manifest_and_no_unknown_field,
 )
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import build_manifest
