@@ -3,9 +3,7 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -21,8 +19,6 @@ from tests.e2e.common.steps import (
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.kube import build_manifest
 from tests.kit.cli import Run
-from tests.kit.golden import CASES as CASES_OF_GOLDEN
-from tests.kit.golden import whole
 
 ROOT = Path(__file__).resolve().parents[3]
 APPDEFS = (ROOT / "appdefs", ROOT / "examples" / "lane-detection" / "appdefs")
@@ -67,31 +63,6 @@ def test_every_golden_release_gives_what_the_server_takes(
         name, values = release["metadata"]["name"], release["spec"]["values"]
         chart = charts["object-fusion" if name.startswith("of-") else "object-detection"]
         check_chart(rig, chart, name, NAMESPACE, values, tmp_path, lint=False)
-
-
-@pytest.mark.parametrize("case", CASES_OF_GOLDEN)
-def test_kustomize_builds_the_folder_of_a_domain(case: str, tmp_path: Path) -> None:
-    """The folder has no kustomization.yaml, because each new release would change that file."""
-    under = "clusters/c-its/perception/"
-    files = {
-        path.removeprefix(under): text
-        for step in whole(case).values()
-        for path, text in step.items()
-        if path.startswith(under)
-    }
-    for path, text in files.items():
-        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / path).write_text(text)
-    (tmp_path / "kustomization.yaml").write_text(json.dumps({"resources": sorted(files)}))
-    command = ["kubectl", "kustomize", str(tmp_path)]
-    built = subprocess.run(command, capture_output=True, text=True, check=True).stdout
-    wanted = [one for text in files.values() for one in yaml.safe_load_all(text)]
-    assert len(wanted) >= len(files)
-    texts = [
-        sorted(json.dumps(one, sort_keys=True) for one in these)
-        for these in (yaml.safe_load_all(built), wanted)
-    ]
-    assert texts[0] == texts[1]
 
 
 @pytest.fixture

@@ -212,23 +212,16 @@ def _condition(found: Manifest | None) -> str:
     """Return why the newest generation of an object is not ready; empty if it is."""
     if found is None:
         return "does not exist"
-    status = found.get("status", {})
-    generation = found["metadata"].get("generation")
-    fresh = status.get("observedGeneration", generation) == generation
-    if fresh and _holds(found, "Ready"):
+    status, generation = found.get("status", {}), found["metadata"].get("generation")
+    observed = status.get("observedGeneration", generation)
+    if observed == generation and _holds(found, "Ready"):
         return ""
-    shown = [f"{c['type']}={c['status']} {c.get('message', '')}" for c in _conditions(found)]
-    if not fresh:
-        shown.append("of an older generation")
-    return "; ".join(shown) or "no conditions"
+    return f"generation {observed} of {generation}: {status.get('conditions')}"
 
 
 def _holds(found: Manifest, kind: str) -> bool:
-    return any(c["type"] == kind and c["status"] == "True" for c in _conditions(found))
-
-
-def _conditions(found: Manifest) -> list[dict[str, str]]:
-    return list(found.get("status", {}).get("conditions") or [])
+    conditions = found.get("status", {}).get("conditions") or []
+    return any(c["type"] == kind and c["status"] == "True" for c in conditions)
 
 
 def _documents(manifests: Iterable[Manifest | str]) -> list[Manifest]:
