@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.rig import githttp, gobuild, kwok, net, settings, tools
+from tests.e2e.rig import githttp, gobuild, net, settings, tools
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube
@@ -241,14 +241,6 @@ def test_half_an_existing_cluster_is_refused(
     monkeypatch.setenv("E2E_GIT_URL", "http://git.example/")
     found = settings.Existing(config, "http://git.example", "http://git.example")
     assert settings.existing("edge") == found
-
-
-def test_node_names_keep_different_ids_apart() -> None:
-    names = {kwok.node_name(node_id) for node_id in ("vehicle00", "vehicle_00", "Vehicle00", "v")}
-    assert len(names) == 4
-    assert kwok.node_name("vehicle00") == "vehicle00"
-    with pytest.raises(RigError, match="not a label value"):
-        kwok.manifest("vehicle/00")
 
 
 def test_a_dead_runs_folder_is_swept_and_a_living_ones_is_not(
