@@ -201,7 +201,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
 
     original = world.file(APPDEF)
     merge(_autoscaled(world))
-    domain.kube.apply(world.file(f"bootstrap/{CLUSTER}.yaml"))  # allows autoscalers
+    domain.kube.apply(*world.manifests(CLUSTER))  # allows autoscalers
     domain.restore(*DETECTION.values(), FUSION)  # these releases failed without that right
     domain.kube.wait("an autoscaler", lambda: bounds() == (2, 4))
     domain.kube.wait("two replicas", lambda: (replicas(), replicas(FUSION)) == (2, 2))

@@ -46,8 +46,6 @@ _VERSIONS = {
     "Job": "batch/v1",
     "Role": "rbac.authorization.k8s.io/v1",
     "RoleBinding": "rbac.authorization.k8s.io/v1",
-    "ClusterRole": "rbac.authorization.k8s.io/v1",
-    "ClusterRoleBinding": "rbac.authorization.k8s.io/v1",
 }
 
 
@@ -67,12 +65,9 @@ class Kube:
     def close(self) -> None:
         self.api.close()
 
-    def apply(self, *manifests: Manifest | str, dry_run: bool = False) -> None:
-        """Apply manifests by server-side apply; a text may contain several YAML documents.
-
-        In a dry run the server checks everything, admission included, and stores nothing.
-        """
-        for manifest in _documents(manifests):
+    def apply(self, *manifests: Manifest, dry_run: bool = False) -> None:
+        """Apply manifests; in a dry run the server checks everything and stores nothing."""
+        for manifest in manifests:
             meta = manifest["metadata"]
             self._resource(manifest["kind"], manifest["apiVersion"]).server_side_apply(
                 body=manifest,
@@ -182,7 +177,8 @@ class Kube:
 
     def install_crds(self, files: Iterable[Path]) -> None:
         """Apply CRDs and wait until the server serves them."""
-        crds = _documents([path.read_text() for path in files])
+        parsed = (yaml.safe_load_all(path.read_text()) for path in files)
+        crds = [crd for documents in parsed for crd in documents if crd]
         self.apply(*crds)
         for name in (crd["metadata"]["name"] for crd in crds):
             self.wait(
@@ -222,11 +218,3 @@ def _condition(found: Manifest | None) -> str:
 def _holds(found: Manifest, kind: str) -> bool:
     conditions = found.get("status", {}).get("conditions") or []
     return any(c["type"] == kind and c["status"] == "True" for c in conditions)
-
-
-def _documents(manifests: Iterable[Manifest | str]) -> list[Manifest]:
-    documents: list[Manifest] = []
-    for manifest in manifests:
-        parsed = yaml.safe_load_all(manifest) if isinstance(manifest, str) else [manifest]
-        documents += [document for document in parsed if document]
-    return documents
