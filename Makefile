@@ -150,10 +150,7 @@ golden: setup  ## Rewrite the golden files, and the schemas and tables of the ch
 bench: system-page setup  ## Measure the event detector, the page, and the cost of commits and demands as the ledger grows
 	@$(PY) -m tests.benchmarks.commits
 	@$(PY) -m tests.benchmarks.growth
-	@$(PY) -m tests.benchmarks.flood
-	@$(PY) -m tests.benchmarks.configured
 	@$(PY) -m tests.benchmarks.detector
-	@$(PY) -m tests.benchmarks.request
 	@$(PY) -m tests.benchmarks.page
 
 bench-audit: setup  ## Measure the cost of an auditor's questions after 10,000 commits

@@ -1,19 +1,16 @@
 """Measure what an auditor's questions cost on a state repo with thousands of commits.
 
 Vehicles join and leave at all edges in turn; the generator makes a commit of each join and leave.
-The benchmark prints the seconds of each question. ``--keep FOLDER`` makes the state repo in this
-folder and keeps it. If the folder has a state repo already, the benchmark uses that one.
+The benchmark prints the seconds of each question.
 """
 
 from __future__ import annotations
 
-import argparse
 import time
 from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import closing
 from functools import partial
 from pathlib import Path
-from tempfile import TemporaryDirectory
 
 import pygit2
 from demandops.repo import reader
@@ -27,29 +24,25 @@ VERIFIED = 300
 BATCH = 500
 
 
-def lay_down(folder: Path, releases: int, commits: int) -> Path:
-    """Make a state repo with a fleet, and carry out ``commits`` goals there; return its path."""
-    laid = fleet.lay_down(folder / "state-repo.git", releases)
-    generator = Generator(str(laid.path), data=folder / "data")
+def lay_down(folder: Path) -> Path:
+    """Make a state repo with a fleet, and carry out the goals there; return its path."""
+    laid = fleet.lay_down(folder / "state-repo.git", RELEASES)
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync while the repo is made
-    try:
-        for first in range(0, commits, BATCH):
+    with closing(Generator(str(laid.path), data=folder / "data")) as generator:
+        for first in range(0, COMMITS, BATCH):
             tickets = []
-            for number in range(first, min(first + BATCH, commits)):
+            for number in range(first, min(first + BATCH, COMMITS)):
                 edge = (number // 2) % laid.edges
                 vehicle = fleet.spare_id(edge)
                 goal = fleet.goal(fleet.edge_id(edge), vehicle, shutdown=number % 2 == 1)
                 tickets.append(generator.submit(goal))
             for ticket in tickets:
                 ticket.future.result()
-    finally:
-        generator.close()
-        pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
+    pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
     return laid.path
 
 
 def timed(what: str, call: Callable[[], object]) -> None:
-    """Print ``what``, how many seconds ``call`` takes, and what ``call`` returns."""
     start = time.perf_counter()
     found = call()
     print(f"{what:<60} {time.perf_counter() - start:8.2f} s  {found}")
@@ -88,20 +81,10 @@ def _verify(opened: reader.Reader, *, whole: bool) -> int:
     return sum(verdict.holds for verdict in opened.verify(commits, whole=whole))
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n", maxsplit=1)[0])
-    parser.add_argument("--releases", type=int, default=RELEASES)
-    parser.add_argument("--commits", type=int, default=COMMITS)
-    parser.add_argument("--keep", type=Path)
-    args = parser.parse_args()
-    with nullcontext(args.keep) if args.keep else TemporaryDirectory(prefix="bench-audit-") as used:
-        folder = Path(used)
-        repo = folder / "state-repo.git"
-        if not repo.exists():
-            repo = lay_down(folder, args.releases, args.commits)
-        measure(repo)
-    return 0
+def main() -> None:
+    with fleet.workspace() as folder:
+        measure(lay_down(Path(folder)))
 
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    main()

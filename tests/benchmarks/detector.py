@@ -78,10 +78,7 @@ def engine() -> None:
 
 
 def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
-    """Send poses of ``entities`` to the detector over ROS.
-
-    Return how many messages were sent, how many the detector read, and its share of a core.
-    """
+    """Return how many poses were sent over ROS and read, and the detector's share of a core."""
     import rclpy
     from diagnostic_msgs.msg import DiagnosticArray
     from geometry_msgs.msg import PoseStamped
@@ -133,7 +130,6 @@ def over_ros(entities: int, sources: dict[str, Any]) -> tuple[int, int, float]:
 
 
 def cpu(pid: int) -> float:
-    """Return the seconds of processor time that a process has used."""
     fields = Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

@@ -7,10 +7,13 @@ makes the claims and the rendered files.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import json
+import time
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import pygit2
@@ -22,24 +25,26 @@ from demandops.model.config.load import load
 from demandops.model.ledger import claim_file
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.history import commit_message
+from demandops.serve.generator import Generator
+from rich.console import Console
 from rich.table import Table
 
 from tests.kit import goals
 from tests.kit.config import configuration, state_of
 from tests.kit.repo import write_tree
 
-VEHICLES_PER_EDGE = 10
+BUILD = Path("build")
+EDGES_PER_CLUSTER = VEHICLES_PER_EDGE = 10
 RELEASES_PER_EDGE = 3 * VEHICLES_PER_EDGE + 1
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """The state repo of a fleet, and how many edges, releases and nodes the fleet has."""
+    """The state repo of a fleet, and how many edges and releases the fleet has."""
 
     path: Path
     edges: int
     releases: int
-    nodes: int = 0
 
 
 def edge_id(number: int) -> str:
@@ -74,17 +79,15 @@ def goal(
     return goals.goal([app], [link], id="bench", shutdown=shutdown)
 
 
-def _region(number: int, edges_per_cluster: int) -> str:
-    return f"region{number // edges_per_cluster:04d}"
+def _region(number: int) -> str:
+    return f"region{number // EDGES_PER_CLUSTER:04d}"
 
 
-def _nodes(edges: int, edges_per_cluster: int, vehicles: int) -> str:
-    nodes: list[dict[str, str]] = [
-        {"id": "cloud", "type": "cloud", "cluster": _region(0, edges_per_cluster)},
-    ]
+def _nodes(edges: int, vehicles: int) -> str:
+    nodes: list[dict[str, str]] = [{"id": "cloud", "type": "cloud", "cluster": _region(0)}]
     for number in range(edges):
         edge = edge_id(number)
-        region = _region(number, edges_per_cluster)
+        region = _region(number)
         nodes.append({"id": edge, "type": "edge", "cluster": region})
         names = [vehicle_id(number, place) for place in range(vehicles)] + [spare_id(number)]
         nodes += [{"id": name, "type": "vehicle", "cluster": region} for name in names]
@@ -95,58 +98,30 @@ def _file(kind: str, **lists: object) -> str:
     return strict_yaml.dump({"apiVersion": "demandops/v1", "kind": kind} | lists)
 
 
-Configure = Callable[[dict[str, str]], object]
-"""A function that changes the files of a configuration."""
-
-
-def lay_down(
-    path: Path,
-    releases: int,
-    edges_per_cluster: int = 10,
-    configure: Configure = lambda files: None,
-) -> Fleet:
+def lay_down(path: Path, releases: int) -> Fleet:
     """Make a bare state repo in which about ``releases`` releases run; return the fleet."""
     edges = max(1, round(releases / RELEASES_PER_EDGE))
-    nodes = _lay_down(path, edges, edges_per_cluster, VEHICLES_PER_EDGE, 0, configure)
-    return Fleet(path, edges, edges * RELEASES_PER_EDGE, nodes)
+    _lay_down(path, edges, VEHICLES_PER_EDGE, 0)
+    return Fleet(path, edges, edges * RELEASES_PER_EDGE)
 
 
 def lay_down_crowd(path: Path, vehicles: int, further: int) -> Path:
-    """Make a bare state repo with one application that many vehicles hold; return its path.
-
-    ``vehicles`` is the number of vehicles that hold the application. ``further`` is the number of
-    other vehicles in the inventory, which demand nothing yet.
-    """
-    _lay_down(path, 1, 1, vehicles, further)
+    """Make a state repo with an application of many vehicles; ``further`` ones demand nothing."""
+    _lay_down(path, 1, vehicles, further)
     return path
 
 
-def lay_down_idle(path: Path, edges: int, vehicles: int) -> Fleet:
-    """Make a bare state repo with edges and vehicles that demand nothing yet; return the fleet."""
-    _lay_down(path, edges, edges, 0, vehicles)
-    return Fleet(path, edges, 0)
-
-
-def _lay_down(
-    path: Path,
-    edges: int,
-    edges_per_cluster: int,
-    vehicles: int,
-    further: int,
-    configure: Configure = lambda files: None,
-) -> int:
-    """Make the repo, and return how many nodes it has."""
+def _lay_down(path: Path, edges: int, vehicles: int, further: int) -> None:
     files = configuration()
     limits = {"demandItems": 100_000, "demandCharacters": 10_000_000, "fileBytes": 10_000_000}
     limits["decisionMilliseconds"] = 60_000
     files["demandops.yaml"] += strict_yaml.dump({"limits": limits})
-    files["inventory/nodes.yaml"] = _nodes(edges, edges_per_cluster, vehicles + further)
-    regions = sorted({_region(number, edges_per_cluster) for number in range(edges)})
+    files["inventory/nodes.yaml"] = _nodes(edges, vehicles + further)
+    regions = sorted({_region(number) for number in range(edges)})
     clusters = [{"name": region} for region in regions]
     files["inventory/clusters.yaml"] = _file("Clusters", clusters=clusters)
     broker = {"node": "cloud", "host": "broker", "port": 1883}
     files["inventory/brokers.yaml"] = _file("Brokers", brokers=[broker])
-    configure(files)
     config = load(files)
     state, now = state_of(config), datetime.now(timezone.utc)
     ledger = Ledger()
@@ -163,17 +138,34 @@ def _lay_down(
     text = "A fleet\n\nOperation: init\nRender-Version: 2\n"
     repo.create_commit("refs/heads/main", who, who, text, tree, [])
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 1)
-    return len(config.nodes) - len(config.hosts)
 
 
-def table(title: str, rows: Sequence[Mapping[str, object]]) -> Table:
-    """Return figures as a table for people; the columns are the keys of the first row."""
-    made = Table(title=title)
-    for column in rows[0]:
-        made.add_column(column.replace("_", " "), justify="right")
-    for row in rows:
-        made.add_row(*map(_cell, row.values()))
-    return made
+def costs(generator: Generator, goal: dict[str, Any]) -> tuple[float, float]:
+    start, worked = time.perf_counter(), time.process_time()
+    generator.submit(goal).future.result()
+    return time.perf_counter() - start, time.process_time() - worked
+
+
+def workspace() -> TemporaryDirectory[str]:
+    """Return a folder for state repos, on the disk of the checkout."""
+    BUILD.mkdir(exist_ok=True)
+    return TemporaryDirectory(prefix="bench-", dir=BUILD)
+
+
+def report(name: str, **tables: Sequence[Mapping[str, object]]) -> None:
+    """Print tables, with the keys of the first row as columns; write build/<name>.json."""
+    out = Console(highlight=False)
+    for title, rows in tables.items():
+        made = Table(title=title)
+        for column in rows[0]:
+            made.add_column(column.replace("_", " "), justify="right")
+        for row in rows:
+            made.add_row(*map(_cell, row.values()))
+        out.print(made)
+    BUILD.mkdir(exist_ok=True)
+    file = BUILD / f"{name}.json"
+    file.write_text(json.dumps(tables, indent=2) + "\n")
+    out.print(f"written to {file}")
 
 
 def _cell(value: object) -> str:

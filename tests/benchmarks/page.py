@@ -3,54 +3,40 @@
 A headless Chromium opens the page of a fleet with about 10,000 releases on 3,900 nodes. For each
 view, the benchmark measures the server's time, the size of the answer, and the longest time that
 the browser's main thread was busy while the view came up. Then the benchmark books a demand and
-measures how the open view is updated. It prints a table and writes ``build/page.json``.
+measures how the open view is updated.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import time
 import urllib.request
 import uuid
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from playwright.sync_api import Browser, expect
-from rich.console import Console
-from rich.table import Table
 
 from tests.benchmarks import fleet
 from tests.kit.browser import Visit, chromium
 
-VIEWS = (
-    "",
-    "map",
-    "map?q=edge00000",
-    "demands",
-    "services",
-    "connections",
-    "timeline",
-    "overrides",
-    "rates",
-)
+VIEWS = ["", "map", "map?q=edge00000"]
+VIEWS += ["demands", "services", "connections", "timeline", "overrides", "rates"]
+RELEASES = 10_000
 AIM_MS = 200
 ROUNDS = 3
 PATIENCE_MS = 120_000
 
-Row = dict[str, float]
+Row = dict[str, Any]
 
 
 def _on_server(url: str) -> tuple[float, int]:
-    """Return how many seconds the server takes for a view, and the view's size in bytes.
-
-    The server has already served the view once.
-    """
+    """Return the server's seconds for a view that it has served already, and its bytes."""
     for _ in range(2):
         start = time.perf_counter()
         with urllib.request.urlopen(url) as answer:  # noqa: S310 - the page on this machine
@@ -59,11 +45,7 @@ def _on_server(url: str) -> tuple[float, int]:
 
 
 def _row(browser: Browser, generator: Generator, server: WebServer, view: str) -> Row:
-    """Return the figures of a view.
-
-    The browser's figures are the best of several rounds, so that other work on the machine counts
-    less.
-    """
+    """Return a view's figures; those of the browser are the best of several rounds."""
     server_s, size = _on_server(server.url + view)
     first, updates = list[float](), list[tuple[float, float]]()
     for _ in range(ROUNDS):
@@ -89,38 +71,24 @@ def _row(browser: Browser, generator: Generator, server: WebServer, view: str) -
     }
 
 
-def measure(releases: int) -> dict[str, Row]:
-    rows: dict[str, Row] = {}
+def main() -> None:
+    rows = []
     with TemporaryDirectory() as folder, chromium() as browser:
         os.environ["DEMANDOPS_DATA_HOME"] = f"{folder}/home"
-        laid = fleet.lay_down(Path(folder) / "state-repo.git", releases)
+        laid = fleet.lay_down(Path(folder) / "state-repo.git", RELEASES)
         generator = Generator(str(laid.path))
         follower = Follower(Reader.of(str(laid.path)), {}, 0)
         server = WebServer("127.0.0.1:0", "--listen", follower)
         release = next(iter(follower.newest.commit_state.releases))
         for view in (*VIEWS, f"release?name={release}"):
-            rows[view.partition("=")[0] or "not ready"] = _row(browser, generator, server, view)
+            name = view.partition("=")[0] or "not ready"
+            rows.append({"view": name} | _row(browser, generator, server, view))
         server.close()
         generator.close()
-    return rows
-
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("--releases", type=int, default=10_000)
-    rows = measure(parser.parse_args().releases)
-    Path("build").mkdir(exist_ok=True)
-    Path("build/page.json").write_text(json.dumps(rows, indent=2))
-    console, table = Console(), Table("view", title="The page")
-    for column in next(iter(rows.values())):
-        table.add_column(column.replace("_", " "), justify="right")
-    for name, row in rows.items():
-        table.add_row(name, *(f"{figure:,.1f}" for figure in row.values()))
-    console.print(table)
-    longest = max(
-        max(row["longest_task_ms"], row["longest_task_of_update_ms"]) for row in rows.values()
-    )
-    console.print(f"longest task {longest:.0f} ms, aim below {AIM_MS} ms")
+    tasks = ("longest_task_ms", "longest_task_of_update_ms")
+    longest = max(float(row[task]) for row in rows for task in tasks)
+    title = f"The page; the longest task took {longest:.0f} ms, aim below {AIM_MS} ms"
+    fleet.report("page", **{title: rows})
 
 
 if __name__ == "__main__":

@@ -1,19 +1,28 @@
-"""Fixtures for the tests of both controllers: a ROS domain, its clients, and progress messages."""
+"""Fixtures for the tests of both controllers; the fixture `rig` of their folders decides which."""
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 from demandops_ros import DemandClient
 
+from tests.e2e.common.expected import CLUSTER, WITHOUT_DEMANDS
+from tests.e2e.common.intrusion import FILE, NEIGHBOUR, withdraw
 from tests.e2e.common.ros import Client
-from tests.e2e.rig.capture import uncaptured
+from tests.e2e.common.world import VIEWS, World
 from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.kube import Manifest, build_manifest
 from tests.e2e.rig.tools import Report
 from tests.kit.ros import reserved
 
 pytest.register_assert_rewrite("tests.e2e.common.answers", "tests.e2e.common.steps")
+
+MakeWorld = Callable[[], World]
+SlipIn = Callable[..., None]
 
 
 @pytest.fixture(autouse=True)
@@ -23,12 +32,18 @@ def limited() -> None:
 
 @pytest.fixture(scope="session")
 def say(request: pytest.FixtureRequest) -> Report:
-    return uncaptured(request.config)
+    """Return a function that prints past pytest's capture; a cold build takes twenty minutes."""
+    capture: Any = request.config.pluginmanager.getplugin("capturemanager")
+
+    def say(text: str) -> None:
+        with capture.global_and_fixture_disabled():
+            print(text, file=sys.stderr, flush=True)
+
+    return say
 
 
 @pytest.fixture(scope="session")
 def ros_domain() -> Iterator[int]:
-    """A ROS domain that only this process uses."""
     with reserved() as domain:
         yield domain
 
@@ -38,6 +53,32 @@ def client(ros_domain: int) -> Iterator[Client]:
     made = Client(ros_domain)
     yield made
     made.close()
+
+
+@pytest.fixture(scope="module")
+def make_world(
+    rig: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[MakeWorld]:
+    """Return a function that creates a state repo, which no cluster follows yet."""
+    made: list[World] = []
+
+    def make() -> World:
+        made.append(World(rig, tmp_path_factory.mktemp("world"), ros_domain, client))
+        return made[-1]
+
+    yield make
+    for world in made:
+        world.remove()
+
+
+@pytest.fixture(scope="module")
+def world(make_world: MakeWorld, rig: Rig) -> World:
+    """A state repo that the cluster follows, with a running generator and no demand."""
+    made = make_world()
+    made.bootstrap(CLUSTER, rig)
+    made.generator.start()
+    made.domain.wait_lines(WITHOUT_DEMANDS)
+    return made
 
 
 @pytest.fixture
@@ -57,3 +98,30 @@ def edge_is_full(rig: Rig) -> Iterator[Callable[[], None]]:
     unschedulable(True)
     yield lambda: unschedulable(None)
     unschedulable(None)
+
+
+@pytest.fixture(scope="module")
+def neighbour(rig: Rig) -> Iterator[Any]:
+    rig.kube.apply(build_manifest("v1", "Namespace", NEIGHBOUR))
+    # Kubernetes creates the service account and the ConfigMap
+    rig.kube.wait("the account", lambda: rig.kube.get("ServiceAccount", "default", NEIGHBOUR))
+    rig.kube.wait("the root", lambda: rig.kube.get("ConfigMap", "kube-root-ca.crt", NEIGHBOUR))
+    yield VIEWS[rig.gitops](rig.kube, NEIGHBOUR, "none")
+    rig.kube.delete("Namespace", NEIGHBOUR)
+
+
+@pytest.fixture
+def slip_in(world: World, neighbour: Any) -> Iterator[SlipIn]:
+    """Return a function that commits manifests to the domain's folder.
+
+    The function waits until the controller has tried to apply the manifests. The fixture removes
+    the manifests after the test.
+    """
+
+    def push(*manifests: Manifest, file: str = FILE) -> None:
+        commit = world.push({file: "\n---\n".join(map(json.dumps, manifests))})
+        world.domain.wake()
+        world.domain.wait_attempted(commit)
+
+    yield push
+    withdraw(world)

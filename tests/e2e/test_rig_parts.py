@@ -2,40 +2,29 @@
 
 from __future__ import annotations
 
+import json
 import os
+import re
+import shutil
 import subprocess
 import sys
-import threading
-import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
 
-from tests.e2e.rig import githttp, gobuild, kwok, net, settings, tools
+from tests.e2e.rig import githttp, gobuild, net, settings, tools
 from tests.e2e.rig.clone import Clone
 from tests.e2e.rig.errors import RigError
+from tests.e2e.rig.kube import Kube
 from tests.e2e.rig.processes import Component, Processes
 from tests.e2e.rig.workdir import Workdir
+from tests.kit.generator import wait_until
+from tests.kit.http import kubeconfig, running
 
-FAKE_GO = """\
-#!/bin/sh
-# A fake Go toolchain: `build` writes its target slowly and records its run.
-case "$1" in
-env) printf 'go%s\\nlinux\\namd64\\n' "${FAKE_GO_VERSION:-1.26.8}" ;;
-mod) mkdir fetched ;;
-list) if [ "$3" = -m ]; then echo "$FAKE_GO_MODULE"; else printf 'one\\ntwo\\n'; fi ;;
-build)
-    echo run >> "$FAKE_GO_RUNS"
-    printf 'one\\ntwo\\n' >&2
-    [ -z "$FAKE_GO_FAULT" ] || { echo "$FAKE_GO_FAULT" >&2; exit 2; }
-    while [ "$1" != -o ]; do shift; done
-    printf half > "$2"
-    for _ in $(seq "${FAKE_GO_SECONDS:-0}"); do sleep 1; done
-    printf whole > "$2" ;;
-esac
-"""
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.fixture
@@ -43,7 +32,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Put a fake Go on PATH and use an empty cache; return the file where the fake lists builds."""
     program = tmp_path / "bin" / "go"
     program.parent.mkdir()
-    program.write_text(FAKE_GO)
+    shutil.copy(Path(__file__).with_name("fake-go"), program)
     program.chmod(0o755)
     crds = tmp_path / "module" / "config" / "crd" / "bases"
     crds.mkdir(parents=True)
@@ -57,22 +46,18 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return noted
 
 
-def quiet(_: str) -> None:
-    """Ignore a line of progress; tests pass this function as the `report` of `ensure`."""
-
-
 def test_a_program_is_built_once_with_its_crds(runs: Path) -> None:
-    first = tools.ensure(["source-controller"], quiet)
+    first = tools.ensure(["source-controller"])
     assert first["source-controller"].read_text() == "whole"
     assert [path.name for path in tools.crd_files(first)] == ["a.yaml"]
-    assert tools.ensure(["source-controller"], quiet) == first
+    assert tools.ensure(["source-controller"]) == first
     assert runs.read_text().split() == ["run"]
 
 
 def test_another_go_version_is_another_program(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first = tools.ensure(["etcd"], quiet)
+    first = tools.ensure(["etcd"])
     monkeypatch.setenv("FAKE_GO_VERSION", "1.27.0")
-    assert tools.ensure(["etcd"], quiet) != first
+    assert tools.ensure(["etcd"]) != first
     assert len(runs.read_text().split()) == 2
 
 
@@ -86,51 +71,45 @@ def test_two_runs_at_once_build_once(runs: Path, monkeypatch: pytest.MonkeyPatch
     assert any("another run is building" in text for text in said)
 
 
+@contextmanager
+def killed(program: str) -> Iterator[subprocess.Popen[str]]:
+    argv = [sys.executable, "-c", program]
+    run = subprocess.Popen(argv, cwd=ROOT, stdout=subprocess.PIPE, text=True)
+    try:
+        yield run
+    finally:
+        run.kill()
+        run.communicate()
+
+
 def test_a_killed_build_leaves_nothing_that_looks_done(
     runs: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("FAKE_GO_SECONDS", "30")
-    program = "from tests.e2e.rig import tools; tools.ensure(['etcd'])"
-    root = Path(__file__).resolve().parents[2]
-    run = subprocess.Popen([sys.executable, "-c", program], cwd=root)
-    try:
-        deadline = time.monotonic() + 60
-        while not list(tools.cache_root().glob(".building-*/etcd")):
-            assert time.monotonic() < deadline
-            time.sleep(0.05)
-    finally:
-        run.kill()
-        run.wait()
+    with killed("from tests.e2e.rig import tools; tools.ensure(['etcd'])"):
+        wait_until(lambda: [*tools.cache_root().glob(".building-*/etcd")], "a build")
     assert list(tools.cache_root().glob("etcd-*")) == []
     monkeypatch.setenv("FAKE_GO_SECONDS", "0")
-    assert tools.ensure(["etcd"], quiet)["etcd"].read_text() == "whole"
+    assert tools.ensure(["etcd"])["etcd"].read_text() == "whole"
     assert list(tools.cache_root().glob(".building-*")) == []
 
 
-def test_a_failed_build_shows_the_compilers_message(
-    runs: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("variable", "value", "told"),
+    [
+        ("FAKE_GO_FAULT", "main.go:1: syntax error", " failed with 2:\n  main.go:1: syntax error$"),
+        ("FAKE_GO_VERSION", "1.19.8", r"is go1\.19\.8, too old for .*/etcd/go\.mod: install Go "),
+        ("PATH", "/nowhere", re.escape("not on PATH: " + gobuild.REMEDY.format(needed="1.26"))),
+    ],
+    ids=["a failed build", "an old Go", "a missing Go"],
+)
+def test_a_fault_of_the_build_is_told(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, variable: str, value: str, told: str
 ) -> None:
-    monkeypatch.setenv("FAKE_GO_FAULT", "main.go:1: syntax error")
-    with pytest.raises(RigError) as caught:
-        tools.ensure(["etcd"], quiet)
-    assert str(caught.value).endswith(" failed with 2:\n  main.go:1: syntax error")
+    monkeypatch.setenv(variable, value)
+    with pytest.raises(RigError, match=told):
+        tools.ensure(["etcd"])
     assert list(tools.cache_root().glob("*etcd-*")) == []
-
-
-def test_an_old_go_is_named_with_what_to_install(
-    runs: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("FAKE_GO_VERSION", "1.19.8")
-    with pytest.raises(RigError, match=r"is go1\.19\.8, too old for .*/etcd/go\.mod: install Go "):
-        tools.ensure(["etcd"], quiet)
-
-
-def test_a_missing_go_is_named_with_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PATH", "/nowhere")
-    with pytest.raises(RigError) as caught:
-        tools.ensure(["etcd"], quiet)
-    expected = "tests/e2e/tools: `go` is not on PATH: " + gobuild.REMEDY.format(needed="1.26")
-    assert str(caught.value) == expected
 
 
 def test_every_wrapper_is_pinned_and_used() -> None:
@@ -138,11 +117,6 @@ def test_every_wrapper_is_pinned_and_used() -> None:
     assert folders == {tool.wrapper for tool in tools.TOOLS.values()}
     for folder in folders:
         assert (tools.WRAPPERS / folder / "go.sum").stat().st_size > 0
-
-
-def test_an_unknown_tool_is_refused() -> None:
-    with pytest.raises(RigError, match=r"^no such tool: kubelet; there are etcd, "):
-        tools.ensure(["kubelet"], quiet)
 
 
 @pytest.fixture
@@ -158,19 +132,41 @@ def shell(
     return Component(name, ("/bin/sh", "-c", script), probe, {}, seconds, stop_seconds=1)
 
 
-def test_a_start_that_fails_shows_reason_and_log(processes: Processes) -> None:
-    with pytest.raises(RigError) as caught:
-        processes.start_together([shell("x", "echo cannot bind; exit 3", lambda: "no answer")])
-    assert str(caught.value).startswith("x: ended with 3 after ")
-    assert str(caught.value).endswith("\n  cannot bind\n")
-
-
-def test_a_start_that_takes_too_long_shows_reason_and_log(processes: Processes) -> None:
-    component = shell("x", "echo waiting; sleep 60", lambda: "503 etcd not ready", seconds=3)
+@pytest.mark.parametrize(
+    ("component", "begins", "ends"),
+    [
+        (
+            shell("x", "echo cannot bind; exit 3", lambda: "no"),
+            "ended with 3 after ",
+            "cannot bind",
+        ),
+        (
+            shell("x", "echo waiting; sleep 60", lambda: "503 etcd", seconds=3),
+            "not ready after 3 s: 503 etcd\n",
+            "waiting",
+        ),
+    ],
+    ids=["it ends", "it takes too long"],
+)
+def test_a_start_that_fails_shows_reason_and_log(
+    processes: Processes, component: Component, begins: str, ends: str
+) -> None:
     with pytest.raises(RigError) as caught:
         processes.start_together([component])
-    assert str(caught.value).startswith("x: not ready after 3 s: 503 etcd not ready\n")
-    assert str(caught.value).endswith("\n  waiting\n")
+    assert str(caught.value).startswith(f"x: {begins}")
+    assert str(caught.value).endswith(f"\n  {ends}\n")
+
+
+def test_a_part_that_dies_is_named_while_a_test_waits_for_the_cluster(
+    processes: Processes, tmp_path: Path
+) -> None:
+    end = tmp_path / "end"
+    script = f"echo a fault; until [ -e {end} ]; do sleep 0.1; done"
+    processes.start_together([shell("part", script)])
+    kube = Kube(kubeconfig(tmp_path, "http://127.0.0.1:9"), tmp_path, processes.check)
+    with pytest.raises(RigError, match=r"^part: ended with 0 after .*\n.*\n(.*\n)?  a fault\n$"):
+        kube.wait("an event that never happens", end.touch)
+    kube.close()
 
 
 def test_a_process_that_ignores_sigterm_is_killed_with_its_children(
@@ -180,7 +176,7 @@ def test_a_process_that_ignores_sigterm_is_killed_with_its_children(
     script = f"trap '' TERM; sleep 60 & echo $! > {note}; while :; do sleep 1; done"
     processes.start_together([shell("deaf", script, lambda: None if note.exists() else "not yet")])
     pid = processes.pids()["deaf"]
-    time.sleep(0.2)
+    wait_until(lambda: bool(note.read_text()), "the child's pid")
     child = int(note.read_text())
     processes.stop_all()
     assert processes.pids() == {}
@@ -188,34 +184,25 @@ def test_a_process_that_ignores_sigterm_is_killed_with_its_children(
     assert not Path(f"/proc/{child}").exists()
 
 
-def test_a_process_outlives_the_thread_that_started_it(
-    processes: Processes, tmp_path: Path
-) -> None:
-    note = tmp_path / "note"  # once this file exists, the process is bound to its parent
-    component = shell(
-        "long", f"touch {note}; sleep 60", lambda: None if note.exists() else "not yet"
-    )
-    thread = threading.Thread(target=processes.start_together, args=([component],))
-    thread.start()
-    thread.join()
-    time.sleep(0.3)
-    processes.check()
+def test_nothing_outlives_a_killed_test_run(tmp_path: Path) -> None:
+    program = "import json, time; from tests.e2e.test_rig_parts import *\n"
+    program += f"p = Processes(Path({str(tmp_path)!r}), {{}}); p.start_together([shell('long',"
+    program += "'sleep 300')]); print(json.dumps(p.pids()), flush=True); time.sleep(300)"
+    with killed(program) as run:
+        assert run.stdout is not None
+        pids = json.loads(run.stdout.readline())
+    wait_until(lambda: not Path(f"/proc/{pids['long']}").exists(), "the end of the part")
 
 
 @pytest.fixture
-def git_port(tmp_path: Path) -> Iterator[int]:
-    server = githttp.GitServer(tmp_path / "served", net.LOOPBACK, net.free_port(), githttp.Handler)
-    thread = threading.Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05})
-    thread.start()
-    yield server.server_address[1]
-    server.shutdown()
-    thread.join()
-    server.server_close()
+def git_url(tmp_path: Path) -> Iterator[str]:
+    with running(githttp.GitServer(tmp_path / "served", net.LOOPBACK, 0, githttp.Handler)) as url:
+        yield url
 
 
-def test_a_large_push_and_a_partial_clone(git_port: int, tmp_path: Path) -> None:
+def test_a_large_push_and_a_partial_clone(git_url: str, tmp_path: Path) -> None:
     """Git sends a pack above one megabyte in chunks, and a fetch can leave out blobs."""
-    address = f"{net.url(git_port)}/a/state.git"
+    address = f"{git_url}/a/state.git"
     noise = os.urandom(3_000_000).hex()
     commit = Clone(address, tmp_path / "one").push({"big": noise, "small": "s"})
     other = Clone(address, tmp_path / "two")
@@ -229,17 +216,15 @@ def test_a_large_push_and_a_partial_clone(git_port: int, tmp_path: Path) -> None
     assert (other.folder / "big").read_text() == noise
 
 
-def test_of_two_pushes_from_one_commit_the_second_is_refused(git_port: int, tmp_path: Path) -> None:
-    address = f"{net.url(git_port)}/state.git"
+def test_what_the_git_server_refuses(git_url: str, tmp_path: Path) -> None:
+    """It refuses the second of two pushes from one commit, and creates nothing for a reader."""
+    address = f"{git_url}/state.git"
     Clone(address, tmp_path / "one").push({"a": "1"})
     with pytest.raises(AssertionError, match=r"\[rejected\]"):
         Clone(address, tmp_path / "two").push({"b": "1"})
-
-
-def test_reading_a_missing_repository_creates_nothing(git_port: int, tmp_path: Path) -> None:
     with pytest.raises(AssertionError, match="not found"):
-        Clone(f"{net.url(git_port)}/none.git", tmp_path / "one").git("fetch", "origin")
-    assert list((tmp_path / "served").glob("*")) == []
+        Clone(f"{git_url}/none.git", tmp_path / "three").git("fetch", "origin")
+    assert [path.name for path in (tmp_path / "served").iterdir()] == ["state.git"]
 
 
 def test_half_an_existing_cluster_is_refused(
@@ -256,14 +241,6 @@ def test_half_an_existing_cluster_is_refused(
     monkeypatch.setenv("E2E_GIT_URL", "http://git.example/")
     found = settings.Existing(config, "http://git.example", "http://git.example")
     assert settings.existing("edge") == found
-
-
-def test_node_names_keep_different_ids_apart() -> None:
-    names = {kwok.node_name(node_id) for node_id in ("vehicle00", "vehicle_00", "Vehicle00", "v")}
-    assert len(names) == 4
-    assert kwok.node_name("vehicle00") == "vehicle00"
-    with pytest.raises(RigError, match="not a label value"):
-        kwok.manifest("vehicle/00")
 
 
 def test_a_dead_runs_folder_is_swept_and_a_living_ones_is_not(

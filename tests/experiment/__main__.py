@@ -7,56 +7,45 @@ import os
 import shutil
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 from tests.kit.bag import write_bag
+from tests.kit.browser import chromium
 
-from . import crowd, figures, report, routes
+from . import crowd, report, routes
 from .bags import bag_tracks
 from .checks import checks
 from .experiment import ROOT, Experiment
 from .fleet import Carrier
 from .large import LargeExperiment
 from .measures import STAGES, quantiles, savings, steps
-from .outcome import Settings
+from .outcome import Outcome, Settings
 from .rules import Near
 
 
-def main() -> int:
-    """Run the experiment and write its report; return 0 if all checks pass, else 1."""
+def _settings() -> Settings:
     parser = argparse.ArgumentParser(prog="make experiment EXPERIMENT=…", description=__doc__)
-    parser.add_argument("--gitops", choices=("flux", "argocd"), default="flux")
-    parser.add_argument(
-        "--connections",
-        choices=get_args(Carrier),
-        default="mqtt",
-        help="what carries the data to the edge",
-    )
-    parser.add_argument("--seed", type=int, default=0, help="0: the paper's order of events")
-    parser.add_argument(
-        "--gap",
-        type=float,
-        default=10.0,
-        help="about how many seconds of driving lie between two events",
-    )
-    parser.add_argument("--short", action="store_true", help="one vehicle comes and leaves")
-    parser.add_argument("--vanish", choices=routes.VEHICLES, default="", help="who falls silent")
-    parser.add_argument(
-        "--large",
-        type=int,
-        nargs="?",
-        const=200,
-        default=0,
-        metavar="VEHICLES",
-        help="the larger experiment: 200 vehicles or as many as given, which only send poses",
-    )
-    parser.add_argument("--bag", default="", help="take the vehicles' poses from a recorded bag")
+    add = parser.add_argument
+    add("--gitops", choices=("flux", "argocd"), default="flux")
+    add("--connections", choices=get_args(Carrier), default="mqtt", help="carry data to the edge")
+    add("--seed", type=int, default=0, help="0: the paper's order of events")
+    add("--gap", type=float, default=10.0, help="about how many seconds lie between two events")
+    add("--short", action="store_true", help="one vehicle comes and leaves")
+    add("--vanish", choices=routes.VEHICLES, default="", help="who falls silent")
+    many = "the larger experiment: 200 vehicles or as many as given, which only send poses"
+    add("--large", type=int, nargs="?", const=200, default=0, metavar="VEHICLES", help=many)
+    add("--bag", default="", help="take the vehicles' poses from a recorded bag")
     given = parser.parse_args()
-    tracks = bag_tracks(Path(given.bag), Near.read()) if given.bag else ()
     if given.large and (given.gitops, given.connections) != ("flux", "mqtt"):
         parser.error("--large runs with Flux and MQTT only")
-    settings = Settings(**vars(given), tracks=tracks)
+    tracks = bag_tracks(Path(given.bag), Near.read()) if given.bag else ()
+    return Settings(**vars(given), tracks=tracks)
+
+
+def main() -> int:
+    settings = _settings()
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     folder = ROOT / "build" / "experiment"
     shutil.rmtree(folder, ignore_errors=True)
@@ -79,15 +68,18 @@ def main() -> int:
     say(f"the poses that the vehicles sent are recorded in {bag.relative_to(ROOT)}")
     file = folder / "report.html"
     file.write_text(report.page(outcome, found))
-    plots = report.plots(outcome)
-    for name, plot in plots.items():
-        (folder / f"{name}.svg").write_text(plot)
     if os.environ.get("FIGURES"):
-        figures.draw(plots, ROOT / "docs" / "figures")
+        _draw(report.plots(outcome), ROOT / "docs" / "figures")
     for check in found:
         print(f"{'ok   ' if check.holds else 'FAULT'} {check.name}")
         if not check.holds:
             print(f"      {check.fault}")
+    _print_measures(outcome)
+    print(f"report: {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}")
+    return 0 if all(check.holds for check in found) else 1
+
+
+def _print_measures(outcome: Outcome) -> None:
     for joins, word in ((True, "joins"), (False, "leaves")):
         delays = [step.delays() for step in steps(outcome) if step.event.joins is joins]
         for stage in STAGES:
@@ -98,8 +90,16 @@ def main() -> int:
     for saving in savings(outcome):
         amounts = f"{saving.on_demand:.2f} in place of {saving.always:.2f} {saving.unit}".rstrip()
         print(f"      {saving.name}: {amounts}, {saving.saved:.0%} saved")
-    print(f"report: {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}")
-    return 0 if all(check.holds for check in found) else 1
+
+
+def _draw(plots: Mapping[str, str], folder: Path) -> None:
+    """Draw the plots as images for the docs, with a headless browser."""
+    size: Any = {"width": 900, "height": 600}
+    with chromium() as browser:
+        page = browser.new_page(viewport=size, device_scale_factor=1.5)
+        for name, plot in plots.items():
+            page.set_content(f'<body style="margin:0">{plot}</body>')
+            page.locator("svg").screenshot(path=folder / f"experiment-{name}.png")
 
 
 if __name__ == "__main__":

@@ -1,10 +1,9 @@
-"""A real MQTT broker on loopback, with counts of the messages that it carries."""
+"""A real MQTT broker on loopback, with counts of the bytes that it carries."""
 
 from __future__ import annotations
 
 import shutil
 import subprocess
-import time
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -12,17 +11,17 @@ from typing import Any
 import paho.mqtt.client as mqtt
 
 from tests.e2e.rig import launch
-from tests.e2e.rig.net import free_port
+from tests.e2e.rig.net import accepts, free_port
+from tests.kit.generator import wait_until
 from tests.kit.limits import PATIENCE_S
 
 
 class Broker:
-    """A mosquitto, and a client that counts the messages and bytes of each topic."""
+    """A mosquitto, and a client that counts the bytes of each topic."""
 
     def __init__(self, folder: Path) -> None:
         self.port = free_port()
         self.bytes: Counter[str] = Counter()
-        self.messages: Counter[str] = Counter()
         program = shutil.which("mosquitto") or shutil.which("mosquitto", path="/usr/sbin")
         assert program, "mosquitto is missing; run `setup/system e2e` as root to install it"
         configuration = folder / "mosquitto.conf"
@@ -34,23 +33,13 @@ class Broker:
         self._counter = mqtt.Client(mqtt.CallbackAPIVersion.VERSION2)
         self._counter.on_connect = lambda client, *_: client.subscribe("#")
         self._counter.on_message = self._count
-        self._connect()
+        answers = accepts(self.port)
+        wait_until(lambda: answers() is None or self._process.poll() is not None, "mosquitto")
+        self._counter.connect("127.0.0.1", self.port)
         self._counter.loop_start()
-
-    def _connect(self) -> None:
-        deadline = time.monotonic() + PATIENCE_S
-        while True:
-            try:
-                self._counter.connect("127.0.0.1", self.port)
-                return
-            except OSError:
-                if self._process.poll() is not None or time.monotonic() > deadline:
-                    raise
-                time.sleep(0.05)
 
     def _count(self, _: object, __: object, message: Any) -> None:
         self.bytes[message.topic] += len(message.payload)
-        self.messages[message.topic] += 1
 
     def close(self) -> None:
         self._counter.disconnect()

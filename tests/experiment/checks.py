@@ -53,7 +53,6 @@ def checks(outcome: Outcome) -> list[Check]:
 
 
 def differ(expected: object, found: object) -> str:
-    """Return a text with both values if they differ, else an empty text."""
     return "" if expected == found else f"expected {expected}, found {found}"
 
 
@@ -96,7 +95,6 @@ def _inputs(outcome: Outcome) -> Iterator[str]:
 
 
 def _busy_periods(joins: Iterable[bool]) -> int:
-    """Return the number of periods in which at least one vehicle was near."""
     count = inside = 0
     for joined in joins:
         count += joined and inside == 0

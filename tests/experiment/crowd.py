@@ -14,6 +14,7 @@ import yaml
 
 from tests.e2e.common.expected import CLUSTER
 
+from . import fleet
 from .checks import Check, check_nodes, differ
 from .outcome import Formed, Outcome
 from .routes import MIDDLES
@@ -51,10 +52,7 @@ def files(vehicles: Collection[str], clusters: str) -> dict[str, str]:
 
 
 def rules(near: Near) -> str:
-    """Return a rule file with a rule for each intersection.
-
-    Each rule is a copy of the example's last rule, which is for vehicles without a lidar.
-    """
+    """Return the example's last rule, for vehicles without a lidar, for each intersection."""
     found: dict[str, Any] = yaml.safe_load(RULES.read_text())
     text = yaml.safe_dump(found["rules"][-1])
     found["rules"] = []
@@ -74,10 +72,7 @@ def rules(near: Near) -> str:
 
 
 def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> list[Event]:
-    """Return the events before `until`, sorted by time.
-
-    `passing` maps each vehicle to the nearness condition of the intersection that it passes.
-    """
+    """Return the events before `until` in order; `passing` maps vehicles to their intersections."""
     own: defaultdict[Near, list[Pose]] = defaultdict(list)
     for pose in poses:
         own[passing[pose.vehicle]].append(pose)
@@ -86,22 +81,10 @@ def events(poses: Iterable[Pose], passing: Mapping[str, Near], until: float) -> 
 
 
 def requesters(inside: Mapping[str, int]) -> dict[str, list[str]]:
-    """Return the requesters of each service and connection while the given vehicles are near.
-
-    `inside` maps each of these vehicles to the number of the intersection that it is near.
-    """
+    """Return the requesters while each vehicle is near the intersection of this number."""
     rows: dict[str, list[str]] = {}
     for number, (edge, station) in enumerate(zip(EDGES, STATIONS, strict=True)):
-        here = sorted(vehicle for vehicle, at in inside.items() if at == number)
-        if not here:
-            continue
-        everybody = sorted({station, *here})
-        rows |= {
-            f"connection {station} to {edge}": everybody,
-            f"object-detection {station}": everybody,
-            f"object-fusion {edge}/object_detection_fusion": everybody,
-        }
-        rows |= {f"connection {one} to {edge}": sorted({station, one}) for one in here}
+        rows |= fleet.requesters([one for one, at in inside.items() if at == number], edge, station)
     return dict(sorted(rows.items()))
 
 
@@ -119,10 +102,7 @@ def checks(outcome: Outcome, passing: Mapping[str, int]) -> list[Check]:
 
 
 def _by_vehicle(found: Iterable[Event] | Iterable[Formed]) -> dict[str, list[bool]]:
-    """Return each vehicle's joins (true) and leaves (false), in their order.
-
-    The order of events of different vehicles does not count.
-    """
+    """Return each vehicle's joins (true) and leaves (false) in order."""
     by_vehicle: defaultdict[str, list[bool]] = defaultdict(list)
     for one in found:
         by_vehicle[one.vehicle].append(one.joins)

@@ -18,10 +18,11 @@ from examples.experiment import paper
 from tests.e2e.common.answers import limited_world
 from tests.e2e.common.expected import CLUSTER
 from tests.e2e.common.ros import Client
-from tests.e2e.common.staterepo import StateRepo, demandops, environment
+from tests.e2e.common.world import World, demandops, environment
 from tests.e2e.rig import launch
 from tests.e2e.rig.cluster import Rig
 from tests.kit.limits import PATIENCE_S
+from tests.kit.repo import git
 from tests.kit.ros import reserved
 
 from . import fleet, routes
@@ -30,21 +31,18 @@ from .observers import CloudObserver, EdgeObserver
 from .outcome import Formed, Outcome, Settings
 from .participants import POSE, Plan
 from .process_runner import ProcessRunner
-from .rules import Event, Near, causes, events_of, poses_in, predicted
-from .standins.image import image
+from .rules import Event, Near, Pose, causes, events_of, poses_in, predicted
+from .standins import image
 
 ROOT = Path(__file__).resolve().parents[2]
 _STAND_S = 0.5
 """How many seconds before an event's cause the vehicles stop, to wait for the event before it."""
-_CONTROLLER = {"flux": "flux", "argocd": "argo cd"}  # as docs/status.md names them
+_INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
 
-
-Say = Callable[[str], object]
+Say = Callable[[str], None]
 
 
 class Experiment:
-    """A run of the experiment; it starts its parts one after the other."""
-
     def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
         self._settings, self._folder, self._say = settings, folder, say
         self._near, self._routes = Near.read(), settings.routes()
@@ -58,27 +56,29 @@ class Experiment:
             return self._drive()
 
     def _start_cluster(self) -> None:
-        settings = self._settings
-        rig = Rig(CLUSTER, gitops=settings.gitops, nodes=fleet.NODES, report=self._say)
-        rig.start()
-        self._stack.push(lambda kind, *_: rig.stop(failed=kind is not None))
-        self._say(f"the cluster is up: {rig.timings}")
+        rig = Rig(CLUSTER, gitops=self._settings.gitops, nodes=fleet.NODES, report=self._say)
+        self._rig = self._stack.enter_context(rig)
+        self._rigs = {CLUSTER: rig}
+        self._say("the cluster is up")
         self._domains = {node: self._stack.enter_context(reserved()) for node in fleet.NODES}
         self._brokers = {node: Broker(self._made(f"broker-{node}")) for node in ("cloud", "edge")}
         for broker in self._brokers.values():
             self._stack.callback(broker.close)
-        self._rig, self._rigs = rig, {CLUSTER: rig}
 
-    def _start_fleet(self) -> None:
-        rig, folder = self._rig, self._made("generator")
+    def _start_world(self) -> World:
         client = Client(self._domains["cloud"])
         self._stack.callback(client.close)
-        self._world = world = _world(rig, folder, self._domains["cloud"], client)
-        self._stack.callback(world.generator.stop)
+        folder = self._made("generator")
+        self._world = World(self._rig, folder, self._domains["cloud"], client)
+        self._stack.callback(self._world.generator.stop)
+        return self._world
+
+    def _start_fleet(self) -> None:
+        rig, world = self._rig, self._start_world()
         ports = {node: broker.port for node, broker in self._brokers.items()}
         given = (world.file(name) for name in ("inventory/nodes.yaml", "registry/images.yaml"))
         world.push(fleet.files(*given, self._domains, ports))
-        limited_world(world, rig, _CONTROLLER[self._settings.gitops])
+        limited_world(world, rig)
         self._runner = ProcessRunner(
             rig.kube,
             world.domain.namespace,
@@ -95,20 +95,7 @@ class Experiment:
 
     def _deploy_initially(self) -> None:
         """Let connections carry the vehicles' poses to the cloud, and start the detector there."""
-        record = self._folder / "poses.jsonl"
-        plan = Plan(
-            self._routes,
-            self._near.point,
-            self._domains,
-            self._settings.seed,
-            str(record),
-            fleet.station_cloud(self._settings.connections),
-        )
-        plan.write(self._folder / "plan.json")
-        self._participants = self._start(
-            "participants", "tests.experiment.participants", str(self._folder / "plan.json")
-        )
-        assert self._read()["ready"]
+        self._start_participants(fleet.station_cloud(self._settings.connections))
         vehicles = [route.vehicle for route in self._routes]
         self._world.demand(fleet.initial_deployment(vehicles))
         for vehicle in vehicles:
@@ -117,15 +104,22 @@ class Experiment:
                 lambda v=vehicle: len(self._cloud.arrivals[POSE.format(v)]) > 0,
             )
         self._wait("the pods of the initial deployment", self._is_ready)
-        self._before = self._world.domain.lines()
+        self._before = self._lines()
         self._say("the initial deployment carries the vehicles' poses to the cloud")
-        rules = self._folder / "rules.yaml"
-        rules.write_text(fleet.rules(self._settings.connections))
-        self._detect(rules)
+        self._detect(fleet.rules(self._settings.connections))
 
-    def _detect(self, rules: Path) -> None:
-        """Start the detector in the cloud, and wait until it is ready."""
-        options = ["detect", str(rules)]
+    def _start_participants(self, station_cloud: str, *, poses_only: bool = False) -> None:
+        record, file = str(self._folder / "poses.jsonl"), self._folder / "plan.json"
+        seed, origin = self._settings.seed, self._near.point
+        plan = Plan(self._routes, origin, self._domains, seed, record, station_cloud, poses_only)
+        plan.write(file)
+        self._participants = self._start("participants", "tests.experiment.participants", str(file))
+        assert self._read()["ready"]
+
+    def _detect(self, rules: str) -> None:
+        file = self._folder / "rules.yaml"
+        file.write_text(rules)
+        options = ["detect", str(file)]
         self._detector = self._start("detector", "demandops.cli.main", *options, domain="cloud")
         self._wait("the detector's start", lambda: "detecting; rules: " in self._log("detector"))
 
@@ -147,48 +141,57 @@ class Experiment:
         self._wait("the last demands", lambda: self._released(first_commit, len(happens)))
         self._wait_until_as_before(PATIENCE_S)
         time.sleep(2.0)  # time for messages that must not come
-        over, left = time.time(), self._world.domain.lines()
-        self._end(self._detector)
-        self._participants.send_signal(signal.SIGTERM)
-        said = self._read()
-        poses = poses_in(self._folder / "poses.jsonl")
-        return Outcome(
-            settings=self._settings,
-            routes=self._routes,
-            near=self._near,
+        over = time.time()
+        return self._outcome(
+            events_of(self._poses(), self._near, over),
             set_off=set_off,
             over=over,
-            poses=poses,
-            events=events_of(poses, self._near, over),
             formed=list(self._formed(first_commit)),
             pods=[
                 pod for pod in self._runner.pods.values() if not pod.service.startswith(_INITIAL)
             ],
-            node_ids=self._node_ids(),
             inputs=self._edge.inputs,
-            fused=self._edge.fused,
             tracks=self._edge.tracks,
             arrivals=dict(self._edge.arrivals),
             early=early,
+            carried=self._carried(),
+        )
+
+    def _outcome(self, events: list[Event], **more: Any) -> Outcome:
+        """End detector and participants; return the outcome with what all runs observe."""
+        left = self._lines()
+        self._detector.send_signal(signal.SIGTERM)
+        self._detector.wait(PATIENCE_S)
+        self._participants.send_signal(signal.SIGTERM)
+        said = self._read()
+        return Outcome(
+            settings=self._settings,
+            routes=self._routes,
+            near=self._near,
+            poses=self._poses(),
+            events=events,
+            node_ids=self._node_ids(),
             held=said["held"],
             published=said["sent"],
-            carried=self._carried(),
             left=left,
             before=self._before,
+            **more,
         )
 
     # --- observing --------------------------------------------------------------------------
 
     def _events(self) -> list[Event]:
-        return events_of(poses_in(self._folder / "poses.jsonl"), self._near, time.time())
+        return events_of(self._poses(), self._near, time.time())
+
+    def _poses(self) -> list[Pose]:
+        return poses_in(self._folder / "poses.jsonl")
 
     def _arrived(self) -> int:
-        return sum(len(times) for times in self._edge.arrivals.values()) + len(self._edge.fused)
+        return sum(map(len, self._edge.arrivals.values()))
 
     def _commits(self, since: str) -> list[str]:
         repository = self._rig.repository(self._world.name)
-        command = ["git", "-C", str(repository), "rev-list", "--reverse", f"{since}..main"]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+        return git(repository, "rev-list", "--reverse", f"{since}..main").split()
 
     def _released(self, since: str, expected: int) -> bool:
         """Return whether all commits are made, and only the initial deployment is booked."""
@@ -211,12 +214,10 @@ class Experiment:
         return self._is_fused(events[-1]) if events[-1].joins else not self._runs(events[-1])
 
     def _is_fused(self, event: Event) -> bool:
-        poses = poses_in(self._folder / "poses.jsonl")
-        own = {(p.x, p.y) for p in poses if p.vehicle == event.vehicle and p.at >= event.at}
+        own = {(p.x, p.y) for p in self._poses() if p.vehicle == event.vehicle and p.at >= event.at}
         return any(at >= event.at and own & set(seen) for at, seen in list(self._edge.tracks))
 
     def _runs(self, event: Event) -> bool:
-        """Return whether a client is running for the vehicle's connection to the edge."""
         carrier = self._settings.connections
         running = [pod for pod in list(self._runner.pods.values()) if pod.ended is None]
         return any(fleet.is_client(pod.service, event.vehicle, carrier) for pod in running)
@@ -234,17 +235,13 @@ class Experiment:
         return self._world.domain.lines()
 
     def _wait_until_as_before(self, seconds: float) -> None:
-        """Wait until the clusters have exactly the objects from before the first demand."""
         if not self._reaches(lambda: self._lines() == self._before, seconds):
             lines = self._lines()
             stays, lacks = sorted(lines - self._before), sorted(self._before - lines)
             raise AssertionError(f"after {seconds:.0f} s, left over: {stays}; missing: {lacks}")
 
     def _bookkeeping(self, commit: str) -> dict[str, list[str]]:
-        """Return the requesters of each service and connection after a commit.
-
-        The result leaves out the initial deployment.
-        """
+        """Return the requesters after a commit, without the initial deployment."""
         repository = str(self._rig.repository(self._world.name))
         options = ("--state-repo", repository, "--at", commit, "--output", "json")
         printed = json.loads(demandops(self._made("reader"), "bookkeeping", *options))
@@ -290,10 +287,6 @@ class Experiment:
         self._participants.stdin.write(f"{moment}\n")
         self._participants.stdin.flush()
 
-    def _end(self, process: Any) -> None:
-        process.send_signal(signal.SIGTERM)
-        process.wait(PATIENCE_S)
-
     def _read(self) -> dict[str, Any]:
         line = self._participants.stdout.readline()
         assert line, f"the participants ended: {self._log('participants')}"
@@ -309,18 +302,13 @@ class Experiment:
         deadline = time.monotonic() + seconds
         while not holds():
             self._rig.check()
-            for name, process in self._parts():
-                assert process.poll() is None, f"the {name} ended: {self._log(name)}"
+            for name in ("participants", "detector"):
+                process = getattr(self, f"_{name}", None)
+                assert process is None or process.poll() is None, f"{name}: {self._log(name)}"
             if time.monotonic() > deadline:
                 return False
             time.sleep(0.1)
         return True
-
-    def _parts(self) -> Iterator[tuple[str, Any]]:
-        for name in ("participants", "detector"):
-            process = getattr(self, f"_{name}", None)
-            if process is not None:
-                yield name, process
 
     def _made(self, name: str) -> Path:
         folder = self._folder / name
@@ -328,28 +316,12 @@ class Experiment:
         return folder
 
 
-_INITIAL = tuple(f"mqtt-{vehicle}-cloud-" for vehicle in routes.VEHICLES)
-
-
 def _stand(happens: list[float], number: int) -> float:
-    """Return when the vehicles must stop so that they cause only the first `number` events.
-
-    The time is shortly before the cause of the next event, or infinity if no event is left.
-    """
+    """Return the time shortly before the cause of the event after the first `number`."""
     if number == len(happens):
         return math.inf
     before, after = happens[number - 1 : number + 1]
     return after - min(_STAND_S, (after - before) / 2)
-
-
-def _world(rig: Rig, folder: Path, domain: int, client: Client) -> StateRepo[Any]:
-    if rig.gitops == "argocd":
-        from tests.e2e.argocd.world import World as ArgoWorld
-
-        return ArgoWorld(rig, folder, domain, client)
-    from tests.e2e.flux.world import World as FluxWorld
-
-    return FluxWorld(rig, folder, domain, client)
 
 
 def _python_path() -> str:

@@ -12,6 +12,8 @@ import yaml
 
 from examples.experiment.paper import S
 from tests.e2e.rig.net import free_port
+from tests.kit import goals
+from tests.kit.config import override
 
 from .participants import POSE, STATION_CLOUD
 from .routes import VEHICLES
@@ -19,16 +21,8 @@ from .rules import RULES
 
 Carrier = Literal["mqtt", "zenoh"]
 NODES = (*VEHICLES, S, "edge", "cloud")
-_SYNC = {
-    "apiVersion": "demandops/v1",
-    "kind": "Override",
-    "reason": "The fusion follows its ConfigMap by a watch",
-    "owner": "experiment",
-    "select": [{"services": ["object-fusion"]}],
-    "values": {"watcher": {"package": "demandops_ros", "launchFile": "parameter_sync.launch.xml"}},
-}
-
-
+_WATCHER = {"package": "demandops_ros", "launchFile": "parameter_sync.launch.xml"}
+"""Lets the fusion follow its ConfigMap by a watch."""
 _BRIDGE = {"repository": "docker.io/eclipse/zenoh-bridge-ros2dds", "tag": "1.10.0"}
 _ZENOH = 2
 STATION_CLOUD_TARGET = f"/stations/{S}/pointcloud"
@@ -37,12 +31,9 @@ STATION_CLOUD_TARGET = f"/stations/{S}/pointcloud"
 def files(
     nodes: str, images: str, domains: dict[str, int], ports: dict[str, int]
 ) -> dict[str, str]:
-    """Return the texts, by path, of the files that differ from the skeleton's.
+    """Return what differs from the skeleton's files, of which `nodes` and `images` are two.
 
-    Args:
-        nodes, images: `inventory/nodes.yaml` and `registry/images.yaml` of the skeleton.
-        domains: the ROS domain of each node.
-        ports: the port of each node's MQTT broker on this machine.
+    `domains` and `ports` are the ROS domain and the MQTT broker's port of each node.
     """
     inventory: dict[str, Any] = yaml.safe_load(nodes)
     registry: dict[str, Any] = yaml.safe_load(images)
@@ -52,13 +43,14 @@ def files(
         edge = {"endpoint": f"tcp/127.0.0.1:{free_port()}"}
         node["zenoh"] = edge if node["id"] == "edge" else {}
     brokers = [{"node": node, "host": "127.0.0.1", "port": port} for node, port in ports.items()]
+    synchronized = override({"services": ["object-fusion"]}, values={"watcher": _WATCHER})
     return {
         "inventory/nodes.yaml": yaml.safe_dump(inventory),
         "registry/images.yaml": yaml.safe_dump(registry),
         "inventory/brokers.yaml": yaml.safe_dump(
             {"apiVersion": "demandops/v1", "kind": "Brokers", "brokers": brokers}
         ),
-        "overrides/parameter-sync.yaml": yaml.safe_dump(_SYNC),
+        "overrides/parameter-sync.yaml": synchronized,
     }
 
 
@@ -80,7 +72,6 @@ def rules(carrier: Carrier) -> str:
 
 
 def station_cloud(carrier: Carrier) -> str:
-    """Return the topic on which the station publishes its point cloud."""
     return STATION_CLOUD if carrier == "mqtt" else STATION_CLOUD_TARGET
 
 
@@ -97,41 +88,34 @@ def is_client(service: str, vehicle: str, carrier: Carrier) -> bool:
 
 def initial_deployment(vehicles: Collection[str]) -> dict[str, Any]:
     """Return the goal that brings every vehicle's poses to the cloud, for the detector."""
-    return {
-        "id": "initial-deployment",
-        "shutdown": False,
-        "connections": [
-            {
-                "id": f"{vehicle}/cloud",
-                "broker_node_id": "cloud",
-                "requester_ids": ["operator"],
-                "source_node_id": vehicle,
-                "target_node_id": "cloud",
-                "source_topics": [POSE.format(vehicle)],
-                "target_topics": [POSE.format(vehicle)],
-                "type": 1,
-            }
-            for vehicle in vehicles
-        ],
-    }
+    carried = [
+        goals.connection(
+            f"{vehicle}/cloud",
+            who=["operator"],
+            ends=(vehicle, "cloud"),
+            topics=[POSE.format(vehicle)],
+            broker="cloud",
+        )
+        for vehicle in vehicles
+    ]
+    return goals.goal([], carried, id="initial-deployment")
 
 
-def requesters(inside: Collection[str]) -> dict[str, list[str]]:
-    """Return the requesters of each service and connection while these vehicles are near.
-
-    The result extends the paper's table to any set of vehicles.
-    """
+def requesters(
+    inside: Collection[str], edge: str = "edge", station: str = S
+) -> dict[str, list[str]]:
+    """Extend the paper's table to any set of vehicles, and to another intersection."""
     if not inside:
         return {}
-    everybody = sorted({S, *inside})
+    everybody = sorted({station, *inside})
     rows = {
-        f"connection {S} to edge": everybody,
-        f"object-detection {S}": everybody,
-        "object-fusion edge/object_detection_fusion": everybody,
+        f"connection {station} to {edge}": everybody,
+        f"object-detection {station}": everybody,
+        f"object-fusion {edge}/object_detection_fusion": everybody,
     }
-    rows |= {f"connection {vehicle} to edge": sorted({S, vehicle}) for vehicle in inside}
+    rows |= {f"connection {vehicle} to {edge}": sorted({station, vehicle}) for vehicle in inside}
     if VEHICLES[0] in inside:
-        rows[f"object-detection {VEHICLES[0]}"] = sorted({S, VEHICLES[0]})
+        rows[f"object-detection {VEHICLES[0]}"] = sorted({station, VEHICLES[0]})
     return dict(sorted(rows.items()))
 
 

@@ -8,28 +8,21 @@ the paper's experiment. No containers run, so no data flows.
 from __future__ import annotations
 
 import math
-import signal
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
-import yaml
-
-from tests.e2e.common.access import documented_roles, limited
+from tests.e2e.common.access import access_file, documented_roles, limited
 from tests.e2e.common.expected import CLUSTER, WITHOUT_DEMANDS
-from tests.e2e.common.ros import Client
-from tests.e2e.flux.world import World
 from tests.e2e.rig.cluster import Rig
+from tests.kit.repo import git
 from tests.kit.ros import reserved
 
 from . import crowd
 from .experiment import Experiment, Say
 from .observers import CloudObserver
 from .outcome import Formed, Outcome, Settings
-from .participants import Plan
 from .process_runner import ProcessRunner
-from .rules import poses_in
 
 _LOOKS = 12
 """The run records the whole bookkeeping at about this many of its commits.
@@ -50,8 +43,6 @@ class PodWatch(ProcessRunner):
 
 
 class LargeExperiment(Experiment):
-    """A run of the larger experiment; it starts its parts one after the other."""
-
     def __init__(self, settings: Settings, folder: Path, say: Say) -> None:
         super().__init__(settings, folder, say)
         self._crossings = crowd.crossings(self._near)
@@ -64,100 +55,57 @@ class LargeExperiment(Experiment):
 
     def _start_cluster(self) -> None:
         vehicles = [route.vehicle for route in self._routes]
-        self._rig = rig = Rig(CLUSTER, nodes=crowd.NODES, report=self._say)
-        self._rigs = {CLUSTER: rig}
-        rig.start()
-        self._stack.push(lambda kind, *_: rig.stop(failed=kind is not None))
-        self._rigs[crowd.FLEET] = fleet = Rig(crowd.FLEET, nodes=vehicles, git_of=rig)
-        fleet.start()
-        self._stack.push(lambda kind, *_: fleet.stop(failed=kind is not None))
+        self._rig = self._stack.enter_context(Rig(CLUSTER, nodes=crowd.NODES, report=self._say))
+        fleet = self._stack.enter_context(Rig(crowd.FLEET, nodes=vehicles, git_of=self._rig))
+        self._rigs = {CLUSTER: self._rig, crowd.FLEET: fleet}
         self._domains = {"cloud": self._stack.enter_context(reserved())}
         self._say(f"two clusters are up, with {len(vehicles) + len(crowd.NODES)} nodes")
 
     def _start_fleet(self) -> None:
-        folder = self._made("generator")
-        client = Client(self._domains["cloud"])
-        self._stack.callback(client.close)
-        self._world = world = World(self._rig, folder, self._domains["cloud"], client)
-        self._stack.callback(world.generator.stop)
+        world = self._start_world()
         world.push(crowd.files(self.passing.keys(), world.file("inventory/clusters.yaml")))
         world.generator.start()
         bootstrap = f"bootstrap/{crowd.FLEET}.yaml"
         self._wait("the second cluster's bootstrap file", lambda: self._exists(bootstrap))
         access, self._watches = {}, []
         for name, rig in self._rigs.items():
-            domain = world.bootstrap(name, rig)
+            domain = world.bootstrap(name, rig, url=rig.git_url(world.name))
             domain.wait_lines(WITHOUT_DEMANDS)  # waits also for what Kubernetes adds to a namespace
-            namespace = domain.namespace
-            rights = limited(
-                rig.kube, rig.kubeconfig, self._made(f"access-{name}"), documented_roles("flux")
-            )
-            access[name] = {"kubeconfig": str(rights)}
-            watch = PodWatch(rig.kube, namespace, folder, self._made("pods"), {})
+            rights = documented_roles("flux")
+            folder = self._made(f"access-{name}")
+            access[name] = {"kubeconfig": limited(rig.kube, rig.kubeconfig, folder, rights)}
+            watch = PodWatch(rig.kube, domain.namespace, world.folder, self._made("pods"), {})
             self._stack.callback(watch.close)
             self._watches.append(watch)
-        head = {"apiVersion": "demandops/v1", "kind": "ClusterAccess"}
-        file = folder / "clusters.yaml"
-        file.write_text(yaml.safe_dump({**head, "clusters": access}))
         world.generator.stop()
-        world.generator.start("--clusters", str(file))
+        world.generator.start("--clusters", str(access_file(world.folder, access)))
         self._cloud = CloudObserver(self._domains["cloud"])
         self._cloud.start()
         self._stack.callback(self._cloud.close)
 
     def _deploy_initially(self) -> None:
-        record, seed = str(self._folder / "poses.jsonl"), self._settings.seed
-        plan = Plan(self._routes, self._near.point, self._domains, seed, record, "", True)
-        plan.write(self._folder / "plan.json")
-        self._participants = self._start(
-            "participants", "tests.experiment.participants", str(self._folder / "plan.json")
-        )
-        assert self._read()["ready"]
+        self._start_participants("", poses_only=True)
         self._before = self._lines()
-        rules = self._folder / "rules.yaml"
-        rules.write_text(crowd.rules(self._near))
-        self._detect(rules)
+        self._detect(crowd.rules(self._near))
 
     def _drive(self) -> Outcome:
         first = self._world.tip()
         self._drive_until(math.inf)
         set_off = self._read()["set_off"]
         last = max(route.ends for route in self._routes)
-        self._say(
-            f"{len(self._routes)} vehicles have set off; the last one leaves after {last:.0f} s"
-        )
+        self._say(f"{len(self._routes)} vehicles have set off; the last leaves after {last:.0f} s")
         deadline = time.monotonic() + last + 2 * self._near.timeout
         self._reaches(lambda: time.monotonic() > deadline, math.inf)
         passing = {vehicle: self._crossings[at] for vehicle, at in self.passing.items()}
-        poses = poses_in(self._folder / "poses.jsonl")
-        events = crowd.events(poses, passing, time.time())
+        events = crowd.events(self._poses(), passing, time.time())
         self._wait("the last demands", lambda: len(self._commits(first)) >= len(events), 300)
         self._wait_until_as_before(300)
-        over = time.time()
-        self._end(self._detector)
-        self._participants.send_signal(signal.SIGTERM)
-        said = self._read()
-        return Outcome(
-            settings=self._settings,
-            routes=self._routes,
-            near=self._near,
+        return self._outcome(
+            events,
             set_off=set_off,
-            over=over,
-            held=0.0,
-            poses=poses,
-            events=events,
+            over=time.time(),
             formed=list(self._formed(first)),
             pods=[pod for watch in self._watches for pod in watch.pods.values()],
-            node_ids=self._node_ids(),
-            inputs=[],
-            fused=[],
-            tracks=[],
-            arrivals={},
-            early=0,
-            published=said["sent"],
-            carried={},
-            left=self._lines(),
-            before=self._before,
             crossings=self._crossings,
         )
 
@@ -170,10 +118,7 @@ class LargeExperiment(Experiment):
         return frozenset(f"{name}: {line}" for name, one in domains for line in one.lines())
 
     def _formed(self, since: str) -> Iterator[Formed]:
-        """Yield the demand of each commit after ``since``.
-
-        Of these demands, about :data:`_LOOKS` come with the bookkeeping.
-        """
+        """Yield each commit's demand, about :data:`_LOOKS` of them with the bookkeeping."""
         stages, commits = self._cloud.commits(), self._commits(since)
         looks = {*commits[:: max(1, len(commits) // _LOOKS)], *commits[-1:]}
         for commit in commits:
@@ -184,6 +129,5 @@ class LargeExperiment(Experiment):
 
     def _trailers(self, commit: str) -> list[str]:
         keys = "".join(f"%(trailers:key={key},valueonly)%n" for key in ("Operation", "Requester"))
-        repository = str(self._rig.repository(self._world.name))
-        command = ["git", "-C", repository, "log", "-1", f"--format={keys}", commit]
-        return subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+        repository = self._rig.repository(self._world.name)
+        return git(repository, "log", "-1", f"--format={keys}", commit).split()

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from statistics import median
 
 from . import fleet
 from .outcome import Formed, Outcome
+from .process_runner import RunningPod
 from .rules import Event
-from .running_pod import RunningPod
 
 STAGES = ("demand", "commit", "pods", "fused")
 
@@ -74,7 +74,6 @@ def _pods_of(outcome: Outcome, event: Event) -> list[RunningPod]:
 
 
 def _first_fused(outcome: Outcome, event: Event, gone: float | None) -> float | None:
-    """Return the time at which the fusion first published a position of the vehicle, or None."""
     places = {
         (pose.x, pose.y)
         for pose in outcome.poses
@@ -124,12 +123,9 @@ def savings(outcome: Outcome) -> list[Saving]:
     found = [Saving(name, unit, mean(use), always(use)) for name, unit, use in amounts]
     if not outcome.carried:
         return found
-    carried = sum(_payload(outcome).values())
-    published = sum(
-        outcome.published[topic]["bytes"]
-        for topic in _payload(outcome)
-        if topic in outcome.published
-    )
+    topics = _payload(outcome)
+    carried = sum(topics.values())
+    published = sum(outcome.published.get(topic, 0) for topic in topics)
     rate = [size / seconds / 1024 for size in (carried, published)]
     return [*found, Saving("carried to the edge", "KiB/s", *rate)]
 
@@ -154,10 +150,5 @@ def running(outcome: Outcome) -> Iterator[tuple[float, int]]:
         yield at, count
 
 
-@lru_cache
-def quantiles(values: tuple[float, ...]) -> tuple[float, float, float]:
-    """Return the minimum, the median and the maximum."""
-    ordered = sorted(values)
-    middle = len(ordered) // 2
-    median = ordered[middle] if len(ordered) % 2 else sum(ordered[middle - 1 : middle + 1]) / 2
-    return ordered[0], median, ordered[-1]
+def quantiles(values: Sequence[float]) -> tuple[float, float, float]:
+    return min(values), median(values), max(values)

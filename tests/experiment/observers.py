@@ -39,7 +39,6 @@ class Observer:
         self.arrivals: dict[str, list[float]] = defaultdict(list)
 
     def watch(self, kind: Any, topic: str) -> None:
-        """Record in `arrivals` when messages of a topic arrive."""
         arrived = self.arrivals[topic]
         self.node.create_subscription(kind, topic, lambda _: arrived.append(time.time()), 10)
 
@@ -58,7 +57,6 @@ class EdgeObserver(Observer):
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
         self.inputs: list[tuple[float, frozenset[str]]] = [(time.time(), frozenset())]
-        self.fused: list[tuple[float, float, int]] = []  # arrival, stamp, number of objects
         self.tracks: list[tuple[float, list[tuple[float, float]]]] = []
         self.bytes: Counter[str] = Counter()
         for vehicle in VEHICLES:
@@ -66,7 +64,7 @@ class EdgeObserver(Observer):
             self._weigh(PoseStamped, EGO_DATA.format(vehicle))
             self._weigh(PointCloud2, VEHICLE_CLOUD.format(vehicle))
         self._weigh(PointCloud2, STATION_CLOUD_TARGET)
-        self.node.create_subscription(PoseArray, FUSED, self._take_fused, 10)
+        self.watch(PoseArray, FUSED)
         self.node.create_subscription(PoseArray, TRACKS, self._take_tracks, 10)
         self.node.create_timer(_LOOK_S, self._look)
 
@@ -75,10 +73,6 @@ class EdgeObserver(Observer):
             self.bytes[topic] += len(data)
 
         self.node.create_subscription(kind, topic, count, 10, raw=True)
-
-    def _take_fused(self, message: PoseArray) -> None:
-        stamp = message.header.stamp
-        self.fused.append((time.time(), stamp.sec + stamp.nanosec / 1e9, len(message.poses)))
 
     def _take_tracks(self, message: PoseArray) -> None:
         places = [(pose.position.x, pose.position.y) for pose in message.poses]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from . import routes
 from .fleet import Carrier
+from .process_runner import RunningPod
 from .routes import Way
 from .rules import Event, Near, Pose
-from .running_pod import RunningPod
 
 if TYPE_CHECKING:
     from tests.e2e.rig.cluster import Gitops
@@ -58,27 +58,25 @@ class Formed:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The settings and all observations of a run; times are seconds since 1970."""
-
     settings: Settings
     routes: tuple[Way, ...]
     near: Near
     set_off: float
     over: float
-    held: float
     poses: list[Pose]
     events: list[Event]
     formed: list[Formed]
-    pods: list[RunningPod]
-    node_ids: dict[str, str]
-    inputs: list[tuple[float, frozenset[str]]]
-    fused: list[tuple[float, float, int]]
-    tracks: list[tuple[float, list[tuple[float, float]]]]
-    arrivals: dict[str, list[float]]
-    early: int
-    published: dict[str, dict[str, int]]
-    carried: dict[str, int]
     left: frozenset[str]
     before: frozenset[str]
+    pods: list[RunningPod] = field(default_factory=list)
+    node_ids: dict[str, str] = field(default_factory=dict)
+    published: dict[str, int] = field(default_factory=dict)
+    held: float = 0.0
+    early: int = 0
+    # what the edge received; empty in the larger experiment
+    inputs: list[tuple[float, frozenset[str]]] = field(default_factory=list)
+    tracks: list[tuple[float, list[tuple[float, float]]]] = field(default_factory=list)
+    arrivals: dict[str, list[float]] = field(default_factory=dict)
+    carried: dict[str, int] = field(default_factory=dict)
     crossings: tuple[Near, ...] = ()
     """All intersections of the larger experiment; empty in the paper's experiment."""

@@ -5,13 +5,14 @@ Call: `python -m tests.experiment.participants PLAN`.
 PLAN is a JSON file with the fields of `Plan`. The vehicles publish from the program's start to its
 end, also while they stand. Each line on standard input is a time, in seconds of driving. At the
 first line the vehicles set off. They drive until the line's time, then stand until the next line.
-When the program ends, it prints a line of JSON: the messages and bytes of each topic since the
-vehicles set off, and for how many seconds the vehicles stood.
+When the program ends, it prints a line of JSON: the bytes of each topic since the vehicles set off,
+and for how many seconds the vehicles stood.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import os
 import random
 import select
@@ -31,7 +32,9 @@ from rclpy.serialization import serialize_message
 from rclpy.signals import SignalHandlerOptions
 
 from . import clouds
-from .routes import STATION, VEHICLES, Route, Track
+from .routes import STATION, VEHICLES, Route, Track, Way
+
+Place = tuple[float, float]
 
 POSE = "/vehicles/{}/pose"
 EGO_DATA = "/vehicles/{}/ego_data"
@@ -57,7 +60,7 @@ class Plan:
     one ROS node in the cloud's domain sends all poses, and nothing else is sent.
     """
 
-    routes: tuple[Route | Track, ...]
+    routes: tuple[Way, ...]
     origin: tuple[float, float]
     domains: dict[str, int]
     seed: int
@@ -66,13 +69,11 @@ class Plan:
     poses_only: bool = False
 
     def write(self, file: Path) -> None:
-        """Write the plan to a file that the program can read."""
         routes = [vars(route) for route in self.routes]
         file.write_text(json.dumps(vars(self) | {"routes": routes}))
 
     @classmethod
     def read(cls, file: Path) -> Plan:
-        """Return the plan that :meth:`write` wrote to a file."""
         data = json.loads(file.read_text())
         routes = tuple(
             Track(**route) if "points" in route else Route(**route) for route in data.pop("routes")
@@ -91,7 +92,6 @@ class Participant:
         self.node = Node(f"{name}_participant", context=self._context, enable_rosout=False)
         self._publishers: dict[str, Any] = {}
         self.sent: Counter[str] = Counter()
-        self.messages: Counter[str] = Counter()
 
     def send(self, topic: str, message: Any, now: float) -> None:
         message.header.stamp.sec, message.header.stamp.nanosec = int(now), int(now % 1 * 1e9)
@@ -100,7 +100,6 @@ class Participant:
         data = serialize_message(message)
         self._publishers[topic].publish(data)
         self.sent[topic] += len(data)
-        self.messages[topic] += 1
 
     def close(self) -> None:
         self.node.destroy_node()
@@ -108,8 +107,6 @@ class Participant:
 
 
 class Participants:
-    """All participants, and the time since the vehicles set off."""
-
     def __init__(self, plan: Plan) -> None:
         self._plan, self._chance = plan, random.Random(plan.seed)
         names = (*(route.vehicle for route in plan.routes), STATION)
@@ -124,16 +121,13 @@ class Participants:
         self._ticks = 0
 
     def tick(self) -> None:
-        """Publish what each participant sends now."""
         now, elapsed = time.time(), self._pass_time()
         self._ticks += 1
         if self._plan.poses_only and self._ticks % TICKS_PER_POSE_OF_MANY:
             return
         x, y = self._plan.origin
-        where = {
-            route.vehicle: (x + route.position(elapsed)[0], y + route.position(elapsed)[1])
-            for route in self._plan.routes
-        }
+        places = {route.vehicle: route.position(elapsed) for route in self._plan.routes}
+        where = {vehicle: (x + dx, y + dy) for vehicle, (dx, dy) in places.items()}
         for route in self._plan.routes:
             if route.sends(elapsed):
                 self._send_pose(route.vehicle, *where[route.vehicle], now)
@@ -141,10 +135,7 @@ class Participants:
             self._send_clouds(where, elapsed, now)
 
     def _pass_time(self) -> float:
-        """Count the time since the last call; return how many seconds the vehicles have driven.
-
-        The result is -1 before the vehicles set off.
-        """
+        """Return the seconds of driving so far; -1 before the vehicles set off."""
         passed, self._last = time.monotonic() - self._last, time.monotonic()
         if self.set_off is not None:
             driven = min(passed, max(0.0, self.until - self._elapsed))
@@ -161,40 +152,33 @@ class Participants:
             self._by_name[vehicle].send(topic.format(vehicle), message, now)
         print(json.dumps({"at": now, "vehicle": vehicle, "x": x, "y": y}), file=self._sent)
 
-    def _send_clouds(
-        self, where: dict[str, tuple[float, float]], elapsed: float, now: float
-    ) -> None:
-        self._by_name[STATION].send(
-            self._plan.station_cloud, self._cloud(self._plan.origin, where.values()), now
-        )
+    def _send_clouds(self, where: dict[str, Place], elapsed: float, now: float) -> None:
+        seen = self._cloud(self._plan.origin, where.values())
+        self._by_name[STATION].send(self._plan.station_cloud, seen, now)
         for route in self._plan.routes:
             if route.vehicle in WITH_LIDAR and route.sends(elapsed):
                 others = [place for name, place in where.items() if name != route.vehicle]
                 cloud = self._cloud(where[route.vehicle], others)
                 self._by_name[route.vehicle].send(VEHICLE_CLOUD.format(route.vehicle), cloud, now)
 
-    def _cloud(self, at: tuple[float, float], objects: Iterable[tuple[float, float]]) -> Any:
-        near = [(x, y) for x, y in objects if (x - at[0]) ** 2 + (y - at[1]) ** 2 <= RANGE_M**2]
+    def _cloud(self, at: Place, objects: Iterable[Place]) -> Any:
+        near = [place for place in objects if math.dist(place, at) <= RANGE_M]
         return clouds.to_message(clouds.points_of(near, self._chance))
 
     def go(self) -> None:
-        """Let the vehicles set off, and start to count messages anew."""
+        """Let the vehicles set off, and start to count bytes anew."""
         self.set_off, self._elapsed, self._last = time.time(), 0.0, time.monotonic()
         for participant in set(self._by_name.values()):
             participant.sent.clear()
-            participant.messages.clear()
 
-    def close(self) -> dict[str, Any]:
-        """Leave the ROS graphs; return each topic's messages and bytes since :meth:`go`."""
-        everybody = set(self._by_name.values())
-        for participant in everybody:
+    def close(self) -> dict[str, int]:
+        """Leave the ROS graphs; return each topic's bytes since :meth:`go`."""
+        sent: dict[str, int] = {}
+        for participant in set(self._by_name.values()):
             participant.close()
+            sent |= participant.sent
         self._sent.close()
-        return {
-            topic: {"messages": participant.messages[topic], "bytes": size}
-            for participant in everybody
-            for topic, size in participant.sent.items()
-        }
+        return sent
 
 
 def main(plan: Path) -> None:

@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import os
 import queue
+import re
 import signal
 import subprocess
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -32,14 +34,75 @@ from tests.e2e.rig import launch
 from tests.e2e.rig.kube import Kube, Manifest
 from tests.kit.limits import PATIENCE_S
 
-from .running_pod import Container, RunningPod, path_in_pod, program_of
-
 _TICK_S = 0.1
 _WATCH_S = 60
 _NOT_YET = (LookupError, ApiException, HTTPError, OSError)
 """The errors for an object that does not exist yet, or an API server that cannot be reached."""
 _FIRST_PAUSE_S, _LONGEST_PAUSE_S = 0.5, 10.0
 _TOKEN = "/var/run/secrets/kubernetes.io/serviceaccount"  # noqa: S105 - a folder
+
+
+@dataclass
+class Container:
+    """A container: its process, the times of its starts, and when it may start again."""
+
+    name: str
+    command: list[str]
+    environment: dict[str, str]
+    process: subprocess.Popen[bytes] | None = None
+    starts: list[float] = field(default_factory=list)
+    due: float = 0.0
+
+
+@dataclass
+class RunningPod:
+    """A pod with its containers: `bound` is when it got a node, `ended` when it ended."""
+
+    manifest: dict[str, Any]
+    folder: Path
+    bound: float
+    containers: list[Container] = field(default_factory=list)
+    ended: float | None = None
+
+    @property
+    def service(self) -> str:
+        """The name of the pod's release or connection client."""
+        return str(self.manifest["metadata"]["labels"]["app.kubernetes.io/instance"])
+
+    @property
+    def node(self) -> str:
+        return str(self.manifest["spec"]["nodeName"])
+
+    def requests(self) -> tuple[float, float]:
+        """Return the processor cores and the bytes of memory that the pod requests."""
+        found = [c["resources"].get("requests", {}) for c in self.manifest["spec"]["containers"]]
+        cores = sum(quantity(each.get("cpu", "0")) for each in found)
+        return cores, sum(quantity(each.get("memory", "0")) for each in found)
+
+
+def program_of(image: str) -> str:
+    """Return the name of an image's stand-in program: the image's name without registry and tag."""
+    return image.rpartition("/")[2].partition("@")[0].partition(":")[0]
+
+
+def path_in_pod(text: str, mounts: Mapping[str, Path | str]) -> str:
+    """Replace each path below a mount in ``text`` by its path on this machine; return the text."""
+    if not mounts:
+        return text
+    longest_first = sorted(mounts, key=len, reverse=True)
+    below = "|".join(map(re.escape, longest_first))
+    # in one pass: a replacement may itself begin with the path of a mount, such as /tmp
+    return re.sub(rf"(?<![\w./-])({below})(?=/|$)", lambda hit: str(mounts[hit[1]]), text)
+
+
+_UNITS = {"m": 1e-3, "Ki": 2**10, "Mi": 2**20, "Gi": 2**30}
+
+
+def quantity(text: str) -> float:
+    for unit, factor in _UNITS.items():
+        if text.endswith(unit):
+            return float(text.removesuffix(unit)) * factor
+    return float(text)
 
 
 class ProcessRunner:
@@ -50,12 +113,8 @@ class ProcessRunner:
     ) -> None:
         """Start to watch pods and ConfigMaps, and to run the pods.
 
-        Args:
-            kube: the cluster.
-            namespace: the namespace of the pods.
-            image: the working directory of all containers; it is first on their PATH.
-            folder: the folder for volumes and logs.
-            environment: the environment variables that every container gets from its image.
+        ``image`` is the working directory of all containers, and first on their PATH; all get
+        ``environment`` from it. ``folder`` is the folder for volumes and logs.
         """
         self._kube, self._namespace, self._image, self._folder = kube, namespace, image, folder
         path = os.pathsep.join([str(image), os.environ.get("PATH", os.defpath)])
@@ -65,24 +124,17 @@ class ProcessRunner:
         self._ending: list[tuple[subprocess.Popen[bytes], float]] = []
         self._events: queue.Queue[tuple[str, Manifest]] = queue.Queue()
         self._closed = threading.Event()
-        self._threads = [
-            threading.Thread(target=self._watch, args=("Pod", "list_namespaced_pod"), daemon=True),
-            threading.Thread(
-                target=self._watch, args=("ConfigMap", "list_namespaced_config_map"), daemon=True
-            ),
-        ]
-        self._runner = threading.Thread(target=self._run, name="process-runner", daemon=True)
-        for thread in (*self._threads, self._runner):
-            thread.start()
+        for watched in (
+            ("Pod", "list_namespaced_pod"),
+            ("ConfigMap", "list_namespaced_config_map"),
+        ):
+            threading.Thread(target=self._watch, args=watched, daemon=True).start()
+        self._runner = threading.Thread(target=self._run, daemon=True)
+        self._runner.start()
 
     def close(self) -> None:
         self._closed.set()
         self._runner.join(30)
-
-    def log(self, service: str) -> str:
-        """Return what the containers of a service have printed."""
-        found = sorted(self._folder.glob(f"{service}-*/*.log"))
-        return "\n".join(f"--- {path}\n{path.read_text(errors='replace')}" for path in found)
 
     # --- watching ---------------------------------------------------------------------------
 
@@ -175,10 +227,7 @@ class ProcessRunner:
             )
 
     def _entry_point(self, image: str) -> list[str]:
-        """Return the stand-in for the image's entry point, or nothing if there is none.
-
-        Without a stand-in, the container's arguments are its whole command.
-        """
+        """Return the stand-in for an image's entry point; without it arguments are the command."""
         program = program_of(image)
         return [program] if (self._image / program).exists() else []
 
@@ -201,18 +250,14 @@ class ProcessRunner:
                         self._fill(pod, volume)
 
     def _kubeconfig(self, account: Path) -> Path:
-        """Write a kubeconfig with the token of the pod's account; return its path."""
         server = self._kube.api.configuration.host
-        cluster = {"server": server, "certificate-authority": str(account / "ca.crt")}
-        names = {"cluster": "c", "user": "u", "namespace": self._namespace}
-        config = {
-            "apiVersion": "v1",
-            "kind": "Config",
-            "current-context": "c",
-            "clusters": [{"name": "c", "cluster": cluster}],
-            "users": [{"name": "u", "user": {"token": (account / "token").read_text()}}],
-            "contexts": [{"name": "c", "context": names}],
-        }
+        config: dict[str, Any] = {"apiVersion": "v1", "kind": "Config", "current-context": "c"}
+        for part, content in {
+            "cluster": {"server": server, "certificate-authority": str(account / "ca.crt")},
+            "user": {"token": (account / "token").read_text()},
+            "context": {"cluster": "c", "user": "c", "namespace": self._namespace},
+        }.items():
+            config[f"{part}s"] = [{"name": "c", part: content}]
         file = account.with_suffix(".kubeconfig")
         file.touch(mode=0o600)
         file.write_text(yaml.safe_dump(config))
@@ -242,7 +287,7 @@ class ProcessRunner:
                 env=environment,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
-                stderr=subprocess.STDOUT,
+                stderr=log,
                 start_new_session=True,
             )
         container.starts.append(time.time())

@@ -9,10 +9,9 @@ from __future__ import annotations
 import math
 import random
 from bisect import bisect_right
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Protocol
 
 RADIUS_M = 84.0
 """The paper's distance at which a vehicle is near the intersection."""
@@ -35,28 +34,6 @@ _JITTER = 0.2  # of a slot
 _ARMS = tuple(math.radians(degrees) for degrees in (0, 90, 180, 270))
 
 
-class Way(Protocol):
-    """Where a vehicle is at each time: a route, or a recorded track."""
-
-    @property
-    def vehicle(self) -> str:
-        """The vehicle's id."""
-
-    @property
-    def ends(self) -> float:
-        """The time after which nothing of interest happens."""
-
-    @property
-    def label(self) -> str:
-        """What the report says of the way, such as ``30 km/h``."""
-
-    def position(self, time: float) -> tuple[float, float]:
-        """Return the vehicle's position at a time."""
-
-    def sends(self, time: float) -> bool:
-        """Return whether the vehicle sends anything at a time."""
-
-
 @dataclass(frozen=True)
 class Route:
     """A vehicle's way along one arm of the intersection to its middle, and out along another arm.
@@ -76,17 +53,14 @@ class Route:
 
     @property
     def speed(self) -> float:
-        """The vehicle's speed in metres per second."""
         return 2 * RADIUS_M / (self.leaves - self.enters)
 
     @property
     def ends(self) -> float:
-        """The time at which the vehicle leaves or vanishes."""
         return min(self.leaves, self.vanishes)
 
     @property
     def label(self) -> str:
-        """The vehicle's speed, and a note if it falls silent."""
         silent = ", falls silent" if math.isfinite(self.vanishes) else ""
         return f"{self.speed * 3.6:.0f} km/h{silent}"
 
@@ -98,7 +72,6 @@ class Route:
         return x + abs(along) * math.cos(arm), y + abs(along) * math.sin(arm)
 
     def distance(self, time: float) -> float:
-        """Return the vehicle's distance from the intersection."""
         return math.dist(self.position(time), self.middle)
 
     def sends(self, time: float) -> bool:
@@ -119,7 +92,6 @@ class Track:
 
     @property
     def ends(self) -> float:
-        """The time at which the recording ends."""
         return self.points[-1][0]
 
     def position(self, time: float) -> tuple[float, float]:
@@ -138,19 +110,8 @@ class Track:
         return self.points[max(index - 1, 0)], self.points[min(index, last)]
 
 
-def tracks(
-    poses: Iterable[tuple[float, str, float, float]], origin: tuple[float, float]
-) -> tuple[Track, ...]:
-    """Return the track of each vehicle from recorded poses: time, vehicle, x and y.
-
-    ``origin`` is the position of the intersection in the recording.
-    """
-    found: dict[str, list[tuple[float, float, float]]] = {}
-    first: float | None = None
-    for at, vehicle, x, y in poses:
-        first = at if first is None else first
-        found.setdefault(vehicle, []).append((at - first + LEAD_S, x - origin[0], y - origin[1]))
-    return tuple(Track(vehicle, tuple(found[vehicle])) for vehicle in sorted(found))
+Way = Route | Track
+"""Where a vehicle is at each time; nothing of interest happens after `ends`."""
 
 
 def four(seed: int, gap: float) -> tuple[Route, ...]:
@@ -172,16 +133,12 @@ def four(seed: int, gap: float) -> tuple[Route, ...]:
 
 
 def one(seed: int, gap: float) -> tuple[Route, ...]:
-    """Return the route of one vehicle that comes and leaves."""
     arms = random.Random(seed).sample(_ARMS, 2)
     return (Route(VEHICLES[0], gap, 4 * gap, *arms),)
 
 
 def many(seed: int, count: int) -> tuple[Route, ...]:
-    """Return the routes of many vehicles, each through one of the intersections in ``MIDDLES``.
-
-    About every ``SPACING_S`` seconds one vehicle enters, at 20 to 50 km/h.
-    """
+    """Return routes through ``MIDDLES``; every ``SPACING_S`` s one enters, at 20 to 50 km/h."""
     chance = random.Random(seed)
     found = []
     for number in range(count):

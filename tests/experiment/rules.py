@@ -45,8 +45,6 @@ class Near:
 
 @dataclass(frozen=True)
 class Pose:
-    """A position that a vehicle reported, and the time of the report."""
-
     at: float
     vehicle: str
     x: float
@@ -55,8 +53,6 @@ class Pose:
 
 @dataclass(frozen=True)
 class Event:
-    """An event: a vehicle joins or leaves."""
-
     at: float
     vehicle: str
     joins: bool
@@ -66,7 +62,6 @@ class Event:
 
 
 def poses_in(record: Path) -> list[Pose]:
-    """Return the poses that the participants wrote to their record."""
     return [Pose(**json.loads(line)) for line in record.read_text().splitlines()]
 
 
@@ -99,7 +94,6 @@ def causes(poses: Iterable[Pose], near: Near, until: float) -> list[float]:
 
 
 def events_of(poses: Iterable[Pose], near: Near, until: float) -> list[Event]:
-    """Return the events before `until`, sorted by time."""
     return sorted(_events(list(poses), near, until), key=lambda event: event.at)
 
 

@@ -15,8 +15,8 @@ from tests.experiment.checks import checks
 from tests.experiment.measures import savings, steps
 from tests.experiment.outcome import Formed, Outcome, Settings
 from tests.experiment.participants import EGO_DATA
+from tests.experiment.process_runner import Container, RunningPod
 from tests.experiment.rules import Near, events_of
-from tests.experiment.running_pod import Container, RunningPod
 
 from .test_routes import drive
 
@@ -64,7 +64,6 @@ def good() -> Outcome:
         routes=all_routes,
         near=near,
         set_off=0.0,
-        held=0.0,
         over=OVER,
         poses=poses,
         events=events,
@@ -76,11 +75,9 @@ def good() -> Outcome:
             (joins.at + 2, fleet.fusion_inputs({VEHICLE})),
             (leaves.at + 1, frozenset()),
         ],
-        fused=[(pose.at + 0.1, pose.at, 1) for pose in inside],
         tracks=[(pose.at + 0.1, [(pose.x, pose.y)]) for pose in inside],
         arrivals={EGO: [pose.at + 0.1 for pose in inside]},
-        early=0,
-        published={EGO: {"messages": 250, "bytes": 1000}},
+        published={EGO: 1000},
         carried={f"mqtt-prefix{EGO}": 400, "mqtt_client/ros_msg_type/x": 7},
         left=left,
         before=left,

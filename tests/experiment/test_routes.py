@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import math
 from pathlib import Path
 
 import pytest
@@ -14,9 +13,9 @@ from rosbags.rosbag2 import StoragePlugin
 from examples.experiment import paper
 from tests.experiment import fleet, routes
 from tests.experiment.bags import bag_tracks
+from tests.experiment.process_runner import path_in_pod
 from tests.experiment.routes import Way
 from tests.experiment.rules import Event, Near, Pose, causes, events_of, predicted
-from tests.experiment.running_pod import path_in_pod, program_of, quantity
 from tests.kit.bag import write_bag
 
 NEAR = Near.read()
@@ -35,24 +34,18 @@ def order(seed: int) -> list[str]:
     return [str(event) for event in events(seed)]
 
 
-def test_the_distance_is_the_paper_s() -> None:
+def test_seed_0_has_the_paper_s_distance_and_order_of_events() -> None:
     assert NEAR.start == routes.RADIUS_M == 84
     assert NEAR.start < NEAR.stop < routes.FAR_M
-
-
-def test_seed_0_has_the_paper_s_order_of_events() -> None:
     assert order(0) == list(paper.STEPS)
 
 
-@pytest.mark.parametrize("seed", range(1, 7))
-def test_with_any_seed_each_vehicle_joins_and_leaves_once(seed: int) -> None:
-    found = events(seed)
-    assert sorted(map(str, found)) == sorted(paper.STEPS)
-    gaps = [later.at - event.at for event, later in itertools.pairwise(found)]
-    assert min(gaps) > GAP_S / 4
-
-
-def test_another_route_has_another_order() -> None:
+def test_with_any_seed_each_vehicle_joins_and_leaves_once_in_another_order() -> None:
+    for seed in range(1, 7):
+        found = events(seed)
+        assert sorted(map(str, found)) == sorted(paper.STEPS)
+        gaps = [later.at - event.at for event, later in itertools.pairwise(found)]
+        assert min(gaps) > GAP_S / 4
     assert len({tuple(order(seed)) for seed in range(7)}) > 5
 
 
@@ -61,7 +54,6 @@ def test_vehicles_drive_in_from_one_road_and_out_on_another() -> None:
         assert route.arm_in != route.arm_out
         assert route.distance(route.enters) == pytest.approx(84)
         assert route.distance((route.enters + route.leaves) / 2) == pytest.approx(0)
-        assert route.distance(0) == route.distance(1000) == routes.FAR_M
 
 
 @pytest.mark.parametrize("vehicle", routes.VEHICLES)
@@ -74,21 +66,13 @@ def test_a_vehicle_vanishes_while_nothing_else_happens(vehicle: str) -> None:
         assert min(abs(moment - at) for at in others) > 1
 
 
-def test_a_vehicle_that_falls_silent_leaves_after_the_time_out() -> None:
+def test_a_vehicle_that_falls_silent_leaves_after_the_time_out_because_of_its_last_pose() -> None:
     silent = routes.vanishing(routes.one(0, GAP_S), "vehicle00")
-    assert silent[0].vanishes == pytest.approx(2.5 * GAP_S)
     joins, leaves = events_of(drive(silent, 60), NEAR, 60)
     assert (joins.joins, leaves.joins) == (True, False)
     assert leaves.at == pytest.approx(2.5 * GAP_S + NEAR.timeout, abs=0.21)
-    assert math.isinf(routes.one(0, GAP_S)[0].vanishes)
-
-
-def test_a_leave_by_timeout_is_dated_at_the_last_pose_of_the_vehicle() -> None:
-    """The last pose is the cause of the leave. The leave follows after the timeout of the rules."""
-    silent = routes.vanishing(routes.one(0, GAP_S), "vehicle00")
-    enters, vanishes = causes(drive(silent, 60), NEAR, 60)
-    assert enters == pytest.approx(GAP_S, abs=0.11)
-    assert vanishes == pytest.approx(2.5 * GAP_S, abs=0.11)
+    expected = pytest.approx([GAP_S, 2.5 * GAP_S], abs=0.11)
+    assert causes(drive(silent, 60), NEAR, 60) == expected
 
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
@@ -130,13 +114,6 @@ def test_the_rules_for_zenoh_are_valid_and_keep_all_names_of_topics() -> None:
 
 
 @pytest.mark.parametrize(
-    "image", ["host:5000/a/bridge:1.2", "a/bridge@sha256:0123", "bridge", "a/bridge:1@sha256:0"]
-)
-def test_an_image_has_a_program_of_its_name(image: str) -> None:
-    assert program_of(image) == "bridge"
-
-
-@pytest.mark.parametrize(
     ("text", "found"),
     [
         ("params_file:=/config/params.yaml", "params_file:=/pod/c/params.yaml"),
@@ -152,10 +129,3 @@ def test_an_image_has_a_program_of_its_name(image: str) -> None:
 def test_a_path_below_a_mount_becomes_one_of_this_machine(text: str, found: str) -> None:
     mounts = {"/config": "/pod/c", "/config/deep": "/pod/d", "/tmp": "/tmp/pod/t"}
     assert path_in_pod(text, mounts | {"/params": "/tmp/pod/i"}) == found
-
-
-@pytest.mark.parametrize(
-    ("text", "number"), [("250m", 0.25), ("2", 2.0), ("256Mi", 2**28), ("1Gi", 2**30), ("0", 0.0)]
-)
-def test_quantities(text: str, number: float) -> None:
-    assert quantity(text) == number

@@ -51,11 +51,6 @@ class KubeApi:
                 self.put(plural, namespace, name, item["status"], metadata=metadata, **more)
             self.patches.append((path, body))
 
-    def forget(self, plural: str, namespace: str, name: str) -> None:
-        """Delete an object without an event, as if no client watched when it was deleted."""
-        with self._changed:
-            del self._items[plural, namespace, name]
-
     def listed(self, plural: str, namespace: str) -> Item:
         with self._changed:
             found = [item for key, item in self._items.items() if key[:2] == (plural, namespace)]

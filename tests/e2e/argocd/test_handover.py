@@ -6,17 +6,15 @@ import json
 from collections.abc import Iterator
 
 import pytest
-import yaml
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import CLUSTER, NODES, WITHOUT_DEMANDS
+from tests.e2e.common.namespace import name_of
 from tests.e2e.common.ros import Client
-from tests.e2e.common.running import running
-from tests.e2e.common.staterepo import demandops
-from tests.e2e.flux import view as flux_view
-from tests.e2e.flux.world import World as FluxWorld
-from tests.e2e.rig.argocd import NAMESPACE as CONTROL
+from tests.e2e.common.world import World, demandops, running
+from tests.e2e.flux.view import Domain as FluxDomain
 from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.components import ARGOCD as CONTROL
 from tests.e2e.rig.tools import Report
 
 from .view import Domain
@@ -27,7 +25,6 @@ SUSPENDED = {"spec": {"suspend": True}}
 
 @pytest.fixture(scope="module")
 def both(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
-    """A cluster with Flux and Argo CD."""
     rig = Rig("both", gitops="flux", beside="argocd", nodes=NODES, report=say)
     with running(rig, request.session):
         yield rig
@@ -36,7 +33,7 @@ def both(request: pytest.FixtureRequest, say: Report) -> Iterator[Rig]:
 def test_every_pod_stays_there_and_back(
     both: Rig, client: Client, ros_domain: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    world = FluxWorld(both, tmp_path_factory.mktemp("world"), ros_domain, client)
+    world = World(both, tmp_path_factory.mktemp("world"), ros_domain, client)
     try:
         flux = world.bootstrap(CLUSTER, both)
         world.generator.start()
@@ -69,18 +66,14 @@ def test_every_pod_stays_there_and_back(
         world.remove_wide()
 
 
-def from_flux(domain: flux_view.Domain) -> None:
-    """Suspend the Flux objects that would otherwise remove the releases."""
+def from_flux(domain: FluxDomain) -> None:
     for kind in ("Kustomization", "HelmRelease"):
         for item in domain.find(kind):
-            domain.kube.patch(kind, item["metadata"]["name"], SUSPENDED, domain.namespace)
+            domain.kube.patch(kind, name_of(item), SUSPENDED, domain.namespace)
 
 
-def upgrade(world: FluxWorld, gitops: str) -> str:
-    """Render the state repo for a controller while the generator runs; return the commit.
-
-    Fail unless this makes exactly one commit.
-    """
+def upgrade(world: World, gitops: str) -> str:
+    """Render the state repo anew while the generator runs; return the only commit of this."""
     before = world.tip()
     options = ("--gitops", gitops, "--output", "json")
     output = demandops(world.folder, "upgrade", "--state-repo", world.push_url, *options)
@@ -90,14 +83,11 @@ def upgrade(world: FluxWorld, gitops: str) -> str:
     return str(commit)
 
 
-def to_argocd(world: FluxWorld) -> Domain:
-    """Render the state repo for Argo CD, apply its bootstrap file, and demand step 2."""
+def to_argocd(world: World) -> Domain:
     upgraded = upgrade(world, "argocd")
-    manifests = list(yaml.safe_load_all(world.file(f"bootstrap/{CLUSTER}.yaml")))
+    manifests = world.manifests(CLUSTER)
     world.apply(world.rig.kube, manifests)
-    folder = manifests[-1]
-    destination = folder["spec"]["destination"]["namespace"]
-    domain = Domain(world.rig.kube, destination, folder["metadata"]["name"])
+    (domain,) = Domain.all_in(world.rig.kube, manifests)
     domain.wait_applied(upgraded)
     domain.wait_releases()
     sent = world.demand(expected.demand(2))
@@ -107,19 +97,14 @@ def to_argocd(world: FluxWorld) -> Domain:
     return domain
 
 
-def forget_flux(domain: flux_view.Domain) -> None:
-    """Delete Helm's records and Flux's objects.
-
-    Flux's objects are suspended, so their deletion removes no release.
-    """
+def forget_flux(domain: FluxDomain) -> None:
+    """Delete Helm's records and Flux's objects; as these are suspended, no release goes."""
     for kind in FLUX_KINDS:
         for item in domain.find(kind):
-            name = item["metadata"]["name"]
-            domain.kube.delete(kind, name, domain.namespace)
-            domain.kube.wait_gone(kind, name, domain.namespace)
+            domain.take_away(kind, name_of(item))
     for secret in domain.find("Secret"):
         if secret["type"] == "helm.sh/release.v1":
-            domain.kube.delete("Secret", secret["metadata"]["name"], domain.namespace)
+            domain.kube.delete("Secret", name_of(secret), domain.namespace)
 
 
 def forget_argocd(domain: Domain) -> None:
@@ -127,10 +112,7 @@ def forget_argocd(domain: Domain) -> None:
 
     The folder's Application goes first, because it would restore the Applications of the releases.
     """
-    apps = [
-        (domain.name, CONTROL),
-        *((name, domain.namespace) for name in domain.releases()),
-    ]
+    apps = [(domain.name, CONTROL), *((name, domain.namespace) for name in domain.releases())]
     for name, namespace in apps:
         domain.kube.patch("Application", name, {"metadata": {"finalizers": None}}, namespace)
         domain.kube.delete("Application", name, namespace)
@@ -138,8 +120,7 @@ def forget_argocd(domain: Domain) -> None:
     domain.kube.delete("AppProject", domain.name, CONTROL)
 
 
-def to_flux(world: FluxWorld) -> None:
-    """Render the state repo for Flux, demand step 4, and apply the bootstrap file of Flux."""
+def to_flux(world: World) -> None:
     upgrade(world, "flux")
     world.demand(expected.demand(4))
     world.bootstrap(CLUSTER, world.rig)

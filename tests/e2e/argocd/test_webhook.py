@@ -13,11 +13,10 @@ from tests.e2e.common.access import access_file, documented_roles, limited
 from tests.e2e.common.answers import TIMEOUT_S, fusion, push_chart, restart_generator
 from tests.e2e.common.expected import CLUSTER
 from tests.e2e.common.namespace import name_of
-from tests.e2e.rig.argocd import SERVER, WEBHOOK_SECRET
+from tests.e2e.common.world import World
+from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
-
-from .conftest import MakeWorld
-from .world import World
+from tests.e2e.rig.components import ARGOCD_SERVER, WEBHOOK_SECRET
 
 OF_CHART = "\n---\napiVersion: v1\nkind: ConfigMap\nmetadata: {name: {{ .Release.Name }}-new}\n"
 
@@ -36,36 +35,30 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
         namespace: [
             {**rule, "verbs": [verb for verb in rule["verbs"] if verb != "patch"]} for rule in rules
         ]
-        for namespace, rules in documented_roles("argo cd").items()
+        for namespace, rules in documented_roles("argocd").items()
     }
-    access_file(
-        made.folder,
-        CLUSTER,
-        kubeconfig=limited(rig.kube, rig.kubeconfig, made.folder, rights),
-        webhook=f"{rig.url(SERVER)}/api/webhook",
-        secret_file=secret,
-    )
+    access = {
+        "kubeconfig": limited(rig.kube, rig.kubeconfig, made.folder, rights),
+        "webhook": f"{rig.parts.url(ARGOCD_SERVER)}/api/webhook",
+        "secret_file": secret,
+    }
+    access_file(made.folder, {CLUSTER: access})
     restart_generator(made, TIMEOUT_S)
     return made
 
 
 @pytest.fixture
 def refreshed(rig: Rig) -> Callable[[], set[str]]:
-    """Return a function that names the Applications that the webhook has refreshed.
-
-    Each call names those that were refreshed after the previous call.
-    """
-    log, seen = rig.log(SERVER), rig.log(SERVER).stat().st_size
+    """Return a function that names what the webhook has refreshed since the last call."""
+    seen: list[str] = []
 
     def names() -> set[str]:
-        nonlocal seen
-        with log.open("rb") as file:
-            file.seek(seen)
-            text = file.read().decode()
-        seen += len(text.encode())
-        lines = (line for line in text.splitlines() if "from webhook" in line)
-        return {line.split("refreshing app '")[1].split("'")[0] for line in lines}
+        told = rig.parts.log(ARGOCD_SERVER).read_text(errors="replace").splitlines()
+        new = [line for line in told if "from webhook" in line][len(seen) :]
+        seen.extend(new)
+        return {line.split("refreshing app '")[1].split("'")[0] for line in new}
 
+    names()  # what was refreshed before the test does not count
     return names
 
 
@@ -97,7 +90,8 @@ def test_healthy_means_that_a_chart_edited_in_its_folder_runs(
 def test_a_call_with_another_signature_or_none_is_refused(
     world: World, rig: Rig, secret: bytes | None
 ) -> None:
-    url, pushed = f"{rig.url(SERVER)}/api/webhook", (rig.git_url(world.name), "", world.tip(), None)
+    url = f"{rig.parts.url(ARGOCD_SERVER)}/api/webhook"
+    pushed = (rig.git_url(world.name), "", world.tip(), None)
     with pytest.raises(NoAnswer, match=r"^it answered 400$"):
         reconcile_trigger.call_argocd(url, secret, *pushed)
     reconcile_trigger.call_argocd(url, WEBHOOK_SECRET.encode(), *pushed)

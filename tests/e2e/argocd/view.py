@@ -6,12 +6,13 @@ This module reads the API and triggers Argo CD; it changes no object that Argo C
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from tests.e2e.common.namespace import Namespace
-from tests.e2e.rig.argocd import NAMESPACE
+from tests.e2e.rig.components import ARGOCD as NAMESPACE
 from tests.e2e.rig.errors import RigError
-from tests.e2e.rig.kube import Manifest
+from tests.e2e.rig.kube import Kube, Manifest
 
 _REFRESH = "argocd.argoproj.io/refresh"
 
@@ -19,8 +20,36 @@ _REFRESH = "argocd.argoproj.io/refresh"
 class Domain(Namespace):
     """The domain's namespace on one cluster; the Application `name` applies the domain's folder."""
 
-    GITOPS = "argocd"
     RELEASE = "Application"
+
+    @classmethod
+    def all_in(cls, kube: Kube, bootstrap: Iterable[Manifest]) -> list[Domain]:
+        folders = (item for item in bootstrap if item["kind"] == "Application")
+        return [
+            cls(kube, one["spec"]["destination"]["namespace"], one["metadata"]["name"])
+            for one in folders
+        ]
+
+    def settle(self, commit: str) -> None:
+        def is_permitted() -> bool:
+            """Return whether the project permits the folder and Argo CD has read the folder.
+
+            For minutes, Argo CD may still use a former project of the same name. If that project
+            forbids the folder, make Argo CD look at the folder again.
+            """
+            if "is not permitted in project" in self.folder_trouble():
+                self.wake()
+                return False
+            return bool(self.fetched())
+
+        self.kube.wait("Argo CD to see the project", is_permitted)
+        self.wait_applied(commit)
+
+    def remove(self) -> None:
+        self.kube.delete("Application", self.name, NAMESPACE)
+        # if a test killed the API server, Argo CD sees this only when it watches again
+        self.kube.wait_gone("Application", self.name, NAMESPACE)
+        self.kube.delete("AppProject", self.name, NAMESPACE)
 
     # --- reading ----------------------------------------------------------------------------
 
@@ -34,9 +63,9 @@ class Domain(Namespace):
         under_way = bool(found.get("operation"))
         return self.fetched() if self._sync().get("status") == "Synced" and not under_way else ""
 
-    def trouble(self, name: str, namespace: str) -> str:
-        """Return the errors that Argo CD reports for an Application; empty if it reports none."""
-        status = (self.kube.get("Application", name, namespace) or {}).get("status") or {}
+    def trouble(self, kind: str, name: str) -> str:
+        found = self.kube.get(kind, name, self._home(name)) or {}
+        status = found.get("status") or {}
         messages = [condition["message"] for condition in status.get("conditions") or []]
         operation = status.get("operationState") or {}
         if operation.get("phase") not in (None, "Succeeded"):
@@ -50,40 +79,40 @@ class Domain(Namespace):
         return "; ".join(messages)
 
     def folder_trouble(self) -> str:
-        return self.trouble(self.name, NAMESPACE)
+        return self.trouble("Application", self.name)
+
+    def read_chart(self, release: str) -> None:
+        self._refresh(release)  # by itself, Argo CD reads a chart only every few minutes
 
     # --- waiting ----------------------------------------------------------------------------
 
     def wake(self) -> None:
         """Refresh the folder's Application now, so that Argo CD applies what has changed in it."""
-        self.refresh(self.name, NAMESPACE)
+        self._refresh(self.name)
 
-    def refresh(self, name: str, namespace: str = "") -> None:
-        """Refresh one Application now, and wait until Argo CD has done so."""
-        namespace = namespace or self.namespace
+    def _refresh(self, name: str) -> None:
+        home = self._home(name)
         body = {"metadata": {"annotations": {_REFRESH: "normal"}}}
-        self.kube.patch("Application", name, body, namespace)
+        self.kube.patch("Application", name, body, home)
 
         def refreshed() -> bool:
-            found = self.kube.get("Application", name, namespace) or {"metadata": {}}
+            found = self.kube.get("Application", name, home) or {"metadata": {}}
             return _REFRESH not in (found["metadata"].get("annotations") or {})
 
-        self.kube.wait(f"Application {namespace}/{name} to be refreshed", refreshed)
+        self.kube.wait(f"Application {home}/{name} to be refreshed", refreshed)
 
     def wait_fetched(self, commit: str) -> float:
-        self._wait_for(f"{commit[:10]} to be fetched", commit, fetched=True)
-        return time.monotonic()
+        return self._wait_for(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit)
 
     def wait_applied(self, commit: str) -> float:
-        self._wait_for(f"{commit[:10]} to be applied", commit, fetched=False)
-        return time.monotonic()
+        return self._wait_for(f"{commit[:10]} to be applied", lambda: self.applied() == commit)
 
     def wait_attempted(self, commit: str) -> None:
         self.wait_fetched(commit)
 
     def wait_checked(self, commit: str) -> None:
         for release in self.releases():
-            self.refresh(release)
+            self._refresh(release)
 
     def wait_releases(self) -> None:
         def synced() -> bool:
@@ -100,11 +129,14 @@ class Domain(Namespace):
     def _sync(self) -> dict[str, Any]:
         return dict((self._folder().get("status") or {}).get("sync") or {})
 
-    def _wait_for(self, what: str, commit: str, *, fetched: bool) -> None:
-        look = self.fetched if fetched else self.applied
+    def _home(self, name: str) -> str:
+        """Return the namespace of an Application: the folder's is Argo CD's own."""
+        return NAMESPACE if name == self.name else self.namespace
+
+    def _wait_for(self, what: str, look: Callable[[], bool]) -> float:
         try:
-            self.kube.wait(what, lambda: look() == commit)
+            self.kube.wait(what, look)
         except RigError as error:
-            messages = [self.trouble(self.name, NAMESPACE)]
-            messages += [self.trouble(name, self.namespace) for name in self.releases()]
+            messages = [self.trouble("Application", one) for one in (self.name, *self.releases())]
             raise AssertionError(f"{error}; {'; '.join(filter(None, messages))}") from error
+        return time.monotonic()

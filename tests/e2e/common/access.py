@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -16,19 +15,19 @@ _ACCOUNT = "generator"
 _STATUS_PAGE = Path(__file__).parents[3] / "docs" / "status.md"
 
 
-def access_file(folder: Path, cluster: str, **connection: object) -> Path:
-    """Write the file for ``--clusters`` with access to one cluster; return the file's path."""
+def access_file(folder: Path, clusters: Mapping[str, Mapping[str, object]]) -> Path:
     file = folder / "clusters.yaml"
-    clusters = {cluster: {key: str(value) for key, value in connection.items()}}
-    content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": clusters}
+    access = {name: {key: str(one[key]) for key in one} for name, one in clusters.items()}
+    content = {"apiVersion": "demandops/v1", "kind": "ClusterAccess", "clusters": access}
     file.write_text(yaml.safe_dump(content))
     return file
 
 
 def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
     """Return the role rules that docs/status.md lists for a controller, by namespace."""
+    name = {"flux": "flux", "argocd": "argo cd"}[gitops]
     blocks = re.findall(r"```yaml\n(.*?)```", _STATUS_PAGE.read_text(), re.DOTALL)
-    (block,) = [text for text in blocks if f"# with {gitops}\n" in text.lower()]
+    (block,) = [text for text in blocks if f"# with {name}\n" in text.lower()]
     roles = list(yaml.safe_load_all(block))
     return {role["metadata"]["namespace"]: role["rules"] for role in roles}
 
@@ -36,33 +35,18 @@ def documented_roles(gitops: str) -> dict[str, list[Manifest]]:
 def limited(
     kube: Kube, administrator: Path, folder: Path, rights: Mapping[str, Sequence[Manifest]]
 ) -> Path:
-    """Create an account with only these rights, and return the path of a kubeconfig for it.
-
-    ``rights`` has the account's role rules by namespace.
-    """
+    """Create an account with these role rules by namespace; return the path of its kubeconfig."""
     home, *_ = rights
     subject = {"kind": "ServiceAccount", "name": _ACCOUNT, "namespace": home}
     role = {"apiGroup": _RBAC, "kind": "Role", "name": _ACCOUNT}
-    secret = build_manifest(
-        "v1", "Secret", _ACCOUNT, home, type="kubernetes.io/service-account-token"
-    )
-    secret["metadata"]["annotations"] = {"kubernetes.io/service-account.name": _ACCOUNT}
-    kube.apply(build_manifest("v1", "ServiceAccount", _ACCOUNT, home), secret)
+    kube.apply(build_manifest("v1", "ServiceAccount", _ACCOUNT, home))
     for namespace, rules in rights.items():
         kube.apply(
             build_manifest(f"{_RBAC}/v1", "Role", _ACCOUNT, namespace, rules=list(rules)),
             build_manifest(
-                f"{_RBAC}/v1",
-                "RoleBinding",
-                _ACCOUNT,
-                namespace,
-                roleRef=role,
-                subjects=[subject],
+                f"{_RBAC}/v1", "RoleBinding", _ACCOUNT, namespace, roleRef=role, subjects=[subject]
             ),
         )
-
-    def token() -> str:
-        return str(((kube.get("Secret", _ACCOUNT, home) or {}).get("data") or {}).get("token", ""))
 
     def in_force() -> bool:  # the API server applies new roles only a moment later
         return all(
@@ -73,9 +57,8 @@ def limited(
         )
 
     kube.wait("the rights", in_force)
-    token_text = base64.b64decode(kube.wait("a token", token)).decode()
     config = yaml.safe_load(administrator.read_text())
-    config["users"] = [{"name": _ACCOUNT, "user": {"token": token_text}}]
+    config["users"] = [{"name": _ACCOUNT, "user": {"token": kube.token(_ACCOUNT, home)}}]
     (context,) = [c for c in config["contexts"] if c["name"] == config["current-context"]]
     context["context"]["user"] = _ACCOUNT
     config["contexts"] = [context]

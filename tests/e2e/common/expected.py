@@ -46,12 +46,10 @@ def demand(step: int) -> dict[str, Any]:
 
 
 def title(step: int) -> str:
-    """Return what happens in a step."""
     return str(paper.STEPS[step - 1])
 
 
 def source_end(node: str) -> str:
-    """Return the name of the client at the source of a node's connection to the edge."""
     return f"mqtt-{node}-edge-source-{_ENDS[node][0]}"
 
 

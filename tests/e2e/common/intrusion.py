@@ -3,61 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
+
+import yaml
 
 from tests.e2e.rig.kube import Manifest, build_manifest
 
 NEIGHBOUR = "neighbour"  # a namespace that belongs to no access domain
-FILE = "clusters/c-its/perception/edge/foreign.yaml"
+FOLDER = "clusters/c-its/perception"
+FILE, BASE = f"{FOLDER}/edge/foreign.yaml", f"{FOLDER}/foreign/kustomization.yaml"
 _RBAC = "rbac.authorization.k8s.io"
-
-
-_EDGE = {"node_id": "edge"}
 _BY_POLICY = " is not possible with podSecurity: host-network of access domain 'perception'"
-_ELSEWHERE = "no node selector of access domain 'perception': its pods run on its own nodes"
+_PODS = yaml.safe_load(Path(__file__).with_name("pods.yaml").read_text())
 
 
-def _container(**context: Any) -> Manifest:
-    return {"name": "foreign", "image": "example.org/foreign:1", "securityContext": context}
+def pod(container: Manifest | None = None, **fields: Any) -> Manifest:
+    """Return the spec of a pod on the edge, with a container of this security context."""
+    only = {"name": "foreign", "image": "example.org/foreign:1", "securityContext": container or {}}
+    return {"nodeSelector": {"node_id": "edge"}, "containers": [only], **fields}
 
 
-def pod(*containers: Manifest, **more: Any) -> Manifest:
-    """Return the spec of a pod on the edge; `more` adds or replaces fields."""
-    return {"nodeSelector": _EDGE, "containers": [*containers] or [_container()], **more}
-
-
-ALLOWED = {
-    "the host's network": pod(hostNetwork=True),
-    "a usual capability": pod(_container(capabilities={"add": ["CHOWN"], "drop": ["ALL"]})),
-    "a narrower selector": pod(nodeSelector={**_EDGE, "kubernetes.io/os": "linux"}),
-    "volumes of a chart": pod(volumes=[{"name": "home", "emptyDir": {}}]),
-}
+ALLOWED = {name: pod(**fields) for name, fields in _PODS["allowed"].items()}
 FORBIDDEN = {
-    "privileged": (pod(_container(privileged=True)), f"a privileged container{_BY_POLICY}"),
-    "privileged at its start": (
-        pod(initContainers=[{**_container(privileged=True), "name": "first"}]),
-        f"a privileged container{_BY_POLICY}",
-    ),
-    "a folder of the host": (
-        pod(volumes=[{"name": "root", "hostPath": {"path": "/"}}]),
-        f"a hostPath volume{_BY_POLICY}",
-    ),
-    "processes of the host": (pod(hostPID=True), f"hostPID or hostIPC{_BY_POLICY}"),
-    "memory of the host": (pod(hostIPC=True), f"hostPID or hostIPC{_BY_POLICY}"),
-    "a capability": (
-        pod(_container(capabilities={"add": ["SYS_ADMIN"]})),
-        f"a capability beyond the usual ones{_BY_POLICY}",
-    ),
-    "unconfined": (
-        pod(securityContext={"seccompProfile": {"type": "Unconfined"}}),
-        f"an unconfined container (procMount, seccomp, AppArmor, SELinux){_BY_POLICY}",
-    ),
-    "another type for SELinux": (
-        pod(_container(seLinuxOptions={"type": "spc_t"})),
-        f"an unconfined container (procMount, seccomp, AppArmor, SELinux){_BY_POLICY}",
-    ),
-    "any node": (pod(nodeSelector={}), _ELSEWHERE),
-    "a node of nobody": (pod(nodeSelector={"kubernetes.io/os": "linux"}), _ELSEWHERE),
+    name: (pod(**fields), reason.replace("…", _BY_POLICY))
+    for reason, pods in _PODS["forbidden"].items()
+    for name, fields in pods.items()
 }
 """Pod specs that the skeleton's access domain must refuse, each with the refusal's reason."""
 
@@ -77,8 +48,28 @@ def makers(spec: Manifest) -> Iterator[Manifest]:
     yield build_manifest("batch/v1", "CronJob", "foreign", "perception", spec=cron)
 
 
+def privileged_deployment() -> tuple[Manifest, str]:
+    """Return a Deployment of privileged pods, and the reason of its refusal."""
+    spec, reason = FORBIDDEN["privileged"]
+    (deployment,) = (maker for maker in makers(spec) if maker["kind"] == "Deployment")
+    return deployment, reason
+
+
+def config(name: str, namespace: str) -> Manifest:
+    return build_manifest("v1", "ConfigMap", name, namespace, data={"made": "by hand"})
+
+
 def binding(kind: str, namespace: str = "") -> Manifest:
     """Return a binding of this kind that makes the domain's account an administrator."""
     account = {"kind": "ServiceAccount", "name": "demandops", "namespace": "perception"}
     role = {"apiGroup": _RBAC, "kind": "ClusterRole", "name": "cluster-admin"}
     return build_manifest(f"{_RBAC}/v1", kind, "more", namespace, roleRef=role, subjects=[account])
+
+
+def withdraw(world: Any) -> None:
+    """Remove the committed files that still exist, and wait until the removal is applied."""
+    commit = world.tip()
+    if there := {FILE, BASE} & set(world.person.git("ls-files").split()):
+        commit = world.push(dict.fromkeys(there))
+    world.domain.wake()
+    world.domain.wait_applied(commit)

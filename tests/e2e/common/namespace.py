@@ -5,8 +5,9 @@ The `view` module of each controller adds what depends on the controller.
 
 from __future__ import annotations
 
+import re
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, ClassVar
 
 import yaml
@@ -14,7 +15,6 @@ import yaml
 from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube, Manifest
 from tests.e2e.rig.kwok import NODE_ID_LABEL
-from tests.kit.limits import PATIENCE_S
 
 from .expected import FUSION
 
@@ -22,28 +22,35 @@ _INSTANCE = "app.kubernetes.io/instance"
 
 # Kinds that commits of the generator can create in a domain's namespace.
 _OF_RELEASES = (
-    "ConfigMap",
-    "Deployment",
-    "Pod",
-    "ReplicaSet",
-    "Role",
-    "RoleBinding",
-    "Secret",
-    "ServiceAccount",
+    *("ConfigMap", "Deployment", "Pod", "ReplicaSet", "Secret"),
+    *("Role", "RoleBinding", "ServiceAccount"),
 )
 _OTHERS = ("Job", "Service")
+_READY_POD = re.compile(r"pod of (?P<name>\S+?)(-[0-9a-f]{12})? on (?P<node>\S+), ready")
+
+Pods = set[tuple[str, str]]
+"""Pods, each as the name of its service without a hash, and its node."""
 
 
 class Namespace:
-    """An access domain's namespace; each release of a service is an object of the kind `RELEASE`.
+    """An access domain's namespace; its releases are objects of the kind `RELEASE`."""
 
-    `name` is the name of the controller's object that applies the domain's folder.
-    """
-
-    GITOPS: ClassVar[str]
     RELEASE: ClassVar[str]
     OWN: ClassVar[tuple[str, ...]] = ()  # further kinds of the controller's objects
     STEADY: ClassVar[tuple[str, ...]] = ()  # kinds that a commit must not touch without need
+
+    # What the view of each controller adds. The times are those of `time.monotonic`.
+    all_in: ClassVar[Callable[..., list[Any]]]  # the domains that a bootstrap file lays down
+    settle: Callable[[str], None]  # wait until the bootstrap file and a commit are applied
+    remove: Callable[[], None]  # the controller's objects, with all releases
+    wake: Callable[[], None]  # make the controller fetch from the remote now
+    wait_fetched: Callable[[str], float]  # wait for a commit; return the time
+    wait_applied: Callable[[str], float]
+    wait_attempted: Callable[[str], None]  # wait until a commit is applied or refused
+    wait_releases: Callable[[], None]  # until all are applied; their pods need not be ready
+    wait_checked: Callable[[str], None]  # until every release was compared with a commit
+    trouble: Callable[[str, str], str]  # why an object (kind, name) is not ready, or nothing
+    folder_trouble: Callable[[], str]  # why the domain's folder cannot be applied, or nothing
 
     def __init__(self, kube: Kube, namespace: str, name: str) -> None:
         self.kube, self.namespace, self.name = kube, namespace, name
@@ -52,7 +59,6 @@ class Namespace:
     # --- reading ----------------------------------------------------------------------------
 
     def get(self, kind: str, name: str) -> Manifest:
-        """Return an object that must exist."""
         found = self.kube.get(kind, name, self.namespace)
         assert found is not None, f"{kind} {self.namespace}/{name} does not exist"
         return found
@@ -74,6 +80,12 @@ class Namespace:
         repeated = {line for line in found if found.count(line) > 1}
         return frozenset(found) | {f"twice: {line}" for line in repeated}
 
+    def pods(self) -> Pods:
+        """Return the pods; one that is not ready is ``("?", "?")``."""
+        lines = (line for line in self.lines() if line.startswith("pod of "))
+        matches = map(_READY_POD.fullmatch, lines)
+        return {(match["name"], match["node"]) if match else ("?", "?") for match in matches}
+
     def releases(self) -> dict[str, Any]:
         return {name_of(item): item["spec"] for item in self.find(self.RELEASE)}
 
@@ -91,20 +103,16 @@ class Namespace:
         }
 
     def identity(self, name: str) -> tuple[object, ...]:
-        """Return ids that change if a Deployment's pods restart or are about to restart.
-
-        These are the UID and generation of the Deployment, and the UIDs of pods and ReplicaSets.
-        """
+        """Return what changes if a Deployment's pods restart or are about to restart."""
         metadata = self.get("Deployment", name)["metadata"]
         pods = sorted(pod["metadata"]["uid"] for pod in self.find("Pod", name))
         sets = sorted(item["metadata"]["uid"] for item in self.find("ReplicaSet", name))
         return metadata["uid"], metadata["generation"], *pods, *sets
 
     def uids(self) -> dict[str, tuple[object, ...]]:
-        """Return the UIDs of each Deployment, its pods and ReplicaSets, by the Deployment's name.
+        """Return `identity` of each Deployment, without the generation.
 
-        `identity` has the Deployment's generation too. The generation changes when another
-        controller applies the Deployment and writes a default value explicitly.
+        It changes when another controller applies a Deployment and writes out a default value.
         """
         found = {}
         for item in self.find("Deployment"):
@@ -114,59 +122,35 @@ class Namespace:
 
     # --- what the controller does -------------------------------------------------------------
 
-    def wake(self) -> None:
-        """Make the controller fetch from the remote now."""
-        raise NotImplementedError
-
-    def wait_fetched(self, commit: str) -> float:
-        """Wait until the controller has fetched a commit; return the time (`time.monotonic`)."""
-        raise NotImplementedError
-
-    def wait_applied(self, commit: str) -> float:
-        """Wait until the controller has applied a commit; return the time (`time.monotonic`)."""
-        raise NotImplementedError
-
-    def wait_attempted(self, commit: str) -> None:
-        """Wait until the controller has tried to apply a commit, with or without success."""
-        raise NotImplementedError
-
-    def wait_releases(self) -> None:
-        """Wait until the controller has applied all releases; their pods need not be ready."""
-        raise NotImplementedError
-
-    def wait_checked(self, commit: str) -> None:
-        """Wait until the controller has compared every release with the given commit."""
-        raise NotImplementedError
-
-    def folder_trouble(self) -> str:
-        """Return why the domain's folder cannot be applied; empty if it can."""
-        raise NotImplementedError
+    def read_chart(self, release: str) -> None:
+        """Make the controller read a release's chart again, if it does not do so by itself."""
 
     def take_away(self, kind: str, name: str) -> None:
-        """Delete an object that the controller restores."""
         self.kube.delete(kind, name, self.namespace)
 
     def restore(self, *releases: str) -> None:
-        """Make the controller restore these releases, or the domain's folder if none is named.
-
-        A subclass overrides this empty method if its controller does not restore by itself.
-        """
+        """Make the controller restore these releases, or without any the folder, if it must."""
 
     # --- waiting ----------------------------------------------------------------------------
 
-    def wait_lines(self, wanted: frozenset[str], timeout: float = PATIENCE_S) -> float:
+    def wait_lines(self, wanted: frozenset[str]) -> float:
         """Wait until `lines` returns just the wanted lines; return the time (`time.monotonic`)."""
-        return self._wait_same(self.lines, wanted, timeout)
+        return self._wait_same(self.lines, wanted)
 
-    def wait_inventory(self, wanted: frozenset[str], timeout: float = PATIENCE_S) -> None:
-        """Wait until `inventory` returns exactly the wanted objects."""
-        self._wait_same(self.inventory, wanted, timeout)
+    def wait_inventory(self, wanted: frozenset[str]) -> None:
+        self._wait_same(self.inventory, wanted)
+
+    def wait_refused(self, why: str, *releases: str) -> None:
+        """Wait until the domain's folder, or one of these releases, reports a refusal."""
+
+        def refused() -> bool:
+            told = [self.folder_trouble(), *(self.trouble(self.RELEASE, name) for name in releases)]
+            return any(why in text for text in told)
+
+        self.kube.wait(f"'{why}' to be reported", refused)
 
     def wait_quiet(self, seconds: float = 1.0) -> dict[str, str]:
-        """Wait until no object of a release has changed for ``seconds``; return `versions`.
-
-        The status of a Deployment counts too; Kubernetes updates it after the pods are ready.
-        """
+        """Wait until no release has changed for ``seconds``, nor its status; return `versions`."""
         seen, since = self.versions(), time.monotonic()
 
         def quiet() -> bool:
@@ -182,7 +166,6 @@ class Namespace:
     # --- inside -----------------------------------------------------------------------------
 
     def _all_counted(self) -> bool:
-        """Return whether each Deployment and ReplicaSet reports all wanted pods as available."""
         return all(
             status.get("observedGeneration") == item["metadata"]["generation"]
             and status.get(counted, 0) == item["spec"]["replicas"]
@@ -192,9 +175,7 @@ class Namespace:
             for counted in ("readyReplicas", "availableReplicas")
         )
 
-    def _wait_same(
-        self, look: Callable[[], frozenset[str]], wanted: frozenset[str], timeout: float
-    ) -> float:
+    def _wait_same(self, look: Callable[[], frozenset[str]], wanted: frozenset[str]) -> float:
         seen: list[frozenset[str]] = [frozenset()]
 
         def same() -> bool:
@@ -202,7 +183,7 @@ class Namespace:
             return seen[0] == wanted
 
         try:
-            self.kube.wait("exactly what is wanted", same, timeout)
+            self.kube.wait("exactly what is wanted", same)
         except RigError as error:
             raise AssertionError(f"{error}\n{_difference(wanted, seen[0])}") from error
         return time.monotonic()
@@ -229,8 +210,19 @@ class Namespace:
         return self._node_ids[node]
 
 
+def wait_for_pods(wanted: Mapping[Namespace, Pods]) -> None:
+    """Wake the controller until each of these domains runs exactly its pods."""
+
+    def same() -> bool:
+        for domain in wanted:
+            domain.wake()
+        return all(domain.pods() == pods for domain, pods in wanted.items())
+
+    listed = {domain.namespace: sorted(pods) for domain, pods in wanted.items()}
+    next(iter(wanted)).kube.wait(f"exactly {listed}", same)
+
+
 def fusion_inputs(config: Manifest) -> list[str]:
-    """Return the fusion's input topics from its ConfigMap."""
     (parameters,) = yaml.safe_load(config["data"]["params.yml"]).values()
     inputs = parameters["ros__parameters"]["additional_inputs"]
     return [topic for topic in inputs["topics_egodata"] + inputs["topics_objectlist"] if topic]

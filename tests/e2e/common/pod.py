@@ -15,7 +15,6 @@ names a folder, the image is the root file system in that folder (made by ``depl
 from __future__ import annotations
 
 import os
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -29,56 +28,11 @@ from .volumes import files
 ROOT = Path(__file__).parents[3]
 IMAGE_VARIABLE = "E2E_IMAGE_ROOT"
 
-# Arguments: the root's folder; the image; the folders and the Python that replace an image;
-# MODE:SOURCE:TARGET for each volume; user; group; and the command.
-_START = """
-root=$1 image=$2 folders=$3 python=$4 volumes=$5 user=$6 group=$7
-shift 7
-show_folders() {
-  for folder in $folders; do
-    [ -z "$(ls -A "$root$folder" 2>/dev/null)" ] || continue
-    mkdir -p "$root$folder"
-    mount --bind "$folder" "$root$folder"
-    mount -o remount,bind,ro "$root$folder"
-  done
-}
-mount -t tmpfs -o mode=755 tmpfs "$root"
-if [ -n "$image" ]; then
-  mkdir "$root/above" "$root/work" "$root/merged"
-  mount -t overlay -o "lowerdir=$image,upperdir=$root/above,workdir=$root/work" pod "$root/merged"
-  root=$root/merged
-else
-  cp -a /etc /bin /sbin /lib* "$root/"
-  echo "demandops:x:$user:$group::/:/bin/sh" >>"$root/etc/passwd"
-  mkdir "$root/image"
-  printf '#!/bin/sh\nexec %s -m demandops.cli.main "$@"\n' "$python" >"$root/image/demandops"
-  chmod 755 "$root/image/demandops"
-  show_folders
-fi
-mkdir -p "$root/proc" "$root/dev"
-mount --bind /proc "$root/proc"
-mount --bind /dev "$root/dev"
-mount -t tmpfs -o mode=700 tmpfs "$root/dev/shm"
-for volume in $volumes; do
-  mode=${volume%%:*} target=${volume##*:} source=${volume#*:}
-  chroot "$root" mkdir -p "$target"
-  target=$(chroot "$root" realpath "$target")  # an image's link must not lead out of it
-  mount --bind "${source%:*}" "$root$target"
-  mount -o "remount,bind,$mode" "$root$target"
-done
-[ -n "$image" ] || show_folders  # a volume may hide one: this checkout may be below /tmp
-mount -o remount,bind,ro "$root"
-cd /
-exec chroot "$root" setpriv --reuid "$user" --regid "$group" --groups "$group" \
-  --bounding-set=-all --inh-caps=-all --no-new-privs --pdeathsig KILL env -i "$@"
-"""
+_START = Path(__file__).with_name("start-pod.sh")
 
 
 class Pod:
-    """A pod's only container as a process.
-
-    When the pod has ended, ``folder`` still has its log and the data of its volume claims.
-    """
+    """A pod's only container as a process; ``folder`` has its log and volume claims."""
 
     def __init__(self, kube: Kube, name: str, namespace: str, server: str, folder: Path) -> None:
         """Read the pod from the API; ``server`` is the API server's host and port."""
@@ -89,7 +43,7 @@ class Pod:
         self.log = folder / f"{name}.log"
         self._start = 0
         self._host, self._port = server.rsplit(":", 1)
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process: Any = None
 
     @property
     def container(self) -> dict[str, Any]:
@@ -98,13 +52,10 @@ class Pod:
 
     @property
     def pid(self) -> int:
-        assert self._process is not None
         return self._process.pid
 
     @property
     def code(self) -> int | None:
-        """The exit code of the process; None while it runs."""
-        assert self._process is not None
         return self._process.poll()
 
     def start(self) -> None:
@@ -137,18 +88,11 @@ class Pod:
             self._process = subprocess.Popen(
                 [
                     *launch.command("/usr/bin/unshare", "--mount", "--propagation", "private"),
-                    *("/bin/sh", "-eu", "-c", _START, "pod", str(root), image),
-                    *(
-                        " ".join(sorted(folders)),
-                        sys.executable,
-                        " ".join(mounts),
-                        *ids,
-                        *variables,
-                        *command,
-                    ),
+                    *("/bin/sh", "-eu", str(_START), str(root), image, " ".join(sorted(folders))),
+                    *(sys.executable, " ".join(mounts), *ids, *variables, *command),
                 ],
                 stdout=log,
-                stderr=subprocess.STDOUT,
+                stderr=log,
                 stdin=subprocess.DEVNULL,
             )
 
@@ -157,16 +101,8 @@ class Pod:
         return self.log.read_bytes()[self._start :].decode(errors="replace")
 
     def kill(self) -> None:
-        """Kill the container, as if its cluster node had died."""
-        assert self._process is not None
         self._process.kill()
         self._process.wait(10)
-
-    def stop(self) -> int:
-        """Send the container a SIGTERM, wait for its end, and return its exit code."""
-        assert self._process is not None
-        self._process.send_signal(signal.SIGTERM)
-        return self._process.wait(self.manifest["spec"]["terminationGracePeriodSeconds"])
 
     def _volume(self, volume: dict[str, Any], group: int) -> Path:
         """Return a folder with the content of a volume, readable by the pod's group."""

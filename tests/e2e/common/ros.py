@@ -16,8 +16,6 @@ from tests.kit.ros import Sent
 
 
 class Client(ros.Client):
-    """Sends goals to the node of one ROS domain."""
-
     def __init__(self, domain: int) -> None:
         super().__init__(domain)
         self._over = threading.Event()
@@ -42,10 +40,7 @@ class Client(ros.Client):
         return sent[0]
 
     def call(self, sent: Goal) -> Sent:
-        """Send a goal and wait for its result; send it again if no node accepts it in 3 s.
-
-        A client still sees a killed server for a while, and goals to that server are lost.
-        """
+        """Send a goal until a node takes it; for a while a client still sees a killed node."""
         end = time.monotonic() + PATIENCE_S
         under_way, since = self.send(sent), time.monotonic()
         while not under_way.accepted:

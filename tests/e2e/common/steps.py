@@ -12,7 +12,8 @@ from typing import Any
 import pytest
 import yaml
 
-from tests.e2e.rig.cluster import PARTS, Rig
+from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.components import KINDS
 from tests.e2e.rig.kube import build_manifest
 from tests.e2e.rig.tools import Report
 from tests.kit.config import override
@@ -29,34 +30,30 @@ from .expected import (
     target_end,
     unscheduled,
 )
-from .golden import golden
-from .manual import change_image, overwrite, pod_template, requested_by, wait_restored
 from .namespace import Namespace
-from .staterepo import StateRepo, demandops
-from .timing import Table
+from .rendered import golden
+from .world import World, demandops, show_times
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 CHART = "appdefs/object-detection-fusion/charts/object-fusion"
 SCALING = "{min: 2, max: 4, autoscaler: {cpu: 70}, dividesWork: true}"
 MANY = "overrides/many.yaml"
 SCALED = {"services": ["object-detection"]}
-World = StateRepo[Any]
 PLAIN, OTHER = source_end("vehicle00"), target_end("station00")
 
 
 def test_eight_steps_and_the_fusion_is_never_restarted(world: World, say: Report) -> None:
     domain = world.domain
-    table = Table(f"From the goal to the pods with {world.rig.gitops}, woken by the test")
+    times: dict[str, list[float]] = {}
     at_first = domain.inventory()
     fusion: list[tuple[object, ...]] = []
     for step in STEPS:
-        times = world.step(step, expected.after(step))
-        table.add(f"{step} {expected.title(step)}", times)
+        times[f"{step} {expected.title(step)}"] = world.step(step, expected.after(step))
         domain.wait_releases()
         assert domain.lines() == expected.after(step), "the namespace changed again"
         if step < STEPS[-1]:
             fusion.append(domain.identity(FUSION))
-    table.show(say)
+    show_times(say, f"From the goal to the pods with {world.rig.gitops}, woken by the test", times)
     assert len(set(fusion)) == 1, f"the fusion was rolled out or restarted: {fusion}"
     domain.wait_inventory(at_first)
 
@@ -76,6 +73,45 @@ def test_a_service_that_cannot_start_is_reconfigured_and_removed(
     domain.wake()
     domain.wait_applied(sent.commit)
     domain.wait_lines(WITHOUT_DEMANDS)
+
+
+def requested_by(vehicle: str, goal: dict[str, Any]) -> dict[str, Any]:
+    """Return a copy of the goal whose requesters are ``vehicle`` and station00."""
+    requesters = {"requester_ids": [vehicle, "station00"]}
+    apps = [
+        app | {"object_detection_fusion_app": app["object_detection_fusion_app"] | requesters}
+        for app in goal["apps"]
+    ]
+    connections = [connection | requesters for connection in goal["connections"]]
+    return goal | {"apps": apps, "connections": connections}
+
+
+def pod_template(namespace: Namespace, deployment: str) -> dict[str, Any]:
+    template: dict[str, Any] = namespace.get("Deployment", deployment)["spec"]["template"]
+    return template
+
+
+def change_image(namespace: Namespace, deployment: str) -> None:
+    containers = pod_template(namespace, deployment)["spec"]["containers"]
+    containers[0]["image"] = "example.invalid/other:1"
+    body = {"spec": {"template": {"spec": {"containers": containers}}}}
+    namespace.kube.patch("Deployment", deployment, body, namespace.namespace)
+    changed = pod_template(namespace, deployment)["spec"]["containers"][0]["image"]
+    assert changed == "example.invalid/other:1"
+
+
+def overwrite(namespace: Namespace, config: str, key: str) -> None:
+    namespace.kube.patch("ConfigMap", config, {"data": {key: "by hand"}}, namespace.namespace)
+    assert namespace.get("ConfigMap", config)["data"] == {key: "by hand"}
+
+
+def wait_restored(
+    namespace: Namespace, template: dict[str, Any], data: dict[str, str], *names: str
+) -> None:
+    """Wait until a Deployment and a ConfigMap, of these names, are as they were."""
+    deployment, config = names
+    namespace.kube.wait("the image", lambda: pod_template(namespace, deployment) == template)
+    namespace.kube.wait("the content", lambda: namespace.get("ConfigMap", config)["data"] == data)
 
 
 def running(world: World) -> Namespace:
@@ -155,10 +191,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
         domain.wait_applied(world.tip())
 
     def scale_and_change_image(to: int, *names: str) -> None:
-        """Scale Deployments as an autoscaler does, and change their images.
-
-        Return once the controller has restored each former image.
-        """
+        """Scale as an autoscaler does, change the images, and wait until these are restored."""
         for each in names:
             template = pod_template(domain, each)
             domain.kube.scale(each, to, domain.namespace)
@@ -168,7 +201,7 @@ def test_an_autoscaler_owns_the_number_of_replicas(world: World) -> None:
 
     original = world.file(APPDEF)
     merge(_autoscaled(world))
-    domain.kube.apply(world.file(f"bootstrap/{CLUSTER}.yaml"))  # allows autoscalers
+    domain.kube.apply(*world.manifests(CLUSTER))  # allows autoscalers
     domain.restore(*DETECTION.values(), FUSION)  # these releases failed without that right
     domain.kube.wait("an autoscaler", lambda: bounds() == (2, 4))
     domain.kube.wait("two replicas", lambda: (replicas(), replicas(FUSION)) == (2, 2))
@@ -220,9 +253,8 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
     cluster that cannot be reached.
     """
     domain = world.domain
-    other, foreign = {"flux": ("argocd", "Application"), "argocd": ("flux", "HelmRelease")}[
-        domain.GITOPS
-    ]
+    own = world.rig.gitops
+    other, foreign = ("argocd", "Application") if own == "flux" else ("flux", "HelmRelease")
     world.step(1, expected.after(1))
     domain.wait_releases()
     before, releases = domain.uids(), domain.releases()
@@ -238,7 +270,7 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
     assert domain.uids() == before
     assert domain.releases() == releases
 
-    demandops(world.folder, "upgrade", "--state-repo", world.push_url, "--gitops", domain.GITOPS)
+    demandops(world.folder, "upgrade", "--state-repo", world.push_url, "--gitops", own)
     domain.wake()
     domain.wait_applied(world.tip())
     assert domain.uids() == before
@@ -246,24 +278,14 @@ def test_a_controller_that_was_not_retired_fails_and_changes_no_pod(world: World
         world.step(step, expected.after(step))
 
 
-def _prepare_golden(rig: Rig) -> list[str]:
-    """Create the golden manifests' namespace; return kinds that the manifests must include."""
-    rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
-    return [*PARTS[rig.gitops].KINDS, "Deployment"]
-
-
-def test_the_server_takes_every_golden_manifest(rig: Rig) -> None:
+def test_the_server_takes_every_golden_manifest_and_no_unknown_field(rig: Rig) -> None:
     """The manifests use the controller's own kinds, whose CRDs the API server knows."""
-    kinds = _prepare_golden(rig)
-    manifests = list(golden(rig.gitops))
+    rig.kube.apply(build_manifest("v1", "Namespace", NAMESPACE))
+    manifests, kinds = list(golden(rig.gitops)), (*KINDS[rig.gitops], "Deployment")
     assert {*kinds, "Role"} <= {manifest["kind"] for manifest in manifests}
     rig.kube.apply(*manifests, dry_run=True)
-
-
-def test_the_dry_run_refuses_an_unknown_field(rig: Rig) -> None:
-    """Without this check, `test_the_server_takes_every_golden_manifest` might prove nothing."""
-    for kind in _prepare_golden(rig):
-        broken = copy.deepcopy(next(item for item in golden(rig.gitops) if item["kind"] == kind))
+    for kind in kinds:
+        broken = copy.deepcopy(next(item for item in manifests if item["kind"] == kind))
         broken["spec"]["interwal"] = "1m"
         with pytest.raises(Exception, match="field not declared in schema"):
             rig.kube.apply(broken, dry_run=True)

@@ -9,11 +9,7 @@ from tests.e2e.rig.kube import Kube
 
 
 def files(kube: Kube, namespace: str, account: str, volume: dict[str, Any]) -> dict[str, bytes]:
-    """Return the content of a volume's files by name, for a pod of a service account.
-
-    Raises:
-        LookupError: if its ConfigMap or Secret does not exist.
-    """
+    """Return the content of a volume's files by name; raise LookupError if it is missing."""
     if secret := volume.get("secret"):
         data = _data(kube, "Secret", namespace, secret["secretName"])
         return {key: base64.b64decode(value) for key, value in data.items()}

@@ -9,14 +9,12 @@ import yaml
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import CLUSTER, NAMESPACE, NODES, STEPS, VEHICLES, WITHOUT_DEMANDS
-from tests.e2e.common.running import running
+from tests.e2e.common.world import World, running
+from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .conftest import MakeWorld
-from .relay import Relay
 from .view import SOURCE, Domain
-from .world import World
 
 FLEET = "vehicles"
 OTHERS = tuple(node for node in NODES if node not in VEHICLES)
@@ -34,15 +32,7 @@ def fleet(rig: Rig, request: pytest.FixtureRequest, say: Report) -> Iterator[Rig
 
 
 @pytest.fixture(scope="module")
-def link(rig: Rig) -> Iterator[Relay]:
-    made = Relay(rig.git_url(""))
-    yield made
-    made.cut()
-
-
-@pytest.fixture(scope="module")
-def world(make_world: MakeWorld, rig: Rig, fleet: Rig, link: Relay) -> Iterator[World]:
-    """A state repo that both clusters follow. It puts the vehicles into the second cluster."""
+def world(make_world: MakeWorld, rig: Rig, fleet: Rig) -> Iterator[World]:
     made = make_world()
     clusters = yaml.safe_load(made.file(CLUSTERS))
     clusters["clusters"].append({"name": FLEET})
@@ -53,8 +43,7 @@ def world(make_world: MakeWorld, rig: Rig, fleet: Rig, link: Relay) -> Iterator[
     made.generator.start()
     made.demand(expected.demand(1))  # its commit applies the inventory
     made.bootstrap(CLUSTER, rig)
-    url = rig.git_url(made.name)
-    made.bootstrap(FLEET, fleet, url=url if rig.existing else link.url + made.name)
+    made.bootstrap(FLEET, fleet, url=fleet.git_url(made.name))
     yield made
     made.remove()  # while both clusters still run
 
@@ -63,10 +52,7 @@ def test_each_cluster_gets_the_services_of_its_own_nodes(world: World) -> None:
     here, there = both(world)
     for step in STEPS:
         sent = world.demand(expected.demand(step))
-        for domain, nodes in ((here, OTHERS), (there, VEHICLES)):
-            domain.wake()
-            domain.wait_applied(sent.commit)
-            domain.wait_lines(expected.after(step, nodes))
+        follow(world, sent.commit, step)
         assert here.lines() == expected.after(step, OTHERS)
     assert here.lines() == there.lines() == WITHOUT_DEMANDS
 
@@ -83,19 +69,15 @@ def test_a_cluster_fetches_its_own_part_and_the_applications(world: World, rig: 
         assert [file for file in files if not file.startswith((part, "appdefs/"))] == []
 
 
-def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(
-    world: World, rig: Rig, link: Relay
-) -> None:
-    if rig.existing:
+def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(world: World, fleet: Rig) -> None:
+    """The link of the vehicles' cluster is the Git server that only this cluster reads from."""
+    if fleet.existing:
         pytest.skip("the tests cannot cut the link of an existing cluster")
     here, there = both(world)
     first = world.demand(expected.demand(1))
-    for domain, nodes in ((here, OTHERS), (there, VEHICLES)):
-        domain.wake()
-        domain.wait_applied(first.commit)
-        domain.wait_lines(expected.after(1, nodes))
-    before, pods = link.pulls, pod_uids(there)
-    link.cut()
+    follow(world, first.commit, 1)
+    before, pods = pulls(world, fleet), there.uids()
+    fleet.parts.stop("git")
     for step in (2, 3, 4, 5, 6):
         sent = world.demand(expected.demand(step))
         for domain in (here, there):
@@ -103,26 +85,31 @@ def test_a_cluster_that_was_cut_off_catches_up_with_one_pull(
         here.wait_lines(expected.after(step, OTHERS))
     there.kube.wait("the cut to be noticed", lambda: there.trouble("GitRepository", SOURCE) or None)
     assert there.lines() == expected.after(1, VEHICLES)
-    assert pod_uids(there) == pods, "a pod was restarted during the cut"
-    link.restore()
+    assert there.uids() == pods, "a pod was restarted during the cut"
+    fleet.parts.start("git")
     there.wait_applied(sent.commit)
     there.wait_lines(expected.after(6, VEHICLES))
-    assert link.pulls == before + 1
+    assert pulls(world, fleet) == before + 1
     assert applied_since(there, first.commit) == [sent.commit]
     for step in (7, 8):
         last = world.demand(expected.demand(step))
-    for domain in (here, there):
-        domain.wake()
-        domain.wait_applied(last.commit)
-        domain.wait_lines(WITHOUT_DEMANDS)
+    follow(world, last.commit, step)
 
 
 def both(world: World) -> tuple[Domain, Domain]:
     return world.domains[CLUSTER], world.domains[FLEET]
 
 
-def pod_uids(domain: Domain) -> set[str]:
-    return {pod["metadata"]["uid"] for pod in domain.find("Pod")}
+def follow(world: World, commit: str, step: int) -> None:
+    """Wait until both clusters have applied a commit, and have what they must after a step."""
+    for domain, nodes in zip(both(world), (OTHERS, VEHICLES), strict=True):
+        domain.wake()
+        domain.wait_applied(commit)
+        domain.wait_lines(expected.after(step, nodes))
+
+
+def pulls(world: World, fleet: Rig) -> int:
+    return fleet.parts.log("git").read_text().count(f'"POST /{world.name}/git-upload-pack ')
 
 
 def applied_since(domain: Domain, commit: str) -> list[str]:

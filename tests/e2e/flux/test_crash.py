@@ -10,10 +10,11 @@ import pytest
 
 from tests.e2e.common import expected
 from tests.e2e.common.expected import STEPS
+from tests.e2e.common.world import World
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .world import World
+from .view import Domain
 
 Act = Callable[[World, dict[str, Any]], None]
 
@@ -33,37 +34,27 @@ def test_eight_steps_with_a_kill_in_each(world: World, rig: Rig, say: Report) ->
     domain.wait_inventory(at_first)
 
 
-def helm_at_work(world: World, goal: dict[str, Any]) -> None:
-    """Kill helm-controller as soon as Helm has stored a release, be it pending or installed."""
-    domain = world.domain
-    world.demand(goal)
-    domain.wake()
+def kill(controller: str, reached: Callable[[Domain, str], object]) -> Act:
+    """Return what demands a goal, and kills a controller once its commit has got so far."""
+
+    def act(world: World, goal: dict[str, Any]) -> None:
+        sent = world.demand(goal)
+        world.domain.wake()
+        reached(world.domain, sent.commit)
+        world.rig.parts.kill(controller)
+        world.rig.parts.start(controller)
+
+    return act
+
+
+def helm_has_stored_a_release(domain: Domain, _: str) -> None:
+    """Wait for the release's secret, be the release pending or installed."""
     secrets = ("Secret", domain.namespace, "owner=helm")
     domain.kube.wait("a release", lambda: domain.kube.find(*secrets) or None)
-    killed(world, "helm-controller")
 
 
-def helm_at_uninstall(world: World, goal: dict[str, Any]) -> None:
-    """Kill helm-controller as soon as the Kustomization has deleted the releases."""
-    sent = world.demand(goal)
-    world.domain.wake()
-    world.domain.wait_applied(sent.commit)
-    killed(world, "helm-controller")
-
-
-def kustomize(world: World, goal: dict[str, Any]) -> None:
-    """Kill kustomize-controller as soon as there is a new commit to apply."""
-    sent = world.demand(goal)
-    world.domain.wake()
-    world.domain.wait_fetched(sent.commit)
-    killed(world, "kustomize-controller")
-
-
-def source(world: World, goal: dict[str, Any]) -> None:
-    """Tell source-controller to fetch, and kill it at once."""
-    world.demand(goal)
-    world.domain.wake()
-    killed(world, "source-controller")
+def told_to_fetch(_: Domain, __: str) -> None:
+    """Do not wait."""
 
 
 def send_until_committed(world: World, goal: dict[str, Any]) -> None:
@@ -74,12 +65,12 @@ def send_until_committed(world: World, goal: dict[str, Any]) -> None:
 def generator_without_git(world: World, goal: dict[str, Any]) -> None:
     """Kill the generator while it cannot push its commit; the next generator pushes the commit."""
     before = world.tip()
-    world.rig.stop_component("git")
+    world.rig.parts.stop("git")
     try:
         send_until_committed(world, goal)
         world.generator.kill()
     finally:
-        world.rig.start_component("git")
+        world.rig.parts.start("git")
     assert world.tip() == before
     world.generator.start()
     world.domain.kube.wait(
@@ -95,30 +86,25 @@ def generator_while_pushing(world: World, goal: dict[str, Any]) -> None:
     the repeated goal makes no second commit. The goal must be a join: a repeated shutdown never
     makes a second commit, so it would prove nothing.
     """
-    world.rig.pause("git")
+    world.rig.parts.pause("git")
     try:
         send_until_committed(world, goal)
         time.sleep(0.2)
         world.generator.kill()
     finally:
-        world.rig.resume("git")
+        world.rig.parts.resume("git")
     world.generator.start()
     world.demand(goal)
     world.domain.wake()
 
 
-def killed(world: World, controller: str) -> None:
-    world.rig.kill(controller)
-    world.rig.start_component(controller)
-
-
 KILLS: dict[int, tuple[str, Act]] = {
-    1: ("helm-controller while it installs", helm_at_work),
+    1: ("helm-controller while it installs", kill("helm-controller", helm_has_stored_a_release)),
     2: ("generator, with a commit that it could not push", generator_without_git),
-    3: ("kustomize-controller while it applies", kustomize),
+    3: ("kustomize-controller while it applies", kill("kustomize-controller", Domain.wait_fetched)),
     4: ("generator while it pushes", generator_while_pushing),
-    5: ("helm-controller while it uninstalls", helm_at_uninstall),
-    6: ("kustomize-controller while it prunes", kustomize),
-    7: ("source-controller while it fetches", source),
-    8: ("source-controller while it fetches the last commit", source),
+    5: ("helm-controller while it uninstalls", kill("helm-controller", Domain.wait_applied)),
+    6: ("kustomize-controller while it prunes", kill("kustomize-controller", Domain.wait_fetched)),
+    7: ("source-controller while it fetches", kill("source-controller", told_to_fetch)),
+    8: ("source-controller at the last commit", kill("source-controller", told_to_fetch)),
 }

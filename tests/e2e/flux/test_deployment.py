@@ -20,11 +20,12 @@ import yaml
 
 from tests.e2e.common.expected import demand
 from tests.e2e.common.pod import Pod
+from tests.e2e.common.rendered import check_chart
 from tests.e2e.common.ros import Client
-from tests.e2e.common.staterepo import demandops
+from tests.e2e.common.world import demandops
 from tests.e2e.rig import githttp, launch
 from tests.e2e.rig.cluster import Rig
-from tests.e2e.rig.kube import Manifest, build_manifest
+from tests.e2e.rig.kube import build_manifest
 from tests.e2e.rig.net import answers, free_port, url
 from tests.kit.repo import git
 
@@ -32,21 +33,8 @@ CHART = Path(__file__).parents[3] / "deploy" / "chart"
 RELEASE, NAMESPACE = "generator", "demandops"
 TAKES_OVER_S = 25
 USER, PASSWORD = "robot", "a token of the git server"
-NEEDED = {"stateRepo": "https://git.invalid/state.git", "image": {"repository": "its/demandops"}}
-ALL = NEEDED | {
-    "stateRepo": "ssh://git@git.invalid/state.git",
-    "image": {"repository": "its/demandops", "digest": "sha256:" + 64 * "0"},
-    "imagePullSecrets": [{"name": "registry"}],
-    "replicas": 3,
-    "secrets": {use: f"{use}-secret" for use in ("git", "signing", "clusters", "webhook", "forge")},
-    "parameters": {"answer": "healthy", "answer_timeout": "60.0"},
-    "ros": {"domainId": 42, "env": [{"name": "ROS_STATIC_PEERS", "value": '10.0.0.1;"#: {'}]},
-    "hostNetwork": True,
-    "storage": {"size": "5Gi", "className": "fast"},
-    "nodeSelector": {"node_id": "edge"},
-    "tolerations": [{"key": "busy", "operator": "Exists"}],
-    "affinity": {"nodeAffinity": {}},
-}
+VALUES: dict[str, Any] = yaml.safe_load(Path(__file__).with_name("deployment.yaml").read_text())
+NEEDED = VALUES["needed"]
 
 
 @pytest.fixture(scope="module")
@@ -57,29 +45,24 @@ def namespace(rig: Rig) -> Iterator[str]:
 
 
 @pytest.mark.parametrize(
-    "values", [NEEDED, NEEDED | {"replicas": 1}, ALL], ids=["as it comes", "one pod", "all set"]
+    "values",
+    [NEEDED, NEEDED | {"replicas": 1}, VALUES["all"]],
+    ids=["as it comes", "one pod", "all set"],
 )
 def test_the_chart_passes_lint_and_what_it_gives_the_server(
     rig: Rig, namespace: str, tmp_path: Path, values: dict[str, Any]
 ) -> None:
-    given = tmp_path / "values.json"
-    given.write_text(json.dumps(values))
-    rig.helm("lint", "--strict", "--quiet", f"--values={given}", str(CHART))
-    text = rig.helm("template", RELEASE, str(CHART), f"-n={namespace}", f"--values={given}")
-    made = [manifest for manifest in yaml.safe_load_all(text) if manifest]
-    for manifest in made:
-        manifest["metadata"].setdefault("namespace", namespace)
-    rig.kube.apply(*made, dry_run=True)
-    kinds = {manifest["kind"] for manifest in made}
+    kinds = check_chart(rig, CHART, RELEASE, namespace, values, tmp_path)
     assert ({"Lease", "Role", "RoleBinding"} <= kinds) == (values.get("replicas") != 1)
     assert ("Service" in kinds) == ("secrets" in values)
 
 
 @pytest.mark.parametrize("missing", ["stateRepo", "image"])
-def test_the_chart_is_refused_without_what_it_needs(rig: Rig, missing: str) -> None:
-    given = [f"--set={key}={value}" for key, value in _flat(NEEDED) if not key.startswith(missing)]
+def test_the_chart_is_refused_without_what_it_needs(rig: Rig, tmp_path: Path, missing: str) -> None:
+    given = tmp_path / "values.json"
+    given.write_text(json.dumps({key: NEEDED[key] for key in NEEDED if key != missing}))
     with pytest.raises(Exception, match=missing):
-        rig.helm("template", RELEASE, str(CHART), *given)
+        rig.helm("template", RELEASE, str(CHART), f"--values={given}")
 
 
 class Deployed:
@@ -100,8 +83,8 @@ class Deployed:
         self._secret("git", username=USER, password=PASSWORD)
         self._secret("signing", **{"ssh-privatekey": self.private_key})
         self.values: dict[str, Any] = {
+            **NEEDED,
             "stateRepo": self.state_repo,
-            "image": {"repository": "its/demandops"},
             "secrets": {"git": "git", "signing": "signing"},
             "ros": {
                 "domainId": ros_domain,
@@ -156,7 +139,6 @@ class Deployed:
         return dict(found.get("spec") or {})
 
     def subjects(self) -> str:
-        """Return the subject lines of all commits on main, newest first."""
         return git(self.repository, "log", "--format=%s", "main")
 
     def close(self) -> None:
@@ -190,7 +172,6 @@ def deployed(
 
 @pytest.fixture
 def active(deployed: Deployed) -> Pod:
-    """The pod that is the leader."""
     (pod,) = [pod for pod in deployed.pods if _leads(pod)]
     return pod
 
@@ -279,32 +260,6 @@ def test_an_upgrade_leaves_the_lease_to_its_holder(deployed: Deployed, active: P
     assert active.code is None
 
 
-def test_a_pod_that_ends_leaves_the_lease_at_once(
-    deployed: Deployed, active: Pod, standby: Pod
-) -> None:
-    holder = deployed.lease["holderIdentity"]
-    assert active.stop() == 0
-    assert deployed.lease["holderIdentity"] != holder
-    deployed.wait_text(standby, "taking demands on")
-    deployed.start(active)
-
-
-def test_a_pod_that_loses_the_lease_ends(deployed: Deployed, active: Pod) -> None:
-    spec = {"holderIdentity": "a person", "leaseDurationSeconds": 3}
-    deployed.rig.kube.patch("Lease", RELEASE, {"spec": spec}, NAMESPACE)
-    assert deployed.rig.kube.wait("the pod's end", lambda: active.code) == 3
-    told = f"the Lease {NAMESPACE}/{RELEASE} is held by 'a person'; another process may be the "
-    assert f"error: {told}leader now, so this one must start again" in active.text()
-
-
 def _leads(pod: Pod) -> bool:
     """Return whether a pod is the leader, which serves the ROS actions."""
     return pod.code is None and "taking demands on" in pod.text()
-
-
-def _flat(values: Manifest, prefix: str = "") -> Iterator[tuple[str, Any]]:
-    for key, value in values.items():
-        if isinstance(value, dict):
-            yield from _flat(value, f"{prefix}{key}.")
-        else:
-            yield prefix + key, value

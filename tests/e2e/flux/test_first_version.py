@@ -5,11 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.e2e.common import expected
-from tests.e2e.common.staterepo import demandops
+from tests.e2e.common.expected import CLUSTER
+from tests.e2e.common.world import demandops
+from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
 from tests.kit.repo import first_version
-
-from .conftest import CLUSTER, MakeWorld
 
 URL = "https://git.example/fleet/state-repo.git"
 

@@ -6,21 +6,20 @@ move together with it. A service that need not move is not restarted.
 
 from __future__ import annotations
 
-import re
 from typing import Any
 
 import yaml
 from demandops_ros import DemandClient
 
 from tests.e2e.common.expected import WITHOUT_DEMANDS
-
-from .world import World
+from tests.e2e.common.namespace import Pods, wait_for_pods
+from tests.e2e.common.world import World
+from tests.kit.config import override
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 NODES, BROKERS = "inventory/nodes.yaml", "inventory/brokers.yaml"
 DOMAINS, VERSIONS = "policy/access-domains.yaml", "registry/versions.yaml"
 OVERRIDE = "overrides/away.yaml"
-_POD = re.compile(r"pod of (?P<name>\S+?)(-[0-9a-f]{12})? on (?P<node>\S+), ready")
 
 
 def test_services_wait_follow_a_drain_and_an_override_and_run_apart(
@@ -45,7 +44,8 @@ def test_services_wait_follow_a_drain_and_an_override_and_run_apart(
     assert stays
     assert {n: world.domain.uids()[n] for n in stays} == {n: before[n] for n in stays}
 
-    merge(world, requester, {OVERRIDE: override(["first"], "edge")})
+    first_fusion = {"applications": ["first"], "services": ["object-fusion"]}
+    merge(world, requester, {OVERRIDE: override(first_fusion, node="edge")})
     moved = fused("first", "vehicle00", "edge", delivered=True)
     wait_for(world, moved | on_station)
 
@@ -72,8 +72,7 @@ def application(id: str, vehicle: str) -> dict[str, Any]:
     return {"id": id, "type": "object-detection-fusion", "node": "edge", "inputs": inputs}
 
 
-def fused(id: str, vehicle: str, node: str, *, delivered: bool = False) -> set[tuple[str, str]]:
-    """Return the expected pods of an application as pairs: name without hash, and node."""
+def fused(id: str, vehicle: str, node: str, *, delivered: bool = False) -> Pods:
     ways = [(vehicle, node), *([(node, vehicle)] if delivered else [])]
     clients = {
         (f"mqtt-derived-{source}-{target}-{side}", end)
@@ -83,19 +82,8 @@ def fused(id: str, vehicle: str, node: str, *, delivered: bool = False) -> set[t
     return {(f"of-{id}", node), *clients}
 
 
-def wait_for(world: World, wanted: set[tuple[str, str]]) -> None:
-    """Wait until exactly these pods run; each is a pair of a name and a node."""
-
-    def found() -> set[tuple[str, str]]:
-        lines = world.domain.lines()
-        matches = (_POD.fullmatch(line) for line in lines if line.startswith("pod of "))
-        return {(match["name"], match["node"]) if match else ("?", "?") for match in matches}
-
-    def same() -> bool:
-        world.domain.wake()
-        return found() == wanted
-
-    world.domain.kube.wait(f"exactly {sorted(wanted)}", same, 120.0)
+def wait_for(world: World, wanted: Pods) -> None:
+    wait_for_pods({world.domain: wanted})
 
 
 def definitions(world: World) -> dict[str, str | None]:
@@ -125,9 +113,3 @@ def gpus(world: World, *, drained: str = "", **count: int) -> dict[str, str | No
             node |= {"capabilities": ["gpu"], "capacity": {"gpu": count[node["id"]]}}
         node["drained"] = node["id"] == drained
     return {NODES: yaml.safe_dump(inventory)}
-
-
-def override(applications: list[str], node: str) -> str:
-    head = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "a test", "owner": "petra"}
-    select = [{"applications": applications, "services": ["object-fusion"]}]
-    return yaml.safe_dump(head | {"select": select, "node": node})

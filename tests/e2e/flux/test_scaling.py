@@ -1,5 +1,3 @@
-"""An autoscaler sets the number of replicas, and Flux does not reset it."""
+"""An autoscaler sets the number of replicas, and the GitOps controller does not reset it."""
 
-from tests.e2e.common.steps import test_an_autoscaler_owns_the_number_of_replicas
-
-__all__ = ["test_an_autoscaler_owns_the_number_of_replicas"]
+from tests.e2e.common.steps import test_an_autoscaler_owns_the_number_of_replicas  # noqa: F401

@@ -6,32 +6,20 @@ driver, a fusion, and a planner. The plan is delivered to the vehicles.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import yaml
 from demandops_ros import DemandClient
 
-from tests.e2e.common.expected import FUSION, WITHOUT_DEMANDS
-from tests.e2e.common.namespace import Namespace, name_of
-
-from .world import World
+from tests.e2e.common.expected import WITHOUT_DEMANDS
+from tests.e2e.common.namespace import Namespace, Pods, name_of, wait_for_pods
+from tests.e2e.common.world import World
 
 EXAMPLE = Path(__file__).parents[3] / "examples" / "lane-detection"
 APPDEF = "appdefs/object-detection-fusion"
 CHART = {"folder": "appdefs/lane-detection/charts/ros-launch", "version": "0.2.0"}
 NODES = "inventory/nodes.yaml"
-
-PLANNER = "plan-edge-object-detection-fusion-440d666b5404"
-FUSED = "/edge_object_detection_fusion_global_objectlist"
 PLAN = "/edge_object_detection_fusion_plan"
-SIDES = ("source", "target")
-CLIENTS = {  # digests in the clients' names, by the nodes of their derived connection
-    ("vehicle00", "edge"): ("749e95da341a", "62cce3e93c69"),
-    ("vehicle01", "edge"): ("a6f86d82e5e2", "94affd7d6964"),
-    ("edge", "vehicle00"): ("49db83c4f763", "c327804aa445"),
-    ("edge", "vehicle01"): ("487346df7112", "aa8eb4a5f970"),
-}
 
 
 def test_four_services_on_three_nodes_serve_two_vehicles(
@@ -85,26 +73,13 @@ def definitions(world: World) -> dict[str, str | None]:
     return {
         **files,
         f"{APPDEF}/appdef.yaml": yaml.safe_dump(appdef),
-        f"{APPDEF}/values/planner.yaml.j2": PLANNER_VALUES,
+        f"{APPDEF}/values/planner.yaml.j2": (
+            Path(__file__).with_name("planner.yaml.j2")
+        ).read_text(),
         "registry/charts.yaml": yaml.safe_dump(charts),
         "registry/images.yaml": yaml.safe_dump(images),
         NODES: yaml.safe_dump(nodes),
     }
-
-
-PLANNER_VALUES = """\
-replicas: {{ replicas }}
-image: {{ images["planner"] }}
-nodeSelector: {{ node.selector }}
-tolerations: {{ node.tolerations }}
-hostNetwork: {{ node.host_network }}
-launch:
-  package: planner
-  file: planner.launch.py
-  arguments:
-    objects_topic: {{ inputs.objects[0].topic }}
-    plan_topic: {{ outputs.plan }}
-"""
 
 
 def cloud(vehicle: str) -> str:
@@ -137,45 +112,20 @@ def follow(world: World) -> None:
 
 
 def assert_exact(domain: Namespace, *vehicles: str) -> None:
-    """Wait until exactly the pods for these vehicles run on their nodes, then check all topics."""
-    wanted = WITHOUT_DEMANDS | set(lines(*vehicles))
-    domain.wait_lines(wanted)
-    domain.wait_releases()
-    assert domain.lines() == wanted, "the namespace changed again"
-    assert carried(domain) == sorted(
-        flow
-        for vehicle in vehicles
-        for flow in (
-            (vehicle, f"/{vehicle}_points", "edge"),
-            (vehicle, ego_data(vehicle), "edge"),
-            ("edge", PLAN, vehicle),
-        )
-    )
+    """Wait until exactly the pods for these vehicles run on their nodes, then check all flows."""
+    pods: Pods = {(f"{name}-edge-object-detection-fusion", "edge") for name in ("of", "plan")}
+    flows = []
     for vehicle in vehicles:
-        points, objects = f"/{vehicle}_points", f"/{vehicle}_local_objectlist"
-        assert topics(domain, f"lidar-{vehicle}-{vehicle}") == {cloud(vehicle), points}
-        assert topics(domain, f"od-edge-{vehicle}") == {points, objects}
-    assert FUSED in topics(domain, FUSION)
-    assert topics(domain, PLANNER) == {FUSED, PLAN}
-
-
-def lines(*vehicles: str) -> Iterator[str]:
-    """Yield the lines that a demand for these vehicles adds to `Namespace.lines`."""
-    yield from (f"ConfigMap {FUSION}-{part}" for part in ("params", "watcher"))
-    services = [(FUSION, "edge"), (PLANNER, "edge")]
-    clients = []
-    for vehicle in vehicles:
-        yield f"fusion takes {ego_data(vehicle)}"
-        yield f"fusion takes /{vehicle}_local_objectlist"
-        services += [(f"lidar-{vehicle}-{vehicle}", vehicle), (f"od-edge-{vehicle}", "edge")]
+        pods |= {(f"lidar-{vehicle}-{vehicle}", vehicle), (f"od-edge-{vehicle}", "edge")}
         for ends in ((vehicle, "edge"), ("edge", vehicle)):
-            for node, side, digest in zip(ends, SIDES, CLIENTS[ends], strict=True):
-                clients.append((f"mqtt-derived-{'-'.join(ends)}-{side}-{digest}", node))
-    yield from (f"release {name}" for name, _ in services)
-    yield from (f"ConfigMap {name}" for name, _ in clients)
-    for name, node in services + clients:
-        yield f"Deployment {name}"
-        yield f"pod of {name} on {node}, ready"
+            client = f"mqtt-derived-{'-'.join(ends)}"
+            pods |= {(f"{client}-source", ends[0]), (f"{client}-target", ends[1])}
+        flows += [(vehicle, topic, "edge") for topic in (f"/{vehicle}_points", ego_data(vehicle))]
+        flows.append(("edge", PLAN, vehicle))
+    wait_for_pods({domain: pods})
+    domain.wait_releases()
+    assert domain.pods() == pods, "the namespace changed again"
+    assert carried(domain) == sorted(flows)
 
 
 def carried(domain: Namespace) -> list[tuple[str, str, str]]:
@@ -194,10 +144,3 @@ def carried(domain: Namespace) -> list[tuple[str, str, str]]:
                 received.append((back[place]["ros_topic"], str(broker), place, node))
     assert sorted(end[:3] for end in sent) == sorted(end[:3] for end in received)
     return sorted((s[3], s[0], r[3]) for s in sent for r in received if s[:3] == r[:3])
-
-
-def topics(domain: Namespace, service: str) -> set[str]:
-    """Return the topics in the arguments of a service's pod."""
-    (pod,) = domain.find("Pod", service)
-    arguments = [arg for each in pod["spec"]["containers"] for arg in each.get("args", ())]
-    return {arg.partition(":=")[2] for arg in arguments if "_topic:=" in arg}

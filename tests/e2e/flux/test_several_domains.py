@@ -7,7 +7,6 @@ same topic of a vehicle.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -16,17 +15,16 @@ import yaml
 from demandops_ros import DemandClient
 
 from tests.e2e.common.expected import CLUSTER, NAMESPACE, WITHOUT_DEMANDS
-from tests.e2e.common.namespace import name_of
+from tests.e2e.common.namespace import wait_for_pods
+from tests.e2e.common.world import World
+from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
 
-from .conftest import MakeWorld
 from .view import Domain
-from .world import World
 
 NODES, POLICY = "inventory/nodes.yaml", "policy/access-domains.yaml"
 CITY, CITY_ROS = "city", 42
 CLOUD = "/vehicles/vehicle00/drivers/lidar/pointcloud"
-_POD = re.compile(r"pod of (?P<name>\S+?)(-[0-9a-f]{12})? on (?P<node>\S+), ready")
 
 FLEETS = {
     ("od-edge-vehicle00", "edge"),
@@ -45,24 +43,18 @@ CITYS = {
 
 @pytest.fixture(scope="module")
 def world(make_world: MakeWorld, rig: Rig, ros_domain: int) -> Iterator[World]:
-    """A state repo with two access domains and no demand, which the cluster follows."""
     made = make_world()
     made.push(two_domains(made))
     made.generator.start()
     with DemandClient("vehicle00", domain_id=ros_domain, timeout_s=120) as first:
         first.put("first", [application("first")])  # its commit applies the policy
         first.release("first")
-    manifests = list(yaml.safe_load_all(made.file(f"bootstrap/{CLUSTER}.yaml")))
+    manifests = made.manifests(CLUSTER)
     made.apply(rig.kube, manifests)
-    for item in manifests:
-        if item["kind"] == "Kustomization":
-            namespace = item["metadata"]["namespace"]
-            made.domains[namespace] = Domain(rig.kube, namespace, item["metadata"]["name"])
+    made.domains = {domain.namespace: domain for domain in Domain.all_in(rig.kube, manifests)}
     assert {*made.domains} == {NAMESPACE, CITY}
     for domain in made.domains.values():
-        domain.wait_applied(made.tip())
-        for chart in domain.find("HelmChart"):
-            rig.kube.wait_ready("HelmChart", name_of(chart), domain.namespace)
+        domain.settle(made.tip())
         domain.wait_lines(WITHOUT_DEMANDS)
     yield made
     made.remove()  # while its namespaces still exist
@@ -80,11 +72,11 @@ def test_two_domains_share_a_machine_and_nothing_else(
 ) -> None:
     fleet, city = world.domains[NAMESPACE], world.domains[CITY]
     assert requester.put("fleet", [application("edge/fleet")]).outcome == "booked"
-    wait_for({fleet: FLEETS, city: set()})
+    wait_for_pods({fleet: FLEETS, city: set()})
     before = fleet.uids()
 
     assert traffic.put("lights", [application("edge/lights")]).outcome == "booked"
-    wait_for({fleet: FLEETS | TO_THE_CITY, city: CITYS})
+    wait_for_pods({fleet: FLEETS | TO_THE_CITY, city: CITYS})
     assert {name: fleet.uids()[name] for name in before} == before, (
         "a pod of the first domain was restarted"
     )
@@ -94,7 +86,7 @@ def test_two_domains_share_a_machine_and_nothing_else(
     assert granted(fleet, of=city) == granted(city, of=fleet) == set()
 
     requester.release("fleet")
-    wait_for({fleet: TO_THE_CITY, city: CITYS})
+    wait_for_pods({fleet: TO_THE_CITY, city: CITYS})
     traffic.release("lights")
     for domain in (fleet, city):
         domain.wake()
@@ -129,47 +121,18 @@ def two_domains(world: World) -> dict[str, str]:
     return {POLICY: yaml.safe_dump(policy), NODES: yaml.safe_dump(inventory)}
 
 
-def wait_for(wanted: dict[Domain, set[tuple[str, str]]]) -> None:
-    """Wait until each domain runs exactly its pods, given as pairs of a name and a node."""
-
-    def same() -> bool:
-        for domain in wanted:
-            domain.wake()
-        return all(running(domain) == pods for domain, pods in wanted.items())
-
-    kube = next(iter(wanted)).kube
-    listed = {domain.namespace: sorted(pods) for domain, pods in wanted.items()}
-    kube.wait(f"exactly {listed}", same, 120.0)
-
-
-def running(domain: Domain) -> set[tuple[str, str]]:
-    """Return each ready pod's name without the hash, and its node; '?' if a pod is not ready."""
-    lines = (line for line in domain.lines() if line.startswith("pod of "))
-    matches = map(_POD.fullmatch, lines)
-    return {(match["name"], match["node"]) if match else ("?", "?") for match in matches}
-
-
 def granted(where: Domain, *, of: Domain) -> set[str]:
-    """Return the resources that the account of domain `of` may use in the namespace of `where`.
-
-    The resources by which an account asks for its own rights are left out, because every account
-    may use them.
-    """
+    """Return what domain `of`'s account may use elsewhere; each account may ask for its rights."""
     rules = where.kube.rules("demandops", where.namespace, of.namespace)
     asked = {"authorization.k8s.io", "authentication.k8s.io"}
     return {one for rule in rules if {*rule["apiGroups"]} - asked for one in rule["resources"]}
 
 
 def ros_domains(domain: Domain) -> set[int]:
-    """Return the ROS domains of all containers in an access domain."""
-    containers = [
-        container
-        for deployment in domain.find("Deployment")
-        for container in deployment["spec"]["template"]["spec"]["containers"]
-    ]
     return {
         int(variable["value"])
-        for container in containers
+        for deployment in domain.find("Deployment")
+        for container in deployment["spec"]["template"]["spec"]["containers"]
         for variable in container.get("env", ())
         if variable["name"] == "ROS_DOMAIN_ID"
     }

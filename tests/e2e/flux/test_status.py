@@ -7,39 +7,28 @@ import os
 import subprocess
 import sys
 
-import pytest
-
 from tests.e2e.common import expected
-from tests.e2e.common.answers import Answers, World, limited_world
+from tests.e2e.common.answers import *  # noqa: F403
 from tests.e2e.common.expected import WITHOUT_DEMANDS, target_end
-from tests.e2e.common.staterepo import environment
-from tests.e2e.rig.cluster import Rig
-
-from .conftest import MakeWorld
+from tests.e2e.common.world import World, environment
 
 
-@pytest.fixture(scope="module")
-def world(make_world: MakeWorld, rig: Rig) -> World:
-    return limited_world(make_world(), rig, "flux")
-
-
-class TestFlux(Answers):
-    def test_what_flux_forgot_is_named_and_its_command_deletes_it(self, world: World) -> None:
-        domain, name = world.domain, target_end("station00")
-        world.follow(world.demand(expected.demand(1)), expected.after(1))
-        forgotten = domain.get("Deployment", name)
-        kept = ("name", "namespace", "labels")
-        metadata = {key: forgotten["metadata"][key] for key in kept} | {"name": "forgotten"}
-        domain.kube.apply(
-            {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": metadata}
-            | {"spec": forgotten["spec"]}
-        )
-        (orphan,) = orphans(world)
-        assert (orphan["kind"], orphan["name"]) == ("Deployment", "forgotten")
-        administrator = os.environ | {"KUBECONFIG": str(world.rig.kubeconfig)}
-        subprocess.run(orphan["command"].split(), env=administrator, check=True)
-        assert orphans(world) == []
-        world.follow(world.demand(expected.demand(1) | {"shutdown": True}), WITHOUT_DEMANDS)
+def test_what_flux_forgot_is_named_and_its_command_deletes_it(world: World) -> None:
+    domain, name = world.domain, target_end("station00")
+    world.follow(world.demand(expected.demand(1)), expected.after(1))
+    forgotten = domain.get("Deployment", name)
+    kept = ("name", "namespace", "labels")
+    metadata = {key: forgotten["metadata"][key] for key in kept} | {"name": "forgotten"}
+    domain.kube.apply(
+        {"apiVersion": "apps/v1", "kind": "Deployment", "metadata": metadata}
+        | {"spec": forgotten["spec"]}
+    )
+    (orphan,) = orphans(world)
+    assert (orphan["kind"], orphan["name"]) == ("Deployment", "forgotten")
+    administrator = os.environ | {"KUBECONFIG": str(world.rig.kubeconfig)}
+    subprocess.run(orphan["command"].split(), env=administrator, check=True)
+    assert orphans(world) == []
+    world.follow(world.demand(expected.demand(1) | {"shutdown": True}), WITHOUT_DEMANDS)
 
 
 def orphans(world: World) -> list[dict[str, str]]:

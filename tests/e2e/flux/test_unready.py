@@ -1,5 +1,3 @@
-"""With Flux, a service that cannot start does not delay demands."""
+"""A service that cannot start does not delay demands."""
 
-from tests.e2e.common.steps import test_a_service_that_cannot_start_is_reconfigured_and_removed
-
-__all__ = ["test_a_service_that_cannot_start_is_reconfigured_and_removed"]
+from tests.e2e.common.steps import test_a_service_that_cannot_start_is_reconfigured_and_removed  # noqa: F401

@@ -2,37 +2,24 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import pytest
 
 from tests.e2e.common import expected
 from tests.e2e.common.access import access_file, limited
 from tests.e2e.common.expected import CLUSTER, STEPS, WITHOUT_DEMANDS
-from tests.e2e.common.timing import Table
+from tests.e2e.common.world import World, show_times
+from tests.e2e.conftest import MakeWorld
 from tests.e2e.rig.cluster import Rig
 from tests.e2e.rig.tools import Report
 
-from .conftest import MakeWorld
-from .view import SOURCE, Domain
-from .world import World
-
 READ = ["get", "list", "watch"]
 RIGHTS = [
-    {
-        "apiGroups": ["source.toolkit.fluxcd.io"],
-        "resources": ["gitrepositories"],
-        "verbs": [*READ, "patch"],
-    },
-    {
-        "apiGroups": ["kustomize.toolkit.fluxcd.io"],
-        "resources": ["kustomizations"],
-        "verbs": READ,
-    },
+    {"apiGroups": [f"{part}.toolkit.fluxcd.io"], "resources": [kind], "verbs": verbs}
+    for part, kind, verbs in (
+        ("source", "gitrepositories", [*READ, "patch"]),
+        ("kustomize", "kustomizations", READ),
+    )
 ]
-REQUESTED = "reconcile.fluxcd.io/requestedAt"
 ROUNDS = 3
 """How often the paper's eight demands are sent, one right after the other."""
 
@@ -43,60 +30,21 @@ def world(make_world: MakeWorld, rig: Rig) -> World:
     made = make_world()
     domain = made.bootstrap(CLUSTER, rig, interval="10m")
     kubeconfig = limited(rig.kube, rig.kubeconfig, made.folder, {domain.namespace: RIGHTS})
-    file = access_file(made.folder, CLUSTER, kubeconfig=kubeconfig)
+    file = access_file(made.folder, {CLUSTER: {"kubeconfig": kubeconfig}})
     made.generator.start("--clusters", str(file))
     return made
 
 
 def test_a_trigger_saves_the_wait_for_the_next_fetch(world: World, say: Report) -> None:
     """Flux fetches only every ten minutes, so only the trigger can bring the demand in time."""
-    table = Table("Triggered by the generator, next fetch after 10 minutes")
-    table.add("joins", world.step(1, expected.after(1), wake=False))
-    table.show(say)
+    times = {"joins": world.step(1, expected.after(1), wake=False)}
+    show_times(say, "Triggered by the generator, next fetch after 10 minutes", times)
     world.follow(world.demand(expected.demand(1) | {"shutdown": True}), WITHOUT_DEMANDS)
 
 
-def test_flux_is_woken_only_while_it_is_idle(world: World) -> None:
+def test_a_burst_of_demands_leaves_nothing(world: World) -> None:
     """A busy Flux could forget an object that it is just creating, and then never remove it."""
-    domain = world.domain
-    with wakes(domain) as found:
-        for step in (*STEPS,) * ROUNDS:
-            sent = world.demand(expected.demand(step))
-        domain.wait_applied(sent.commit)
-        domain.wait_lines(WITHOUT_DEMANDS)
-    assert len(found) > 1
-    assert all(found), "Flux was woken while it was busy"
-
-
-@contextmanager
-def wakes(domain: Domain) -> Iterator[list[bool]]:
-    """Yield a list that gets an entry whenever somebody requests that Flux fetch now.
-
-    The entry is true if Flux was idle just before the request.
-    """
-    found: list[bool] = []
-    over = threading.Event()
-
-    def look() -> None:
-        idle, last = True, None
-        while not over.wait(0.02):
-            applies = domain.get("Kustomization", domain.name)["status"]
-            source = domain.get("GitRepository", SOURCE)
-            requested = source["metadata"].get("annotations", {}).get(REQUESTED)
-            if last is not None and requested != last:
-                found.append(idle)
-            last, status = requested, source["status"]
-            ready = [one["status"] for one in applies["conditions"] if one["type"] == "Ready"]
-            idle = (
-                status.get("lastHandledReconcileAt") == requested
-                and applies.get("lastAttemptedRevision") == status["artifact"]["revision"]
-                and ready in (["True"], ["False"])
-            )
-
-    thread = threading.Thread(target=look)
-    thread.start()
-    try:
-        yield found
-    finally:
-        over.set()
-        thread.join()
+    for step in (*STEPS,) * ROUNDS:
+        sent = world.demand(expected.demand(step))
+    world.domain.wait_applied(sent.commit)
+    world.domain.wait_lines(WITHOUT_DEMANDS)

@@ -8,11 +8,11 @@ from __future__ import annotations
 import tarfile
 import time
 import urllib.request
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 from tests.e2e.common.namespace import Namespace, name_of
 from tests.e2e.rig.errors import RigError
-from tests.kit.limits import PATIENCE_S
+from tests.e2e.rig.kube import Kube, Manifest
 
 SOURCE = "demandops"  # the GitRepository's name
 
@@ -20,10 +20,25 @@ SOURCE = "demandops"  # the GitRepository's name
 class Domain(Namespace):
     """An access domain on one cluster; the Kustomization `name` applies the domain's folder."""
 
-    GITOPS = "flux"
     RELEASE = "HelmRelease"
     STEADY = ("HelmRelease",)
     OWN = ("GitRepository", "HelmChart", "Kustomization")
+
+    @classmethod
+    def all_in(cls, kube: Kube, bootstrap: Iterable[Manifest]) -> list[Domain]:
+        follows = (item["metadata"] for item in bootstrap if item["kind"] == "Kustomization")
+        return [cls(kube, metadata["namespace"], metadata["name"]) for metadata in follows]
+
+    def settle(self, commit: str) -> None:
+        self.wait_applied(commit)
+        for chart in self.find("HelmChart"):
+            self.kube.wait_ready("HelmChart", name_of(chart), self.namespace)
+
+    def remove(self) -> None:
+        for kind, name in (("Kustomization", self.name), ("GitRepository", SOURCE)):
+            self.take_away(kind, name)
+        for kind in ("HelmRelease", "HelmChart"):  # or the next state repo loses its own
+            self.kube.wait(f"each {kind} to go", lambda k=kind: self.find(k) == [])
 
     # --- reading ----------------------------------------------------------------------------
 
@@ -36,10 +51,7 @@ class Domain(Namespace):
         return _commit(self._status("GitRepository", SOURCE).get("artifact", {}).get("revision"))
 
     def fetched_files(self) -> list[str]:
-        """Return the paths that the GitRepository has fetched.
-
-        This downloads the artifact, so source-controller must be reachable from this machine.
-        """
+        """Return the paths in the artifact of the GitRepository, which this downloads."""
         url = self._status("GitRepository", SOURCE)["artifact"]["url"]
         with (
             urllib.request.urlopen(url, timeout=60) as answer,  # noqa: S310 - the source's own
@@ -48,7 +60,6 @@ class Domain(Namespace):
             return [member.name for member in archive if member.isfile()]
 
     def trouble(self, kind: str, name: str) -> str:
-        """Return why an object is not ready; empty if it is ready or has reported nothing yet."""
         conditions = self._status(kind, name).get("conditions") or []
         messages = [
             c["message"] for c in conditions if c["type"] == "Ready" and c["status"] == "False"
@@ -64,20 +75,18 @@ class Domain(Namespace):
         # the new artifact of the source triggers the Kustomization
         self.kube.reconcile("GitRepository", SOURCE, self.namespace)
 
-    def wait_fetched(self, commit: str, timeout: float = PATIENCE_S) -> float:
-        self._wait_for(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit, timeout)
-        return time.monotonic()
+    def wait_fetched(self, commit: str) -> float:
+        return self._wait_for(f"{commit[:10]} to be fetched", lambda: self.fetched() == commit)
 
-    def wait_applied(self, commit: str, timeout: float = PATIENCE_S) -> float:
-        self._wait_for(f"{commit[:10]} to be applied", lambda: self.applied() == commit, timeout)
-        return time.monotonic()
+    def wait_applied(self, commit: str) -> float:
+        return self._wait_for(f"{commit[:10]} to be applied", lambda: self.applied() == commit)
 
-    def wait_attempted(self, commit: str, timeout: float = PATIENCE_S) -> None:
+    def wait_attempted(self, commit: str) -> None:
         def attempted() -> bool:
             status = self._status("Kustomization", self.name)
             return _commit(status.get("lastAttemptedRevision")) == commit
 
-        self._wait_for(f"{commit[:10]} to be tried", attempted, timeout)
+        self._wait_for(f"{commit[:10]} to be tried", attempted)
 
     def wait_checked(self, commit: str) -> None:
         for chart in self.find("HelmChart"):  # each HelmChart checks every commit
@@ -104,15 +113,13 @@ class Domain(Namespace):
         for release in self.find("HelmRelease"):
             self.kube.wait_ready("HelmRelease", name_of(release), self.namespace)
 
-    def _wait_for(self, what: str, look: Callable[[], bool], timeout: float) -> None:
+    def _wait_for(self, what: str, look: Callable[[], bool]) -> float:
         try:
-            self.kube.wait(what, look, timeout)
+            self.kube.wait(what, look)
         except RigError as error:
-            messages = [
-                self.trouble("GitRepository", SOURCE),
-                self.trouble("Kustomization", self.name),
-            ]
+            messages = [self.trouble("GitRepository", SOURCE), self.folder_trouble()]
             raise AssertionError(f"{error}; {'; '.join(filter(None, messages))}") from error
+        return time.monotonic()
 
 
 def _commit(revision: str | None) -> str:

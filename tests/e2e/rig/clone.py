@@ -9,8 +9,6 @@ from tests.kit.repo import git
 
 
 class Clone:
-    """A clone of a repository on the rig's Git server; the first push creates the repository."""
-
     def __init__(self, url: str, folder: Path) -> None:
         self.folder = folder
         folder.mkdir(parents=True)
@@ -32,5 +30,4 @@ class Clone:
         return self.git("rev-parse", "HEAD")
 
     def git(self, *arguments: str) -> str:
-        """Run git in the work tree and return what it prints; a failure is an AssertionError."""
         return git(self.folder, *arguments)

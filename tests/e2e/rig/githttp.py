@@ -17,12 +17,10 @@ import shutil
 import signal
 import subprocess
 import sys
-import threading
 from collections.abc import Iterator
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path, PurePosixPath
-from typing import IO
 from urllib.parse import parse_qs, unquote
 
 USER_VARIABLE = "GIT_HTTP_USER"
@@ -44,8 +42,6 @@ _CONFIGURATION = {
 
 
 class GitServer(ThreadingHTTPServer):
-    """Serves all repositories below a folder."""
-
     daemon_threads = True
     request_queue_size = 128
 
@@ -81,8 +77,6 @@ def _environment(root: Path) -> dict[str, str]:
 
 
 class Handler(BaseHTTPRequestHandler):
-    """Answers git's requests with `git http-backend`."""
-
     protocol_version = "HTTP/1.1"  # with 1.0 a client that sends "Expect: 100-continue" would wait
     server: GitServer
 
@@ -127,24 +121,21 @@ class Handler(BaseHTTPRequestHandler):
             init_bare(repository, self.server.git)
 
     def run_backend(self, path: str, query: str) -> None:
-        backend = subprocess.Popen(
-            [self.server.git, "http-backend"],
-            env=self.server.environment() | self._request_variables(path, query),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-        )
-        assert backend.stdin is not None
-        assert backend.stdout is not None
-        feeder = threading.Thread(target=self._feed, args=(backend.stdin,), daemon=True)
-        feeder.start()  # in a thread, because the backend may answer before it has read all
         try:
-            self._relay(backend.stdout)
-        except OSError:
-            backend.kill()  # the client has gone
-        finally:
-            backend.stdout.close()
-            backend.wait()
-            feeder.join(timeout=10)
+            sent = b"".join(self.body())
+        except (OSError, ValueError) as error:
+            self.log_error("request body: %s", error)
+            return
+        environment = self.server.environment() | self._request_variables(path, query)
+        done = subprocess.run(
+            [self.server.git, "http-backend"],
+            env=environment,
+            input=sent,
+            stdout=subprocess.PIPE,
+            check=False,
+        )
+        with contextlib.suppress(OSError):  # the client may have gone
+            self._relay(done.stdout)
 
     def _request_variables(self, path: str, query: str) -> dict[str, str]:
         headers = self.headers
@@ -160,25 +151,6 @@ class Handler(BaseHTTPRequestHandler):
             "CONTENT_LENGTH": headers.get("Content-Length", ""),
         }
         return {name: value for name, value in variables.items() if value}
-
-    def _feed(self, stdin: IO[bytes]) -> None:
-        """Forward the request's body to the backend.
-
-        Read the whole body even if the backend does not take all of it.
-        """
-        listening = True
-        try:
-            for chunk in self.body():
-                if listening:
-                    try:
-                        stdin.write(chunk)
-                    except BrokenPipeError:
-                        listening = False
-        except (OSError, ValueError) as error:
-            self.log_error("request body: %s", error)
-        finally:
-            with contextlib.suppress(BrokenPipeError):
-                stdin.close()
 
     def body(self) -> Iterator[bytes]:
         if "chunked" in self.headers.get("Transfer-Encoding", "").lower():  # packs above 1 MB
@@ -198,10 +170,11 @@ class Handler(BaseHTTPRequestHandler):
             left -= len(chunk)
             yield chunk
 
-    def _relay(self, stdout: IO[bytes]) -> None:
+    def _relay(self, answer: bytes) -> None:
+        head, _, body = answer.partition(b"\r\n\r\n")
         status, headers = HTTPStatus.OK.value, []
-        while line := stdout.readline().strip():
-            name, _, value = line.decode("latin-1").partition(":")
+        for line in head.decode("latin-1").splitlines():
+            name, _, value = line.partition(":")
             if name.lower() == "status":
                 status = int(value.split()[0])
             else:
@@ -213,11 +186,10 @@ class Handler(BaseHTTPRequestHandler):
         for name, value in [*headers, ("Connection", "close")]:
             self.send_header(name, value)
         self.end_headers()
-        shutil.copyfileobj(stdout, self.wfile, _CHUNK)
+        self.wfile.write(body)
 
 
 def init_bare(repository: Path, git: str = "git") -> None:
-    """Create an empty bare repository whose default branch is `main`."""
     repository.parent.mkdir(parents=True, exist_ok=True)
     subprocess.run(
         [git, "init", "--quiet", "--bare", "--initial-branch=main", str(repository)],

@@ -46,16 +46,11 @@ _VERSIONS = {
     "Job": "batch/v1",
     "Role": "rbac.authorization.k8s.io/v1",
     "RoleBinding": "rbac.authorization.k8s.io/v1",
-    "ClusterRole": "rbac.authorization.k8s.io/v1",
-    "ClusterRoleBinding": "rbac.authorization.k8s.io/v1",
 }
 
 
 class Kube:
-    """A cluster's API.
-
-    The API version of a kind is `version` if given, else the one in `_VERSIONS`, else `v1`.
-    """
+    """A cluster's API; without `version`, a kind's is that of `_VERSIONS`, or `v1`."""
 
     def __init__(
         self, kubeconfig: Path, cache: Path, check: Callable[[], None] = lambda: None
@@ -70,12 +65,9 @@ class Kube:
     def close(self) -> None:
         self.api.close()
 
-    def apply(self, *manifests: Manifest | str, dry_run: bool = False) -> None:
-        """Apply manifests by server-side apply; a text may contain several YAML documents.
-
-        In a dry run the server checks everything, admission included, and stores nothing.
-        """
-        for manifest in _documents(manifests):
+    def apply(self, *manifests: Manifest, dry_run: bool = False) -> None:
+        """Apply manifests; in a dry run the server checks everything and stores nothing."""
+        for manifest in manifests:
             meta = manifest["metadata"]
             self._resource(manifest["kind"], manifest["apiVersion"]).server_side_apply(
                 body=manifest,
@@ -101,11 +93,9 @@ class Kube:
             return None
         return dict(found.to_dict())
 
-    def find(
-        self, kind: str, namespace: str = "", selector: str = "", version: str = ""
-    ) -> list[Manifest]:
+    def find(self, kind: str, namespace: str = "", selector: str = "") -> list[Manifest]:
         """Return the objects of a kind that match a label selector, in one namespace or in all."""
-        found = self._resource(kind, version).get(
+        found = self._resource(kind).get(
             namespace=namespace or None, label_selector=selector or None
         )
         return [dict(item) for item in found.to_dict()["items"]]
@@ -116,10 +106,8 @@ class Kube:
         except NotFoundError:
             return
 
-    def patch(
-        self, kind: str, name: str, body: Manifest, namespace: str = "", version: str = ""
-    ) -> None:
-        self._resource(kind, version).patch(
+    def patch(self, kind: str, name: str, body: Manifest, namespace: str = "") -> None:
+        self._resource(kind).patch(
             name=name,
             namespace=namespace or None,
             body=body,
@@ -141,22 +129,16 @@ class Kube:
         return str(call(account, namespace, {"spec": {"expirationSeconds": 3607}}).status.token)
 
     def rules(self, account: str, namespace: str, home: str = "") -> list[Manifest]:
-        """Return the rules that say which resources of a namespace a service account may use.
-
-        `home` is the namespace of the account; the default is `namespace`.
-        """
+        """Return the rules of a namespace for an account, whose own namespace is `home`."""
         who = f"system:serviceaccount:{home or namespace}:{account}"
         api: Any = ApiClient(self.api.configuration, "Impersonate-User", who)
         call: Any = AuthorizationV1Api(api).create_self_subject_rules_review
         review = api.sanitize_for_serialization(call({"spec": {"namespace": namespace}}))
         return list(review["status"]["resourceRules"])
 
-    def reconcile(self, kind: str, name: str, namespace: str) -> str:
-        """Trigger a reconcile of an object by Flux; return the token that `handled` needs."""
-        token = f"{time.time():.6f}"
-        annotations = {"reconcile.fluxcd.io/requestedAt": token}
+    def reconcile(self, kind: str, name: str, namespace: str) -> None:
+        annotations = {"reconcile.fluxcd.io/requestedAt": f"{time.time():.6f}"}
         self.patch(kind, name, {"metadata": {"annotations": annotations}}, namespace)
-        return token
 
     def wait(self, what: str, look: Callable[[], Seen | None], timeout: float = PATIENCE_S) -> Seen:
         """Return the first result of `look` that is neither None nor False.
@@ -176,51 +158,35 @@ class Kube:
                 raise RigError(f"waited {timeout:.0f} s for {what}{trouble}")
             time.sleep(_POLL_SECONDS)
 
-    def wait_ready(
-        self,
-        kind: str,
-        name: str,
-        namespace: str = "",
-        timeout: float = PATIENCE_S,
-        version: str = "",
-    ) -> Manifest:
-        """Wait until an object's newest generation is Ready; return the object."""
-        last: list[str] = ["does not exist"]
+    def wait_ready(self, kind: str, name: str, namespace: str = "") -> None:
+        last = "does not exist"
 
-        def ready() -> Manifest | None:
-            found = self.get(kind, name, namespace, version)
-            last[:] = [_condition(found)]
-            return found if last == [""] else None
+        def ready() -> bool:
+            nonlocal last
+            last = _condition(self.get(kind, name, namespace))
+            return last == ""
 
-        what = f"{kind} {namespace}/{name} to be Ready"
         try:
-            return self.wait(what, ready, timeout)
+            self.wait(f"{kind} {namespace}/{name} to be Ready", ready)
         except RigError as error:
-            raise RigError(f"{error}; last seen: {last[0]}") from error
+            raise RigError(f"{error}; last seen: {last}") from error
 
-    def wait_gone(
-        self,
-        kind: str,
-        name: str,
-        namespace: str = "",
-        timeout: float = PATIENCE_S,
-        version: str = "",
-    ) -> None:
+    def wait_gone(self, kind: str, name: str, namespace: str = "") -> None:
         what = f"{kind} {namespace}/{name} to go"
-        self.wait(what, lambda: self.get(kind, name, namespace, version) is None, timeout)
+        self.wait(what, lambda: self.get(kind, name, namespace) is None)
 
-    def install_crds(self, files: Iterable[Path], timeout: float = PATIENCE_S) -> None:
+    def install_crds(self, files: Iterable[Path]) -> None:
         """Apply CRDs and wait until the server serves them."""
-        crds = _documents([path.read_text() for path in files])
+        parsed = (yaml.safe_load_all(path.read_text()) for path in files)
+        crds = [crd for documents in parsed for crd in documents if crd]
         self.apply(*crds)
-        for crd in crds:
-            name = crd["metadata"]["name"]
-
-            def established(name: str = name) -> bool:
-                found = self.get("CustomResourceDefinition", name) or {}
-                return _holds(found, "Established")
-
-            self.wait(f"CRD {name} to be served", established, timeout)
+        for name in (crd["metadata"]["name"] for crd in crds):
+            self.wait(
+                f"CRD {name} to be served",
+                lambda name=name: _holds(
+                    self.get("CustomResourceDefinition", name) or {}, "Established"
+                ),
+            )
 
     def _resource(self, kind: str, version: str = "") -> Any:
         if self._dynamic is None:  # not earlier, because it queries the server
@@ -238,37 +204,17 @@ def build_manifest(
     return {"apiVersion": version, "kind": kind, "metadata": metadata, **fields}
 
 
-def handled(manifest: Manifest, token: str) -> bool:
-    """Return whether a Flux controller has finished the reconcile that `token` triggered."""
-    return bool(manifest.get("status", {}).get("lastHandledReconcileAt") == token)
-
-
 def _condition(found: Manifest | None) -> str:
     """Return why the newest generation of an object is not ready; empty if it is."""
     if found is None:
         return "does not exist"
-    status = found.get("status", {})
-    generation = found["metadata"].get("generation")
-    fresh = status.get("observedGeneration", generation) == generation
-    if fresh and _holds(found, "Ready"):
+    status, generation = found.get("status", {}), found["metadata"].get("generation")
+    observed = status.get("observedGeneration", generation)
+    if observed == generation and _holds(found, "Ready"):
         return ""
-    shown = [f"{c['type']}={c['status']} {c.get('message', '')}" for c in _conditions(found)]
-    if not fresh:
-        shown.append("of an older generation")
-    return "; ".join(shown) or "no conditions"
+    return f"generation {observed} of {generation}: {status.get('conditions')}"
 
 
 def _holds(found: Manifest, kind: str) -> bool:
-    return any(c["type"] == kind and c["status"] == "True" for c in _conditions(found))
-
-
-def _conditions(found: Manifest) -> list[dict[str, str]]:
-    return list(found.get("status", {}).get("conditions") or [])
-
-
-def _documents(manifests: Iterable[Manifest | str]) -> list[Manifest]:
-    documents: list[Manifest] = []
-    for manifest in manifests:
-        parsed = yaml.safe_load_all(manifest) if isinstance(manifest, str) else [manifest]
-        documents += [document for document in parsed if document]
-    return documents
+    conditions = found.get("status", {}).get("conditions") or []
+    return any(c["type"] == kind and c["status"] == "True" for c in conditions)

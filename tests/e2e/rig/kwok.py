@@ -1,71 +1,24 @@
-"""Fake nodes, and the kwok process that reports them and their pods as running.
-
-A fake node represents a node of the inventory. It has the label `node_id`, which releases select,
-and the annotation that makes kwok manage it, also in an existing cluster.
-"""
+"""Fake nodes, which kwok reports as running, with their pods."""
 
 from __future__ import annotations
 
-import hashlib
-import re
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
+from .kube import Manifest, build_manifest
 
-from .errors import RigError
-from .net import LOOPBACK, answers, free_port
-from .pki import Pki
-from .processes import Component
-
-NODE_ID_LABEL = "node_id"
-HOLD_ANNOTATION = "rig.demandops.invalid/hold"  # see stages.yaml
-_STAGES = Path(__file__).resolve().parent / "stages.yaml"
-_FAKE = "kwok.x-k8s.io/node"
-_LABEL_VALUE = re.compile(r"[A-Za-z0-9]([-A-Za-z0-9_.]{0,61}[A-Za-z0-9])?")
+NODE_ID_LABEL = "node_id"  # releases select nodes by it
 _CAPACITY = {"cpu": "64", "memory": "256Gi", "ephemeral-storage": "1Ti", "pods": "1000"}
 
 
-def component(binary: Path, kubeconfig: Path, certificates: Pki) -> Component:
-    """Return the kwok process, which manages all nodes made by `manifest`."""
-    port = free_port()
-    argv = [
-        str(binary),
-        f"--kubeconfig={kubeconfig}",
-        "--manage-all-nodes=false",
-        f"--manage-nodes-with-annotation-selector={_FAKE}=fake",
-        "--node-lease-duration-seconds=40",
-        f"--node-ip={LOOPBACK}",
-        "--cidr=10.244.0.0/16",
-        f"--server-address={LOOPBACK}:{port}",
-        f"--node-port={port}",
-        f"--tls-cert-file={certificates.server_certificate}",
-        f"--tls-private-key-file={certificates.server_key}",
-        f"--config={_STAGES}",
-    ]
-    return Component("kwok", tuple(argv), answers(port, "/healthz"))
-
-
-def node_name(node_id: str) -> str:
-    """Return the Kubernetes name for a node id; different ids get different names."""
-    slug = re.sub(r"[^a-z0-9]+", "-", node_id.lower()).strip("-")
-    if slug == node_id:
-        return slug
-    return f"{slug or 'node'}-{hashlib.sha256(node_id.encode()).hexdigest()[:6]}"
-
-
-def manifest(node_id: str, labels: Mapping[str, str] | None = None) -> dict[str, Any]:
-    """Return the Node of an inventory node; raise RigError if its id is no valid label value."""
-    if not _LABEL_VALUE.fullmatch(node_id):
-        raise RigError(f"node {node_id!r}: not a label value; use letters, digits, '-', '_', '.'")
-    name = node_name(node_id)
-    common = {"kubernetes.io/hostname": name, "kubernetes.io/os": "linux", "type": "kwok"}
-    return {
-        "apiVersion": "v1",
-        "kind": "Node",
-        "metadata": {
-            "name": name,
-            "labels": {**common, **(labels or {}), NODE_ID_LABEL: node_id},
-            "annotations": {_FAKE: "fake", "node.alpha.kubernetes.io/ttl": "0"},
+def manifest(node_id: str) -> Manifest:
+    """Return the Node of an inventory node; the annotation makes kwok manage it."""
+    status = {"capacity": _CAPACITY, "allocatable": _CAPACITY}
+    made = build_manifest("v1", "Node", node_id, status=status)
+    made["metadata"] |= {
+        "labels": {
+            "kubernetes.io/hostname": node_id,
+            "kubernetes.io/os": "linux",
+            "type": "kwok",
+            NODE_ID_LABEL: node_id,
         },
-        "status": {"capacity": _CAPACITY, "allocatable": _CAPACITY},
+        "annotations": {"kwok.x-k8s.io/node": "fake", "node.alpha.kubernetes.io/ttl": "0"},
     }
+    return made

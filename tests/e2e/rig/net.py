@@ -39,10 +39,7 @@ def url(port: int, scheme: str = "http") -> str:
 
 
 def answers(port: int, path: str, authority: Path | None = None) -> Probe:
-    """Return a probe that checks that a GET of `path` is answered with status 200.
-
-    The probe uses HTTPS if `authority` names the file of a certificate authority, otherwise HTTP.
-    """
+    """Return a probe for a GET with status 200, by HTTPS if there is an authority's file."""
     context = ssl.create_default_context(cafile=str(authority)) if authority else None
 
     def probe() -> str | None:
@@ -65,8 +62,6 @@ def answers(port: int, path: str, authority: Path | None = None) -> Probe:
 
 
 def accepts(port: int) -> Probe:
-    """Return a probe that checks that the port accepts connections."""
-
     def probe() -> str | None:
         try:
             socket.create_connection((LOOPBACK, port), timeout=5).close()

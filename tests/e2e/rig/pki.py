@@ -11,7 +11,6 @@ import base64
 import datetime
 import ipaddress
 import json
-from dataclasses import dataclass
 from pathlib import Path
 
 from cryptography import x509
@@ -23,63 +22,45 @@ _LIFE = datetime.timedelta(days=30)
 _AUTHORITY = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "rig-authority")])
 
 
-@dataclass(frozen=True)
 class Pki:
-    authority: Path
-    server_certificate: Path
-    server_key: Path
-    admin_certificate: Path
-    admin_key: Path
-    account_private: Path
-    account_public: Path
+    """The files of certificates and keys; `account_*` signs the tokens of service accounts."""
+
+    def __init__(self, folder: Path) -> None:
+        self.authority = folder / "ca.crt"
+        self.server_certificate, self.server_key = folder / "server.crt", folder / "server.key"
+        self.admin_certificate, self.admin_key = folder / "admin.crt", folder / "admin.key"
+        self.account_private, self.account_public = folder / "accounts.key", folder / "accounts.pub"
 
 
 def make(folder: Path) -> Pki:
-    """Create the certificates and keys of a control plane, and write them into a folder.
-
-    The keys include those that sign the tokens of service accounts.
-    """
+    """Create the certificates and keys of a control plane, and write them into a folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    authority = ec.generate_private_key(ec.SECP256R1())
-    root = _builder(_AUTHORITY, authority.public_key(), authority).sign(authority, hashes.SHA256())
-    paths = Pki(
-        authority=_write(folder / "ca.crt", _pem(root)),
-        server_certificate=folder / "server.crt",
-        server_key=folder / "server.key",
-        admin_certificate=folder / "admin.crt",
-        admin_key=folder / "admin.key",
-        account_private=folder / "accounts.key",
-        account_public=folder / "accounts.pub",
-    )
-    server = ec.generate_private_key(ec.SECP256R1())
+    paths, authority = Pki(folder), ec.generate_private_key(ec.SECP256R1())
+    root = _builder(_AUTHORITY, authority.public_key(), authority)
+    _write(paths.authority, _signed(root, authority))
+    server, admin, accounts = (ec.generate_private_key(ec.SECP256R1()) for _ in range(3))
     addresses = x509.SubjectAlternativeName(
         [x509.DNSName("localhost"), x509.IPAddress(ipaddress.ip_address("127.0.0.1"))]
     )
     request = _builder(_name("rig-server"), server.public_key(), authority)
     request = request.add_extension(addresses, critical=False)
-    _write(paths.server_certificate, _pem(request.sign(authority, hashes.SHA256())))
-    _write(paths.server_key, _private(server))
+    _write(paths.server_certificate, _signed(request, authority))
     # Each cluster makes the group system:masters administrators from the start.
-    admin = ec.generate_private_key(ec.SECP256R1())
     request = _builder(_name("rig-admin", "system:masters"), admin.public_key(), authority)
-    _write(paths.admin_certificate, _pem(request.sign(authority, hashes.SHA256())))
-    _write(paths.admin_key, _private(admin))
-    accounts = ec.generate_private_key(ec.SECP256R1())
-    _write(paths.account_private, _private(accounts))
+    _write(paths.admin_certificate, _signed(request, authority))
+    keys = {paths.server_key: server, paths.admin_key: admin, paths.account_private: accounts}
+    for path, key in keys.items():
+        encoding, form = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
+        _write(path, key.private_bytes(encoding, form, serialization.NoEncryption()))
+    public = serialization.PublicFormat.SubjectPublicKeyInfo
     _write(
-        paths.account_public,
-        accounts.public_key().public_bytes(
-            serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
-        ),
+        paths.account_public, accounts.public_key().public_bytes(serialization.Encoding.PEM, public)
     )
     return paths
 
 
 def write_kubeconfig(target: Path, name: str, server: str, pki: Pki) -> Path:
-    """Write an administrator's kubeconfig that contains all certificates; return its path.
-
-    The file is JSON, which is valid YAML.
-    """
+    """Write an administrator's kubeconfig with all certificates, as JSON, which is YAML."""
 
     def inline(path: Path) -> str:
         return base64.b64encode(path.read_bytes()).decode()
@@ -106,6 +87,9 @@ def _builder(
     now = datetime.datetime.now(datetime.timezone.utc)
     ca = subject == _AUTHORITY
     signer = authority.public_key()
+    unused = ("content_commitment", "data_encipherment", "key_agreement")
+    never = dict.fromkeys((*unused, "key_encipherment", "encipher_only", "decipher_only"), False)
+    usage = x509.KeyUsage(digital_signature=True, key_cert_sign=ca, crl_sign=ca, **never)
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
@@ -115,7 +99,7 @@ def _builder(
         .not_valid_before(now - datetime.timedelta(minutes=5))  # a clock may be set back
         .not_valid_after(now + _LIFE)
         .add_extension(x509.BasicConstraints(ca=ca, path_length=None), critical=True)
-        .add_extension(_usage(ca=ca), critical=True)
+        .add_extension(usage, critical=True)
         # Python 3.13 and later refuse a server whose certificate lacks these two extensions.
         .add_extension(x509.SubjectKeyIdentifier.from_public_key(key), critical=False)
         .add_extension(x509.AuthorityKeyIdentifier.from_issuer_public_key(signer), critical=False)
@@ -126,18 +110,8 @@ def _builder(
     return builder.add_extension(x509.ExtendedKeyUsage(usages), critical=False)
 
 
-def _usage(*, ca: bool) -> x509.KeyUsage:
-    return x509.KeyUsage(
-        digital_signature=True,
-        content_commitment=False,
-        key_encipherment=False,
-        data_encipherment=False,
-        key_agreement=False,
-        key_cert_sign=ca,
-        crl_sign=ca,
-        encipher_only=False,
-        decipher_only=False,
-    )
+def _signed(request: x509.CertificateBuilder, authority: ec.EllipticCurvePrivateKey) -> bytes:
+    return request.sign(authority, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
 
 
 def _name(common: str, organisation: str | None = None) -> x509.Name:
@@ -145,18 +119,6 @@ def _name(common: str, organisation: str | None = None) -> x509.Name:
     if organisation:
         attributes.append(x509.NameAttribute(NameOID.ORGANIZATION_NAME, organisation))
     return x509.Name(attributes)
-
-
-def _pem(certificate: x509.Certificate) -> bytes:
-    return certificate.public_bytes(serialization.Encoding.PEM)
-
-
-def _private(key: ec.EllipticCurvePrivateKey) -> bytes:
-    return key.private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.NoEncryption(),
-    )
 
 
 def _write(path: Path, content: bytes) -> Path:

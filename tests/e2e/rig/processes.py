@@ -10,14 +10,11 @@ from __future__ import annotations
 
 import contextlib
 import os
-import queue
 import signal
 import subprocess
-import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping
-from concurrent.futures import Future
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -61,25 +58,18 @@ class Processes:
             self._components[component.name] = component
             self._launch(component)
         for component in batch:
-            self.wait_ready(component.name)
+            self._wait_ready(component.name)
 
     def start(self, name: str) -> None:
         """Start a component again, with the same arguments and ports; wait until it is ready."""
-        component = self._known(name)
-        process = self._running.get(name)
-        if process is not None:
-            if _exit_code(process) is None:
-                raise RigError(f"{name}: already running as {process.pid}; stop it first")
-            _end(process)
-        self._launch(component)
-        self.wait_ready(name)
+        if name in self._running:
+            self.kill(name)
+        self._launch(self._components[name])
+        self._wait_ready(name)
 
-    def wait_ready(self, name: str) -> None:
-        """Wait until a component's probe reports that it is ready.
-
-        Raises RigError with the probe's reason and the end of the log.
-        """
-        component = self._known(name)
+    def _wait_ready(self, name: str) -> None:
+        """Wait until a component is ready; RigError has the reason and the end of the log."""
+        component = self._components[name]
         deadline = time.monotonic() + component.ready_seconds
         while (reason := component.probe()) is not None:
             self.check(name)
@@ -90,10 +80,7 @@ class Processes:
         self.check(name)  # another server may have answered on the port
 
     def check(self, *names: str) -> None:
-        """Raise RigError if one of these components has ended by itself.
-
-        If no name is given, check all components.
-        """
+        """Raise RigError if one of these components, or of all, has ended by itself."""
         for name in names or list(self._running):
             process = self._running.get(name)
             if process is not None and (code := _exit_code(process)) is not None:
@@ -102,22 +89,19 @@ class Processes:
                 raise RigError(self._with_log(name, ended))
 
     def stop(self, name: str) -> None:
-        """Ask a component to end, if it runs, and kill it if it does not end."""
-        self._known(name)
+        """Ask a component to end, and kill it if it does not."""
         self._stop_batch([name])
 
     def kill(self, name: str) -> None:
-        self._known(name)
-        process = self._running.pop(name, None)
-        if process is not None:
-            _end(process)
+        """Kill a component, as a crash would."""
+        _end(self._running.pop(name))
 
-    def signal(self, name: str, number: signal.Signals) -> None:
-        """Send a signal to a component and its children (SIGSTOP makes a server hang)."""
-        process = self._running.get(self._known(name).name)
-        if process is None:
-            raise RigError(f"{name}: not running, cannot receive {number.name}; start it first")
-        os.killpg(process.pid, number)
+    def pause(self, name: str) -> None:
+        """Pause a component: it accepts connections and never answers."""
+        os.killpg(self._running[name].pid, signal.SIGSTOP)
+
+    def resume(self, name: str) -> None:
+        os.killpg(self._running[name].pid, signal.SIGCONT)
 
     def stop_all(self) -> None:
         """Stop all components, the newest first; an interrupt meanwhile kills all that are left."""
@@ -132,22 +116,12 @@ class Processes:
     def pids(self) -> dict[str, int]:
         return {name: process.pid for name, process in self._running.items()}
 
-    def names(self) -> list[str]:
-        """Return all components, in the order of their start."""
-        return list(self._components)
-
     def url(self, name: str) -> str:
-        """Return the URL of a component that has one."""
-        return self._known(name).url
+        return self._components[name].url
 
     def log(self, name: str) -> Path:
         """Return the log file of a component; restarts append to it."""
         return self._logs / f"{name}.log"
-
-    def _known(self, name: str) -> Component:
-        if name not in self._components:
-            raise RigError(f"no component {name!r}; choose one of {', '.join(self._components)}")
-        return self._components[name]
 
     def _launch(self, component: Component) -> None:
         argv = launch.command(component.argv[0], *component.argv[1:])
@@ -155,16 +129,15 @@ class Processes:
         with self.log(component.name).open("ab") as log:
             log.write(f"--- {time.strftime('%H:%M:%S')} {' '.join(component.argv)}\n".encode())
             log.flush()
-            process = _spawner.call(
-                lambda: subprocess.Popen(
-                    argv,
-                    env=environment,
-                    cwd=self._logs,
-                    stdin=subprocess.DEVNULL,
-                    stdout=log,
-                    stderr=subprocess.STDOUT,
-                    start_new_session=True,
-                )
+            # the kernel also kills the process when this thread ends: start no rig in another
+            process = subprocess.Popen(
+                argv,
+                env=environment,
+                cwd=self._logs,
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                start_new_session=True,
             )
         self._running[component.name] = process
         self._started[component.name] = time.monotonic()
@@ -216,38 +189,3 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         while time.monotonic() < deadline:
             os.killpg(process.pid, 0)  # fails once the group is empty
             time.sleep(_POLL_SECONDS / 5)
-
-
-class _Spawner:
-    """Starts every process from one thread that lives as long as this process.
-
-    The kernel kills a child when the *thread* that started it ends. So a rig that a worker thread
-    starts, as with two clusters at once, would lose its processes at the end of that thread.
-    """
-
-    def __init__(self) -> None:
-        self._jobs: queue.Queue[
-            tuple[Callable[[], subprocess.Popen[bytes]], Future[subprocess.Popen[bytes]]]
-        ] = queue.Queue()
-        self._thread: threading.Thread | None = None
-        self._lock = threading.Lock()
-
-    def call(self, job: Callable[[], subprocess.Popen[bytes]]) -> subprocess.Popen[bytes]:
-        with self._lock:
-            if self._thread is None or not self._thread.is_alive():  # not alive after a fork
-                self._thread = threading.Thread(target=self._work, name="rig-spawner", daemon=True)
-                self._thread.start()
-        future: Future[subprocess.Popen[bytes]] = Future()
-        self._jobs.put((job, future))
-        return future.result()
-
-    def _work(self) -> None:
-        while True:
-            job, future = self._jobs.get()
-            try:
-                future.set_result(job())
-            except BaseException as error:
-                future.set_exception(error)
-
-
-_spawner = _Spawner()

@@ -15,8 +15,6 @@ from .errors import RigError
 
 @dataclass(frozen=True)
 class Existing:
-    """An existing cluster and the Git server that it reads."""
-
     kubeconfig: Path
     git_url: str
     push_url: str
@@ -32,10 +30,8 @@ def existing(name: str) -> Existing | None:
     if not kubeconfig or not git_url:
         missing = "E2E_GIT_URL" if kubeconfig else "E2E_KUBECONFIG"
         raise RigError(
-            f"{missing} is not set: an existing cluster needs E2E_KUBECONFIG and E2E_GIT_URL (the "
-            "base URL of a Git server that the cluster reaches and that creates repositories on "
-            "push, with E2E_GIT_PUSH_URL if the tests reach it by another URL); unset both and "
-            "the tests start a cluster of their own"
+            f"{missing} is not set: an existing cluster needs E2E_KUBECONFIG and E2E_GIT_URL "
+            "(docs/e2e.md); unset both and the tests start a cluster of their own"
         )
     path = Path(kubeconfig).expanduser().resolve()
     if not path.is_file():

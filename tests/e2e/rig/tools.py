@@ -6,8 +6,8 @@ module of its own under `tests/e2e/tools/`, whose `go.sum` covers all dependenci
 The name of a cache entry is a digest of everything that decides the program's bytes. A finished
 entry is renamed into the cache, so each existing entry is complete.
 
-`python -m tests.e2e.rig.tools` builds all programs and prints how long each took. With `--for flux`
-it builds the programs of a rig with Flux.
+`python -m tests.e2e.rig.tools` builds all programs. With `--for flux` it builds the programs of a
+rig with Flux.
 """
 
 from __future__ import annotations
@@ -76,17 +76,9 @@ TOOLS = {
 }
 
 
-def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> dict[str, Path]:
-    """Return the paths of the named programs, by default of all; build those that the cache lacks.
-
-    `report` gets lines of progress; by default they go to standard error. Raises RigError if a name
-    is unknown, if Go is missing or too old, or if a build fails.
-    """
-    wanted = list(TOOLS) if names is None else list(names)
-    unknown = sorted(set(wanted) - set(TOOLS))
-    if unknown:
-        raise RigError(f"no such tool: {', '.join(unknown)}; there are {', '.join(TOOLS)}")
-    say = report or _to_stderr
+def ensure(names: Iterable[str], report: Report | None = None) -> dict[str, Path]:
+    """Return the paths of these programs, after building what the cache lacks; raise RigError."""
+    wanted, say = list(names), report or _to_stderr
     go = gobuild.Go.find()
     entries = {name: cache_root() / f"{name}-{_digest(TOOLS[name], go)}" for name in wanted}
     missing = [name for name in wanted if not entries[name].is_dir()]
@@ -94,20 +86,18 @@ def ensure(names: Iterable[str] | None = None, report: Report | None = None) -> 
         with _turn(cache_root(), say):
             if not entries[name].is_dir():  # another run may have built it while we waited
                 workspace = gobuild.Workspace(cache_root() / f".go-{TOOLS[name].wrapper}")
-                step = _prefixed(say, place, len(missing), name)
-                _build(TOOLS[name], go, entries[name], workspace, step)
+                say(f"building program {place} of {len(missing)}, {name}")
+                _build(TOOLS[name], go, entries[name], workspace, say)
                 if TOOLS[name].wrapper not in [TOOLS[other].wrapper for other in missing[place:]]:
                     workspace.remove()
     return {name: entries[name] / name for name in wanted}
 
 
 def needed_with(*gitops: str) -> list[str]:
-    """Return the names of the programs that a rig with these GitOps controllers needs."""
     return [tool.name for tool in TOOLS.values() if tool.gitops in ("", *gitops)]
 
 
 def crd_files(binaries: dict[str, Path]) -> list[Path]:
-    """Return the CRD manifests in the cache entries of these programs."""
     return sorted(
         path for binary in binaries.values() for path in binary.parent.glob("crds/*.yaml")
     )
@@ -138,7 +128,8 @@ def _flags(tool: Tool) -> list[str]:
     linker = ["-s", "-w"]
     if tool.wrapper == "kubernetes":
         # Without a version stamp the server reports v0.0.0-master, which clients refuse.
-        version = _pinned(WRAPPERS / tool.wrapper / "go.mod", "k8s.io/kubernetes")
+        pins = (WRAPPERS / tool.wrapper / "go.mod").read_text()
+        (version,) = re.findall(r"^\s*(?:require )?k8s\.io/kubernetes (v\S+)", pins, re.MULTILINE)
         major, minor = version.removeprefix("v").split(".")[:2]
         stamps = {"gitVersion": version, "gitMajor": major, "gitMinor": minor}
         linker += [
@@ -147,30 +138,16 @@ def _flags(tool: Tool) -> list[str]:
     return ["-trimpath", "-buildvcs=false", f"-ldflags={' '.join(linker)}"]
 
 
-def _pinned(go_mod: Path, module: str) -> str:
-    found = re.search(
-        rf"^\s*(?:require )?{re.escape(module)} (v\S+)", go_mod.read_text(), re.MULTILINE
-    )
-    if found is None:
-        raise RigError(f"{go_mod}: requires no {module}; run `go get -tool` as its README says")
-    return found.group(1)
-
-
 @contextlib.contextmanager
 def _turn(root: Path, say: Report) -> Iterator[None]:
     """Hold the build lock, because two builds of Kubernetes at once do not fit into memory."""
     root.mkdir(parents=True, exist_ok=True)
     with (root / "build.lock").open("w") as lock:
-        waited = False
-        while True:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel on death
-                break
-            except BlockingIOError:
-                if not waited:
-                    say(f"another run is building into {root}, waiting for it")
-                waited = True
-                time.sleep(0.5)
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # freed by the kernel on death
+        except BlockingIOError:
+            say(f"another run is building into {root}, waiting for it")
+            fcntl.flock(lock, fcntl.LOCK_EX)
         for leftover in root.glob(".building-*"):  # only of killed builds, as we hold the lock
             shutil.rmtree(leftover, ignore_errors=True)
         yield
@@ -181,23 +158,19 @@ def _build(
 ) -> None:
     staging = Path(tempfile.mkdtemp(prefix=f".building-{tool.name}-", dir=entry.parent))
     try:
-        start = time.monotonic()
-        wrapper = WRAPPERS / tool.wrapper
-        binary = staging / tool.name
+        start, wrapper, binary = time.monotonic(), WRAPPERS / tool.wrapper, staging / tool.name
         go.check(wrapper)
         say("fetching modules")
-        workspace.vendor(go, wrapper, say)
+        workspace.vendor(go, wrapper)
         if tool.crds_of:
             _copy_crds(Path(gobuild.module_folder(go, workspace, tool.crds_of)), staging / "crds")
         workspace.drop_modules()
         gobuild.build(go, tool.package, _flags(tool), binary, workspace, say)
-        seconds = round(time.monotonic() - start, 1)
-        (staging / "build.json").write_text(json.dumps({"tool": tool.name, "seconds": seconds}))
         with binary.open("rb") as written:
             os.fsync(written.fileno())  # otherwise a power cut could leave an empty file
         staging.chmod(0o755)
         staging.rename(entry)
-        say(f"built in {seconds:.0f} s")
+        say(f"built in {time.monotonic() - start:.0f} s")
     finally:
         shutil.rmtree(staging, ignore_errors=True)
 
@@ -212,29 +185,19 @@ def _copy_crds(module: Path, target: Path) -> None:
         (target / source.name).write_bytes(source.read_bytes())  # copies no read-only mode
 
 
-def _prefixed(say: Report, place: int, total: int, name: str) -> Report:
-    return lambda text: say(f"[{place}/{total}] {name}: {text}")
-
-
 def _to_stderr(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
 def _main() -> int:
-    start = time.monotonic()
-    names = sys.argv[1:]
-    if names and names[0] == "--for":
-        names = needed_with(*names[1:])
+    asked = sys.argv[1:]
     try:
-        paths = ensure(names or None)
+        paths = ensure(needed_with(*asked[1:]) if asked[:1] == ["--for"] else asked or TOOLS)
     except RigError as error:
         print(error, file=sys.stderr)
         return 1
     for name, path in paths.items():
-        seconds = json.loads((path.parent / "build.json").read_text())["seconds"]
-        size = path.stat().st_size / 1e6
-        print(f"{name:24} built in {seconds:7.1f} s  {size:6.1f} MB  {path}")
-    print(f"ready after {time.monotonic() - start:.1f} s")
+        print(f"{name:24} {path}")
     return 0
 
 

@@ -21,37 +21,20 @@ _YOUNG_SECONDS = 60  # a younger lock file may belong to a rig that is about to 
 
 
 class Workdir:
-    """The folder of a rig.
+    """The folder of a rig; its lock is held until `clear`.
 
-    Its lock is held until `clear`.
+    `home` and `temporary` are HOME and TMPDIR of the rig's processes, which so read no file of the
+    user and leave none elsewhere. `repositories` is the root folder of the Git server.
     """
 
-    def __init__(self, name: str, path: Path | None = None) -> None:
-        if path is None:
-            _sweep(Path(tempfile.gettempdir()))
-            path = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{name}-"))
-        else:
-            path.mkdir(parents=True, exist_ok=True)
-        self.path = path.resolve()
-        self.logs = self.path / "logs"
+    def __init__(self, name: str) -> None:
+        _sweep(Path(tempfile.gettempdir()))
+        self.path = Path(tempfile.mkdtemp(prefix=f"{_PREFIX}{name}-")).resolve()
         self._lock = _locked(self.path / "lock")
-        for folder in (self.logs, self.home, self.temporary, self.repositories):
-            folder.mkdir(exist_ok=True)
-
-    @property
-    def home(self) -> Path:
-        """The HOME of the rig's processes, which contains no file of the user."""
-        return self.path / "home"
-
-    @property
-    def temporary(self) -> Path:
-        """The TMPDIR of the rig's processes, so that a killed process leaves no files elsewhere."""
-        return self.path / "tmp"
-
-    @property
-    def repositories(self) -> Path:
-        """The root folder of the Git server."""
-        return self.path / "git"
+        folders = [self.path / part for part in ("logs", "home", "tmp", "git")]
+        self.logs, self.home, self.temporary, self.repositories = folders
+        for folder in folders:
+            folder.mkdir()
 
     def environment(self) -> dict[str, str]:
         """Return the environment of the rig's processes; only PATH comes from the user."""
@@ -63,10 +46,7 @@ class Workdir:
         }
 
     def clear(self, *, keep_logs: bool) -> None:
-        """Remove the data, and the logs too unless `keep_logs`."""
-        for entry in self.path.iterdir():
-            if entry == self.logs and keep_logs:
-                continue
+        for entry in {*self.path.iterdir()} - ({self.logs} if keep_logs else set()):
             if entry.is_dir() and not entry.is_symlink():
                 shutil.rmtree(entry, ignore_errors=True)
             else:

@@ -1,5 +1,23 @@
-"""Stand-ins for the programs in the containers; commands, parameters and topics are the real ones.
+"""Stand-ins for the programs in the pods, and the folder that takes the place of every image.
 
-The interfaces of perception_msgs are not installed, so ego data are `geometry_msgs/PoseStamped` and
-object lists `geometry_msgs/PoseArray`. Point clouds are `sensor_msgs/PointCloud2`.
+They take the commands, parameters and topics of the real programs.
 """
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+_PROGRAMS = {"ros2": __name__, "zenoh-bridge-ros2dds": f"{__name__}.zenoh_bridge"}
+
+
+def image(folder: Path) -> Path:
+    """Fill the containers' working directory with the stand-in programs; return the directory."""
+    setup = folder / "install" / "setup.bash"
+    setup.parent.mkdir(exist_ok=True)
+    setup.write_text(f'PATH="{folder}:$PATH"\n')
+    for name, module in _PROGRAMS.items():
+        program = folder / name
+        program.write_text(f'#!/bin/sh\nexec "{sys.executable}" -m {module} "$@"\n')
+        program.chmod(0o755)
+    return folder

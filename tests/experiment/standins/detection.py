@@ -37,7 +37,6 @@ def pose_at(x: float, y: float) -> Pose:
 
 
 def main(given: dict[str, str]) -> None:
-    """Detect objects in each point cloud of a topic until a signal ends the program."""
     start()
     node = Node(given["node_name"])
     sender = node.create_publisher(PoseArray, given["object_list_topic"], 10)

@@ -88,6 +88,5 @@ def _is_among(pose: Any, others: list[Any]) -> bool:
 
 
 def main(given: dict[str, str]) -> None:
-    """Fuse until a signal ends the program."""
     start()
     spin(Fusion(given))

@@ -19,8 +19,6 @@ _LOOK_S = 0.1
 
 
 class MqttClient(Node):
-    """One end of a connection."""
-
     def __init__(self) -> None:
         super().__init__("mqtt_client", automatically_declare_parameters_from_overrides=True)
         self._broker = mqtt.Client(
@@ -86,7 +84,6 @@ class MqttClient(Node):
 
 
 def main(given: dict[str, str]) -> None:
-    """Carry messages until a signal ends the program."""
     ros_args = ["-r", f"__node:={given['node_name']}", "--params-file", given["params_file"]]
     start(["mqtt_client", "--ros-args", *ros_args])
     client = MqttClient()

@@ -12,7 +12,6 @@ from rclpy.signals import SignalHandlerOptions
 
 
 def message_class(type_name: str) -> Any:
-    """Return the class of a message type, such as `geometry_msgs/msg/PoseStamped`."""
     package, _, name = type_name.split("/")
     return getattr(import_module(f"{package}.msg"), name)
 

@@ -58,7 +58,6 @@ class Bridge(Node):
 
 
 def main() -> None:
-    """Carry messages until a signal ends the program."""
     parser = argparse.ArgumentParser()
     parser.add_argument("-c", dest="config", type=Path, required=True)
     config = json.loads(parser.parse_args().config.read_text())

@@ -11,32 +11,37 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Any
 
+import pytest
+import yaml
+
+from tests.e2e.argocd.view import Domain as ArgoDomain
+from tests.e2e.flux.view import Domain as FluxDomain
 from tests.e2e.rig import launch
 from tests.e2e.rig.clone import Clone
-from tests.e2e.rig.cluster import Rig
+from tests.e2e.rig.cluster import Gitops, Rig
 from tests.e2e.rig.errors import RigError
 from tests.e2e.rig.kube import Kube, Manifest
+from tests.e2e.rig.tools import Report
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import git
 from tests.kit.ros import Sent
 
-from .expected import demand
+from .expected import NAMESPACE, demand
 from .namespace import Namespace
 from .ros import Client
-from .timing import Times
 
-Domain = TypeVar("Domain", bound=Namespace)
-
+VIEWS: dict[Gitops, type[Namespace]] = {"flux": FluxDomain, "argocd": ArgoDomain}
+STAGES = ("committed", "pushed", "fetched", "applied", "ready")
 _READY = "taking demands on"
 
 
 class Generator:
-    """A `demandops serve` process that a test can kill and start again."""
-
     def __init__(self, state_repo: str, folder: Path, ros_domain: int, client: Client) -> None:
         self.log = folder / "generator.log"
         self._client = client
@@ -46,19 +51,12 @@ class Generator:
         self._process: subprocess.Popen[bytes] | None = None
 
     def start(self, *arguments: str) -> None:
-        """Start the generator and wait until it accepts goals.
-
-        The kernel ends the generator when this process ends, even if this process is killed.
-        """
+        """Start the generator, which dies with this process; wait until it accepts goals."""
         command = launch.command(sys.executable, *self._command, *arguments)
         with self.log.open("ab") as log:
             start = log.tell()
             self._process = subprocess.Popen(
-                command,
-                env=self._environment,
-                cwd=self._folder,
-                stdout=log,
-                stderr=subprocess.STDOUT,
+                command, env=self._environment, cwd=self._folder, stdout=log, stderr=log
             )
         deadline = time.monotonic() + PATIENCE_S
         while not (_READY in self._log_since(start) and self._client.reaches_a_node()):
@@ -87,11 +85,8 @@ class Generator:
         return self.log.read_bytes()[offset:].decode(errors="replace")
 
 
-class StateRepo(Generic[Domain]):
-    """A state repo for the GitOps controller of a rig, and the generator that writes it.
-
-    `domains` maps each cluster that follows the state repo to the access domain there.
-    """
+class World:
+    """A state repo, its generator, and the access domain on each cluster that follows it."""
 
     def __init__(self, rig: Rig, folder: Path, ros_domain: int, client: Client) -> None:
         self.rig, self.client, self.folder = rig, client, folder
@@ -103,21 +98,30 @@ class StateRepo(Generic[Domain]):
         git(bare, "push", "--quiet", self.push_url, "main")
         self.person = Clone(self.push_url, folder / "person")
         self.generator = Generator(self.push_url, folder, ros_domain, client)
-        self.domains: dict[str, Domain] = {}
+        self.domains: dict[str, Any] = {}
         self._wide: list[tuple[Kube, Manifest]] = []
 
-    def bootstrap(self, cluster: str, rig: Rig) -> Domain:
+    def bootstrap(self, cluster: str, rig: Rig, **source: Any) -> Any:
         """Let a cluster follow the state repo, and return the access domain on that cluster.
 
-        Apply `bootstrap/<cluster>.yaml`, and wait until it has taken effect.
+        Apply `bootstrap/<cluster>.yaml`, and wait until it has taken effect. `source` replaces
+        fields of a GitRepository there, as an operator may do with an overlay.
         """
-        raise NotImplementedError
+        manifests = self.manifests(cluster)
+        for item in manifests:
+            if item["kind"] == "GitRepository":
+                item["spec"].update(source)
+        (domain,) = VIEWS[rig.gitops].all_in(rig.kube, manifests)
+        self.domains[cluster] = domain
+        self.apply(rig.kube, manifests)
+        domain.settle(self.tip())
+        return domain
+
+    def manifests(self, cluster: str) -> list[Manifest]:
+        return list(yaml.safe_load_all(self.file(f"bootstrap/{cluster}.yaml")))
 
     def apply(self, kube: Kube, manifests: list[Manifest]) -> None:
-        """Apply the manifests of a bootstrap file.
-
-        `remove_wide` later removes those that are cluster-wide.
-        """
+        """Apply a bootstrap file's manifests; `remove_wide` removes those that are cluster-wide."""
         kube.apply(*manifests)
         self._wide += [
             (kube, item)
@@ -126,20 +130,20 @@ class StateRepo(Generic[Domain]):
         ]
 
     def remove_wide(self) -> None:
-        """Remove the cluster-wide objects that :meth:`apply` made."""
         for kube, item in self._wide:
             kube.delete(item["kind"], item["metadata"]["name"], version=item["apiVersion"])
         self._wide.clear()
 
     def remove(self) -> None:
-        """Stop the generator and remove the state repo's objects from its clusters.
-
-        The namespace stays.
-        """
-        raise NotImplementedError
+        """Stop the generator and remove the state repo's objects; the namespaces stay."""
+        self.generator.stop()
+        for domain in self.domains.values():
+            domain.remove()
+        self.remove_wide()
+        self.domains.clear()
 
     @property
-    def domain(self) -> Domain:
+    def domain(self) -> Any:
         """The access domain on the only cluster that follows the state repo."""
         (only,) = self.domains.values()
         return only
@@ -149,7 +153,6 @@ class StateRepo(Generic[Domain]):
         return (self.person.folder / path).read_text()
 
     def tip(self) -> str:
-        """Return the newest commit on the remote's main branch."""
         self._pull()
         return self.person.git("rev-parse", "HEAD")
 
@@ -158,7 +161,6 @@ class StateRepo(Generic[Domain]):
         return self.person.git("show", "--name-only", "--format=", commit).split()
 
     def commits_since(self, commit: str) -> int:
-        """Return how many commits the remote has after a commit."""
         self._pull()
         return int(self.person.git("rev-list", "--count", f"{commit}..HEAD"))
 
@@ -178,15 +180,15 @@ class StateRepo(Generic[Domain]):
         assert sent.status == "succeeded", sent.message
         return sent
 
-    def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> Times:
+    def step(self, number: int, wanted: frozenset[str], *, wake: bool = True) -> list[float]:
         """Send the goal of a step, then `follow` the goal."""
         return self.follow(self.demand(demand(number)), wanted, wake=wake)
 
-    def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> Times:
+    def follow(self, sent: Sent, wanted: frozenset[str], *, wake: bool = True) -> list[float]:
         """Wait until the cluster has applied a goal's commit, and its `lines` are as wanted.
 
-        Return the times at which the goal reached its stages. With `wake`, trigger the controller
-        first.
+        Return when the goal was sent, and when it reached each of :data:`STAGES`. With `wake`,
+        trigger the controller first.
         """
         domain = self.domain
         if wake:
@@ -196,23 +198,40 @@ class StateRepo(Generic[Domain]):
         ready = domain.wait_lines(wanted)
         pushed = sent.stages["pushed"]
         committed = sent.stages.get("committed", pushed)  # no commit if nothing changed
-        return Times(sent.at, committed, pushed, fetched, applied, ready)
+        return [sent.at, committed, pushed, fetched, applied, ready]
 
     def _pull(self) -> None:
         self.person.git("fetch", "--quiet", "origin", "main")
         self.person.git("reset", "--quiet", "--hard", "FETCH_HEAD")
 
 
+def show_times(say: Report, heading: str, rows: Mapping[str, list[float]]) -> None:
+    """Print how long each demand took to each stage; `rows` has results of :meth:`World.follow`."""
+    width = max(map(len, rows))
+    say(f"\n{heading} (seconds)")
+    say(" " * (width + 2) + "".join(f"{stage:>11}" for stage in (*STAGES, "in all")))
+    for title, at in rows.items():
+        taken = [*(after - before for before, after in pairwise(at)), at[-1] - at[0]]
+        say(f"  {title:<{width}}" + "".join(f"{value:11.2f}" for value in taken))
+
+
+@contextmanager
+def running(rig: Rig, session: pytest.Session) -> Iterator[Rig]:
+    """Start a rig and stop it after the block; keep its logs if a test failed meanwhile."""
+    failed = session.testsfailed
+    rig.start()
+    try:
+        yield rig
+    finally:
+        if rig.existing:
+            rig.kube.delete("Namespace", NAMESPACE)
+        rig.stop(failed=session.testsfailed > failed)
+
+
 def demandops(folder: Path, *arguments: str) -> str:
-    """Run a command of `demandops` with its data in `folder` and return its output."""
     command = [sys.executable, "-m", "demandops.cli.main", *arguments]
     done = subprocess.run(
-        command,
-        env=environment(folder),
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
+        command, env=environment(folder), cwd=folder, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, f"demandops {' '.join(arguments)}: {done.stderr}"
     return done.stdout
