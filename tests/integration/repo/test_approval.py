@@ -10,7 +10,6 @@ from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import datetime
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +23,6 @@ from demandops.serve.approvals import approvals
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
-from tests.kit.chance import IN_FULL
 from tests.kit.config import override
 from tests.kit.generator import Proposed
 from tests.kit.git_over_http import Server
@@ -194,19 +192,6 @@ def test_a_proposal_outlives_the_generator(url: str, bare: Path, petra: Person) 
         assert head(bare, branch) == stands, "the branch was pushed again"
         assert generator.withdraw("op-1") is True, "the second generator must know the operation"
         rig.wait_until(lambda: branches(bare) == [other], "the branch is deleted")
-
-
-def test_decisions_made_while_no_generator_runs_take_effect_at_the_next_start(
-    url: str, bare: Path, petra: Person
-) -> None:
-    with rig.running(url) as generator:
-        yes, no = (Proposed(generator, goal(n), f"op-{n}").branch for n in (1, 2))
-    petra.merge(yes)
-    petra.delete(no)
-    with rig.running(url) as generator:
-        wait_until_none(bare)
-        rig.wait_until(lambda: generator.operations == (), "both demands are answered")
-    assert rig.books(bare) == rig.books_after([goal(1)])
 
 
 @pytest.mark.parametrize("how", ["generator-runs", "merged-while-away", "rebased-while-away"])
@@ -611,40 +596,6 @@ def test_odd_ids_give_branches_that_git_takes(
 
 
 # ---- kills, connections that are cut, other generators ----
-
-
-@pytest.mark.parametrize(
-    ("address", "point"),
-    [
-        *(("file-url", f"journaled:{times}") for times in ((1, 2, 3, 4) if IN_FULL else (1, 4))),
-        *product(("embedded", "file-url"), ("proposing", "proposed")),
-    ],
-    indirect=["address"],
-)
-def test_killed_while_proposing_there_is_one_branch_after_the_restart(
-    drivers: rig.Drivers, address: str, bare: Path, petra: Person, point: str
-) -> None:
-    drivers.start(address, [[rig.demand("one", goal(1))]], die_at=point).listen()
-    with rig.running(address) as generator:
-        other = Proposed(generator, goal(2)).branch
-        rig.wait_until(lambda: len(branches(bare)) == 2, "both demands wait")
-        [branch] = [one for one in branches(bare) if one != other]
-        assert [c.one("Operation-Id") for c in rig.commits(bare, f"main..{branch}")] == ["op-one"]
-        petra.merge(branch)
-        rig.wait_until(lambda: branches(bare) == [other], "the generator has seen the merge")
-    assert rig.books(bare) == rig.books_after([goal(1)])
-
-
-def test_killed_before_the_branch_of_a_released_demand_is_deleted_it_goes_at_the_restart(
-    drivers: rig.Drivers, url: str, bare: Path, petra: Person
-) -> None:
-    lanes = [[rig.demand("leave", leave(1))]]
-    opening = rig.demand("join", goal(1))
-    drivers.start(url, lanes, opening=opening, die_at="retracting").listen()
-    with rig.running(url) as generator:
-        wait_until_none(bare)
-        rig.wait_until(lambda: generator.operations == (), "both demands are answered")
-    assert rig.claims(bare) == []
 
 
 @pytest.mark.parametrize("crashes", [False, True])

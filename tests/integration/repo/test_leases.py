@@ -21,7 +21,7 @@ from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
-from tests.kit.repo import GitRepo, Person
+from tests.kit.repo import GitRepo
 
 DOMAINS = "policy/access-domains.yaml"
 POLICY = """\
@@ -90,38 +90,6 @@ def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(
     rig.assert_sound(bare)
 
 
-def test_what_ended_while_the_generator_was_down_goes_when_it_is_back(
-    clock: Clock, url: str, bare: Path
-) -> None:
-    with rig.running(url, runtime=clock) as generator:
-        rig.book(generator, put("b", 120), put("a", 60), put("long", "1h"))
-    assert expiries(bare) == []
-    clock.pass_(120)
-    with rig.running(url, runtime=clock) as generator:
-        wait_until_gone(generator, "b")
-        wait_until_gone(generator, "a")
-        assert held(generator, "long")
-    assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["a"], ["b"]]
-    rig.assert_sound(bare)
-
-
-def test_renewing_a_lease_keeps_the_claim_and_changes_no_cluster_file(
-    clock: Clock, bare: Path
-) -> None:
-    with rig.running(bare, runtime=clock) as generator:
-        rig.book(generator, put("kept", 120), put("other"))
-        files = rig.git(bare, "rev-parse", "main:clusters")
-        (answer,) = rig.book(generator, renew("kept"))
-        assert answer.outcome == "booked"
-        assert rig.git(bare, "rev-parse", "main:clusters") == files
-        clock.pass_(60)
-        wait_until_gone(generator, "other")
-        rig.book(generator, put("kept", "1h"))
-    assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["other"]]
-    assert rig.commits(bare)[-1].summary.startswith("Renew edge/kept")
-    rig.assert_sound(bare)
-
-
 def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
     clock: Clock, bare: Path
 ) -> None:
@@ -173,32 +141,6 @@ def test_a_lease_that_another_generator_renewed_does_not_expire(
     assert expiries(bare) == []
     assert rig.claims(bare, "edge/d")
     rig.assert_sound(bare)
-
-
-def test_two_generators_release_once(clock: Clock, url: str, bare: Path) -> None:
-    with rig.running(url, runtime=clock) as first, rig.running(url, runtime=clock) as second:
-        rig.book(first, put("d"))
-        rig.book(second, put("other", None))  # now the second one knows 'd'
-        assert held(second, "d")
-        clock.pass_(60)
-        wait_until_gone(first, "d")
-        wait_until_gone(second, "d")
-    assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["d"]]
-    rig.assert_sound(bare)
-
-
-def test_a_hand_in_counts_once_though_the_remote_moved(
-    url: str, bare: Path, person: Person, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO, logger="demandops")
-    _with_policy(bare, ", quotas: {demandsPerMinute: 2}")
-    with rig.running(url) as generator:
-        for number in range(2):
-            person.change({"README.md": f"Version {number}.\n"}, "Ours")
-            rig.book(generator, put(f"d{number}", None))
-        assert caplog.text.count("another writer was first") == 2
-        assert rig.outcome(generator.submit(put("d2", None))) == "quota"
-        rig.book(generator, put("d2", None, requesters=["vehicle03"]))
 
 
 def test_odd_goals_are_refusals_and_no_faults_of_the_generator(

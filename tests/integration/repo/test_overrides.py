@@ -172,31 +172,6 @@ def test_a_denied_requester_is_refused_and_its_claims_suspended_until_the_overri
     assert rig.claims(bare, "user1") == []
 
 
-def test_a_kept_application_runs_until_a_demand_takes_over_or_the_override_goes(
-    generator: Generator, bare: Path, person: Person
-) -> None:
-    rig.book(generator, rig.goal(1))
-    person.override(lasting=override({"applications": ["edge/*"]}, keep=True))
-    (left,) = rig.book(generator, rig.leave(1))
-    assert named(bare, left.commit) == ["overrides/lasting.yaml"]
-    books = rig.books(bare)
-    assert books["services"]["od-edge-station00"]["requesters"] == ["petra"]
-    assert books["connections"] == {}, "the override keeps applications, not connections"
-    assert len(rig.claims(bare, "override:lasting")) == 1
-    assert "override overrides/lasting.yaml: keep;" in file(bare, DETECTION)
-    moved = rig.goal(6)
-    moved["apps"][0]["header"]["node_id"] = "cloud"
-    rig.book(generator, moved)
-    assert rig.claims(bare, "override:lasting") == [], "a new demand takes over from the override"
-    rig.book(generator, moved | {"shutdown": True})
-    assert len(rig.claims(bare, "override:lasting")) == 1
-    cause = person.override(lasting=None)
-    next_demand(generator, 2)
-    assert named(bare, cause) == ["overrides/lasting.yaml"]
-    rig.book(generator, rig.leave(2))
-    assert rig.claims(bare) == []
-
-
 def test_a_claim_that_a_person_deletes_is_kept_too(
     generator: Generator, bare: Path, person: Person
 ) -> None:

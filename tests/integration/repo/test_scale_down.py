@@ -12,7 +12,7 @@ from tests.kit import goals, rig
 from tests.kit.cli import Run
 from tests.kit.clock import Clock
 from tests.kit.config import skeleton
-from tests.kit.repo import GitRepo, Person
+from tests.kit.repo import GitRepo
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 SCALING = "{max: 4, per: {sources: 1}, dividesWork: true, downAfter: 10m}"
@@ -76,15 +76,3 @@ def test_one_of_two_generators_scales_down_when_the_time_is_over(
     assert commit.summary.startswith(f"Scale down {RELEASE}")
     assert records(bare) == []
     rig.assert_sound(bare, verify_last=4)
-
-
-def test_a_person_who_deletes_the_record_is_obeyed(
-    clock: Clock, url: str, bare: Path, person: Person
-) -> None:
-    with rig.running(url, runtime=clock) as generator:
-        rig.book(generator, fusion(3), fusion(1))
-        person.push(dict.fromkeys(records(bare)), "Scale down now")
-        generator.fetch_now()
-        wait_until_down(bare)
-    assert rig.commits(bare)[-1].one("Operation") == "follow"
-    rig.assert_sound(bare, verify_last=2)

@@ -60,28 +60,6 @@ def test_demands_count_once_when_the_server_goes_away_before_it_answers_the_push
     rig.assert_sound(bare)
 
 
-def test_a_repeated_join_is_not_booked_when_the_answer_to_the_later_release_is_lost(
-    http: str, server: Server, bare: Path, clock: Clock
-) -> None:
-    """The repeated join changes nothing. The server takes the release, but its answer is lost.
-
-    If the generator decided both demands again on top of the release, it would book the join.
-    """
-    with rig.running(http, runtime=clock) as generator:
-        rig.book(generator, goal(1))
-        with rig.busy(generator, goal(0)) as opening:
-            again, released = generator.submit(goal(1)), generator.submit(leave(1))
-            taken = server.taken
-            opening.future.add_done_callback(lambda _: _cut(server))
-        rig.wait_until(lambda: server.taken == taken + 2, "both pushes were taken")
-        _come_back(server, clock)
-        assert rig.outcome(again) in ("unchanged", "booked")
-        assert rig.outcome(released) == "released"
-    assert rig.books(bare) == rig.books_after([goal(0)]), (
-        "the released connection must not be booked again"
-    )
-
-
 def test_a_push_is_repeated_until_the_server_takes_it(bare: Path) -> None:
     """An error 503 is no refusal, even if the URL has `403`, `denied` and `rejected` in it."""
     prefix = "/403/denied-and-rejected"

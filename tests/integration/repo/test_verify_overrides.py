@@ -76,21 +76,6 @@ def test_a_held_file_that_a_person_edited_is_what_the_next_commits_start_from(
     assert all_hold(bare)
 
 
-def test_what_a_commit_may_not_change(generator: Generator, bare: Path, person: Person) -> None:
-    person.override(brief=override({"nodes": ["edge"]}, keep=True))
-    for operation, path in (
-        ("join", "ledger/overrides/brief.yaml"),
-        ("follow", "ledger/overrides/no-marker.yaml"),
-        ("upgrade", "policy/access-domains.yaml"),
-        ("follow", "demandops.yaml"),
-        ("follow", "README.md"),
-    ):
-        text = file(bare, path) + "# more\n"
-        found = forged(bare, person, generator, path, text, f"Operation: {operation}")
-        assert (found.holds, found.touched) == (False, (path,))
-        rig.book(generator, rig.leave(2), rig.leave(3))
-
-
 def test_a_claim_that_is_kept_is_accounted_for_by_its_override(
     generator: Generator, bare: Path, person: Person
 ) -> None:
