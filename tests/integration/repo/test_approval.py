@@ -23,12 +23,11 @@ from demandops.serve.approvals import approvals
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
-from tests.kit.config import override
 from tests.kit.generator import Proposed
 from tests.kit.git_over_http import Server
 from tests.kit.limits import files_end_at
 from tests.kit.repo import GitRepo, Person, branches, state_of
-from tests.kit.rig import git, goal, leave
+from tests.kit.rig import git, goal
 
 NO_DELETION = 'case "$1 $3" in refs/heads/demand/*\\ 00000000*) exit 1;; esac'
 NO_PUSH = 'case "$1" in refs/heads/demand/*) exit 1;; esac'
@@ -152,16 +151,6 @@ def test_a_demand_waits_for_few_of_the_branches_that_are_pushed_for_others(
         assert sorted(each.branch for each in proposed) == branches(bare)
 
 
-def test_a_deleted_branch_turns_the_demand_down(url: str, bare: Path, petra: Person) -> None:
-    before = rig.tip(bare)
-    with rig.running(url) as generator:
-        proposed = Proposed(generator, goal(1))
-        petra.delete(proposed.branch)
-        assert proposed.outcome() == "TurnedDown"
-    assert rig.restart(url) is True
-    assert (rig.tip(bare), branches(bare)) == (before, [])
-
-
 def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
     bare: Path, petra: Person, generator: Generator
 ) -> None:
@@ -178,62 +167,6 @@ def test_a_full_disk_fails_the_demand_that_needs_it_and_nothing_else(
             rig.receipt(unlucky)
     assert Proposed(generator, goal(2), "op-3").branch in branches(bare)
     assert refused.future.done() and not waiting.future.done()
-
-
-def test_a_proposal_outlives_the_generator(url: str, bare: Path, petra: Person) -> None:
-    with rig.running(url) as generator:
-        proposed = Proposed(generator, goal(1), "op-1")
-        branch = proposed.branch
-        stands = head(bare, branch)
-    assert proposed.outcome() == "ShuttingDown"
-    with rig.running(url) as generator:
-        other = Proposed(generator, goal(2), "op-2").branch  # op-1 comes first, so it was handled
-        assert sorted(branches(bare)) == sorted([branch, other])
-        assert head(bare, branch) == stands, "the branch was pushed again"
-        assert generator.withdraw("op-1") is True, "the second generator must know the operation"
-        rig.wait_until(lambda: branches(bare) == [other], "the branch is deleted")
-
-
-@pytest.mark.parametrize("how", ["generator-runs", "merged-while-away", "rebased-while-away"])
-def test_two_proposals_from_one_tip_give_what_two_demands_give(
-    bare: Path, petra: Person, how: str
-) -> None:
-    """Both proposals change the same fusion. Once one proposal is merged, the other conflicts."""
-    one, two = goal(0, vehicle=0), goal(5, vehicle=1)
-    with rig.running(bare) as generator:
-        first, second = Proposed(generator, one, "op-1"), Proposed(generator, two, "op-2")
-        a, b = first.branch, second.branch
-        stood = head(bare, b)
-        if how == "generator-runs":
-            petra.merge(a, "--no-ff", "-m", "First")
-            assert first.outcome() == "booked"
-            rig.wait_until(lambda: head(bare, b) != stood, "the second branch is rebuilt")
-            petra.merge(b, "--no-ff", "-m", "Second")
-            assert second.outcome() == "booked"
-    if how == "merged-while-away":
-        petra.merge(a, "--no-ff", "-m", "First")
-        petra.merge(b, "--no-ff", "-m", "Second", "-X", "theirs")
-    elif how == "rebased-while-away":
-        petra.rebase(a)
-        petra.rebase(b, "-X", "theirs")
-    if how != "generator-runs":
-        with pytest.raises(AssertionError):
-            assert_rendered(bare)
-        assert rig.restart(bare) is True
-    assert rig.books(bare) == rig.books_after([one, two])
-    assert_rendered(bare)
-
-
-def test_a_proposal_that_still_fits_is_left_where_it_is(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    first = Proposed(generator, goal(1, vehicle=1)).branch
-    stood = head(bare, first)
-    petra.change({"inventory/README.md": "Ours"})
-    assert Proposed(generator, goal(2, vehicle=2)).branch != first
-    tip = rig.tip(bare)
-    rig.wait_until(lambda: str(generator.snapshot.commit) == tip, "the generator follows main")
-    assert head(bare, first) == stood
 
 
 def test_a_branch_that_a_person_works_on_is_left_to_them(
@@ -253,39 +186,6 @@ def test_a_branch_that_a_person_works_on_is_left_to_them(
     assert one.outcome() == "booked"
     assert rig.books(bare) == rig.books_after([goal(5, vehicle=1), goal(0, vehicle=0)])
     assert_rendered(bare)
-
-
-@pytest.mark.parametrize("made", [goal(1), put("d", 1)], ids=["join", "put"])
-def test_the_same_request_sent_twice_waits_on_one_branch(
-    bare: Path, petra: Person, generator: Generator, made: Any
-) -> None:
-    first = Proposed(generator, made)
-    stands = head(bare, first.branch)
-    second = Proposed(generator, made)
-    assert (second.branch, branches(bare)) == (first.branch, [first.branch])
-    assert head(bare, first.branch) == stands
-    petra.merge(first.branch)
-    assert (first.outcome(), second.outcome()) == ("booked", "booked")
-
-
-def test_a_release_of_what_waits_takes_the_branch_away(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    proposed = Proposed(generator, goal(1))
-    assert [proposed.branch] == branches(bare)
-    assert rig.book(generator, leave(1))[0].outcome == "released"
-    assert branches(bare) == []
-    assert proposed.outcome() == "Withdrawn"
-    assert rig.outcome(generator.submit(leave(1) | {"id": "another"})) == "not-held"
-
-
-def test_a_release_right_behind_the_demand_leaves_no_branch(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    with rig.busy(generator, goal(2)):
-        asked, gone = generator.submit(goal(1)), generator.submit(leave(1))
-    assert (rig.outcome(gone), rig.outcome(asked)) == ("released", "Withdrawn")
-    rig.wait_until(lambda: len(branches(bare)) == 1, "only the other demand waits")
 
 
 def test_a_put_of_the_same_demand_is_another_proposal_that_says_so(
@@ -308,55 +208,6 @@ def test_a_put_of_the_same_demand_is_another_proposal_that_says_so(
     [claim] = rig.claims(bare, "ApplicationClaim")
     assert "vehicle02" in rig.git(bare, "show", f"main:{claim}")
     assert rig.claims(bare, "vehicle01") == []
-
-
-def test_who_merges_what_was_approved_before_the_change_gets_just_that(
-    bare: Path, url: str, petra: Person
-) -> None:
-    """The branch is merged after the demand was changed, and before the generator deletes it."""
-    rig.hook(bare, "update", NO_DELETION)
-    with rig.running(url, fetch_interval=0.1) as generator:
-        first = Proposed(generator, put("d", 1), "op-1")
-        old = first.branch
-        second = Proposed(generator, put("d", 2), "op-2")
-        new = second.branch
-        assert sorted(branches(bare)) == sorted([old, new])
-        stood = head(bare, new)
-        petra.merge(old)
-        assert first.outcome() == "booked"
-        assert not second.ticket.future.done()
-        assert rig.claims(bare, "vehicle01") and not rig.claims(bare, "vehicle02")
-        rig.wait_until(lambda: head(bare, new) != stood, "the other one is rebuilt")
-        petra.merge(new)
-        assert second.outcome() == "booked"
-    assert rig.operations(bare) == ["op-1", "op-2"]
-
-
-def test_a_release_takes_away_what_was_replaced_too(bare: Path, url: str, petra: Person) -> None:
-    """Else somebody could merge the replaced branch after the release was answered."""
-    hook = rig.hook(bare, "update", NO_DELETION)
-    with rig.running(url, fetch_interval=0.1) as generator:
-        first = Proposed(generator, put("d", 1), "op-1")
-        assert [first.branch] == branches(bare)
-        second = Proposed(generator, put("d", 2), "op-2")
-        assert len({first.branch, second.branch}) == len(branches(bare)) == 2
-        hook.unlink()
-        assert rig.book(generator, RELEASE)[0].outcome == "released"
-        assert branches(bare) == []
-        assert (first.outcome(), second.outcome()) == ("Withdrawn", "Withdrawn")
-
-
-def test_a_change_that_is_taken_back_at_once_leaves_what_waited(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    first = Proposed(generator, put("d", 1), "op-1")
-    assert [first.branch] == branches(bare)
-    with rig.busy(generator, put("d", 2), "op-2") as changed:
-        generator.withdraw("op-2")
-    assert rig.outcome(changed) == "Withdrawn"
-    assert branches(bare) == [first.branch]
-    petra.merge(first.branch)
-    assert first.outcome() == "booked"
 
 
 def test_a_demand_that_main_would_place_elsewhere_is_another_proposal(
@@ -387,21 +238,6 @@ def test_a_demand_that_main_would_place_elsewhere_is_another_proposal(
         wait_until_none(bare)
     assert rig.operations(bare) == ["op-1"]
     rig.assert_sound(bare)
-
-
-def test_a_put_right_behind_a_release_is_proposed_anew(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    first = Proposed(generator, put("d", 1), "op-1")
-    before = first.branch
-    with rig.busy(generator, goal(2)):
-        released = generator.submit(RELEASE)
-        second = Proposed(generator, put("d", 2))
-    assert (rig.outcome(released), first.outcome()) == ("released", "Withdrawn")
-    assert second.branch in branches(bare)
-    assert before not in branches(bare)
-    petra.merge(second.branch)
-    assert second.outcome() == "booked"
 
 
 def test_a_lease_counts_from_the_merge(bare: Path, petra: Person, generator: Generator) -> None:
@@ -439,86 +275,6 @@ def test_a_merge_takes_back_nothing_of_a_lease_that_was_promised(
     petra.merge(proposed.branch)
     assert proposed.outcome() == "booked"
     assert before and lease() == replace(before, seconds=60)
-
-
-def test_a_demand_that_main_makes_impossible_is_refused_and_its_branch_goes(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    elsewhere = goal(5)
-    elsewhere["apps"][0]["header"]["node_id"] = "cloud"
-    one, two = Proposed(generator, goal(0)), Proposed(generator, elsewhere)
-    assert sorted([one.branch, two.branch]) == branches(bare)
-    petra.merge(one.branch)
-    assert (one.outcome(), two.outcome()) == ("booked", "conflict")
-    wait_until_none(bare)
-
-
-@pytest.mark.parametrize("squashed", [False, True])
-def test_what_was_merged_before_it_was_replaced_is_booked(
-    bare: Path, petra: Person, generator: Generator, squashed: bool
-) -> None:
-    """The person merges ``first`` before the generator decides ``second``."""
-    first = Proposed(generator, put("d", 1), "op-1")
-    branch = first.branch
-    with rig.busy(generator, put("d", 2), "op-2") as second:
-        if squashed:
-            petra.squash(branch, "Without trailers")
-            petra.delete(branch)
-        else:
-            petra.merge(branch)
-    assert first.outcome() == "booked"
-    assert not second.future.done()
-    rig.assert_sound(bare)
-
-
-@pytest.mark.parametrize("replaced", [False, True])
-def test_a_branch_that_cannot_be_rebuilt_or_deleted_can_still_be_merged(
-    bare: Path, url: str, petra: Person, replaced: bool
-) -> None:
-    with rig.running(url, fetch_interval=0.1) as generator:
-        proposed = Proposed(generator, put("d", 1), "op-1")
-        branch = proposed.branch
-        rig.hook(bare, "update", NO_PUSH)
-        if replaced:
-            generator.submit(put("d", 2), "op-2")
-        else:
-            petra.override(two=override({"services": ["*"]}, replicas=2))
-        failed = f"rebuilding {branch}"
-        rig.wait_until(lambda: failed in generator.failures, "the push is denied")
-        assert not proposed.ticket.future.done()
-        petra.merge(branch)
-        assert proposed.outcome() == "booked"
-    assert rig.operations(bare) == ["op-1"]
-
-
-def test_what_replaced_a_proposal_waits_on_after_two_restarts(
-    bare: Path, url: str, petra: Person
-) -> None:
-    with rig.running(url) as generator:
-        old = Proposed(generator, put("d", 1), "op-1").branch
-        hook = rig.hook(bare, "update", NO_DELETION)
-        branch = Proposed(generator, put("d", 2), "op-2").branch
-        rig.wait_until(lambda: generator.failures, "the deletion is denied")
-    assert sorted(branches(bare)) == sorted([old, branch])
-    hook.unlink()
-    with rig.running(url):
-        rig.wait_until(lambda: branches(bare) == [branch], "the replaced branch is deleted")
-    assert rig.restart(url)
-    petra.merge(branch)
-    assert rig.restart(url)
-    assert rig.operations(bare) == ["op-2"]
-
-
-def test_a_policy_that_asks_no_more_lets_what_waits_through(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    proposed = Proposed(generator, goal(1), "op-1")
-    assert [proposed.branch] == branches(bare)
-    petra.policy(approval="none")
-    assert proposed.outcome() == "booked"
-    assert branches(bare) == []
-    assert rig.operations(bare) == ["op-1"]
-    rig.assert_sound(bare)
 
 
 # ---- what the server is told, and what it tells ----
@@ -618,28 +374,6 @@ def test_one_taken_back_while_the_remote_is_away_goes_when_it_is_back(
             assert branches(bare) == []
     with rig.running(http):
         wait_until_none(bare)
-
-
-def test_what_a_request_adds_while_it_waits_is_proposed_beside_it(
-    bare: Path, petra: Person, generator: Generator
-) -> None:
-    """The second join adds to the first, whose branch a person may have approved already."""
-    more = goal(1, vehicle=2) | {"connections": []}
-    first = Proposed(generator, goal(1), "op-1")
-    branch = first.branch
-    stands = head(bare, branch)
-    second = Proposed(generator, more, "op-2")
-    assert sorted([branch, second.branch]) == sorted(branches(bare))
-    assert head(bare, branch) == stands
-    petra.merge(branch)
-    assert first.outcome() == "booked"
-    rig.wait_until(
-        lambda: git(bare, "merge-base", "main", second.branch) == stands,
-        "the second branch is rebuilt on the first",
-    )
-    petra.merge(second.branch)
-    assert second.outcome() == "booked"
-    assert rig.books(bare) == rig.books_after([goal(1), more])
 
 
 @pytest.mark.parametrize("deletes", [False, True])

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pytest
 from demandops.serve import worker
-from demandops.serve.generator import Generator
 
 from tests.kit import rig
-from tests.kit.rig import goal, leave
+from tests.kit.rig import goal
 
 
 @pytest.fixture
@@ -67,13 +66,3 @@ def test_a_lone_demand_is_pushed_at_once_and_what_changes_nothing_never(
         assert (again.outcome, again.commit) == ("unchanged", rig.tip(bare))
         assert rig.outcome(generator.submit(rig.impossible())) == "unknown-node"
     assert _count(pushes) == 3
-
-
-def test_a_batch_is_judged_in_order_a_release_behind_its_join_finds_it(
-    generator: Generator, bare: Path
-) -> None:
-    with rig.busy(generator, goal(0)):
-        tickets = [generator.submit(made) for made in (goal(1), goal(1), leave(1), goal(1))]
-    assert [*map(rig.outcome, tickets)] == ["booked", "unchanged", "released", "booked"]
-    assert rig.books(bare) == rig.books_after([goal(0), goal(1)])
-    rig.assert_sound(bare)

@@ -7,10 +7,8 @@ every commit verifies.
 
 from __future__ import annotations
 
-import logging
 import threading
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -22,24 +20,12 @@ from tests.kit import rig
 from tests.kit.cli import Run
 from tests.kit.git_over_http import Server
 from tests.kit.repo import read as file_of
-from tests.kit.rig import Person, Stages, goal, leave
+from tests.kit.rig import Person, Stages, goal
 
 NODES, CLUSTERS = "inventory/nodes.yaml", "inventory/clusters.yaml"
 BROKERS, CHARTS = "inventory/brokers.yaml", "registry/charts.yaml"
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 SOON_S = 0.1
-
-
-@pytest.fixture
-def place(request: pytest.FixtureRequest, bare: Path) -> str:
-    """The address of the state repo: its path, its file URL or its URL at the Git server."""
-    if request.param == "embedded":
-        return str(bare)
-    return bare.as_uri() if request.param == "file-url" else request.getfixturevalue("http")
-
-
-def claim_of(bare: Path, who: str) -> str:
-    return next(path for path in rig.claims(bare, who) if "applications" in path)
 
 
 def edited(bare: Path, path: str, old: str, new: str) -> dict[str, str | None]:
@@ -66,176 +52,12 @@ def problems(bare: Path) -> list[dict[str, str]]:
     return list(data["problems"])
 
 
-# ---- honoured ----
-
-
-def _move_node(bare: Path) -> dict[str, str | None]:
-    before, _, rest = file_of(bare, NODES).partition("  - id: vehicle01\n")
-    moved = rest.replace("cluster: c-its", "cluster: garage", 1)
-    clusters = file_of(bare, CLUSTERS) + "  - name: garage\n"
-    return {NODES: f"{before}  - id: vehicle01\n{moved}", CLUSTERS: clusters}
-
-
 def _move_broker(bare: Path) -> dict[str, str | None]:
     return edited(bare, BROKERS, "service-mqtt-broker-edge", "elsewhere")
 
 
-def _bump_chart(bare: Path) -> dict[str, str | None]:
-    metadata = "appdefs/object-detection-fusion/charts/object-fusion/Chart.yaml"
-    version = yaml.safe_load(file_of(bare, metadata))["version"]
-    before, name, rest = file_of(bare, CHARTS).partition("object-fusion")
-    registry = before + name + rest.replace(f"{version}", "9.8.7", 1)
-    changed = edited(bare, metadata, f"version: {version}", "version: 9.8.7")
-    return changed | {CHARTS: registry}
-
-
-CHANGES: dict[str, Any] = {
-    "deleted-claim": (
-        "embedded",
-        lambda bare: dict.fromkeys(rig.claims(bare, "user1")),
-        lambda text: "user1" not in text,
-    ),
-    "edited-claim": (
-        "file-url",
-        lambda bare: edited(bare, claim_of(bare, "user1"), "/vehicle01/ego_data", "/another"),
-        lambda text: "/vehicles/another" in text,
-    ),
-    "moved-node": ("http", _move_node, lambda text: "garage" in text),
-    "bumped-chart": ("file-url", _bump_chart, lambda text: "9.8.7" in text),
-}
-"""Maps a change to the kind of address that it is tested with, a function that returns the changed
-files, and a check of the result, which does not depend on the address."""
-
-
-def _everything(bare: Path) -> str:
-    """Return all files below clusters/ and ledger/ as one text, each line with its path."""
-    return rig.git(bare, "grep", "", "main", "--", "clusters", "ledger")
-
-
-@pytest.mark.parametrize(
-    ("place", "change"), [(CHANGES[name][0], name) for name in CHANGES], indirect=["place"]
-)
-def test_a_change_is_honoured_without_any_demand(
-    place: str, bare: Path, person: Person, change: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO, logger="demandops")
-    _, make, holds = CHANGES[change]
-    with rig.running(place, fetch_interval=SOON_S) as generator:
-        rig.book(generator, goal(1), goal(2))
-        made = person.change(make(bare), f"A {change}")
-        commit = followed(bare, made)
-        assert commit.one("Caused-By") == f"{made} Petra Platform <petra@example.org>"
-        assert holds(_everything(bare))
-        by_petra = rig.git(bare, "log", "--author=<petra@example.org>", "--format=%H", "main")
-        assert by_petra.splitlines() == [commit.id, made]
-        committer = rig.git(bare, "log", "-1", "--format=%cn", commit.id)
-        assert committer == "DemandOps generator"
-        rig.book(generator, goal(3))
-        assert holds(_everything(bare)), "the change must hold after a further demand"
-    assert caplog.text.count(f"after commit {made[:12]}") == 1
-    rig.assert_sound(bare)
-
-
-# ---- broken ----
-
-
-def _claim_on_no_node(bare: Path) -> dict[str, str | None]:
-    return edited(bare, claim_of(bare, "user1"), "node: edge\n", "node: nowhere\n")
-
-
 def _node_on_no_cluster(bare: Path) -> dict[str, str | None]:
     return edited(bare, NODES, "cluster: c-its", "cluster: c-itz")
-
-
-BREAKS: dict[str, Any] = {
-    "claim-that-does-not-parse": (
-        "embedded",
-        lambda bare: {claim_of(bare, "user1"): "requesters: nobody\n"},
-        "ledger/applications/",
-    ),
-    "claim-on-an-unknown-node": ("file-url", _claim_on_no_node, "ledger/applications/"),
-    "node-in-use-gone": ("file-url", rig.without_vehicle01, NODES),
-    "appdef-in-use-gone": ("embedded", lambda bare: {APPDEF: None}, APPDEF),
-}
-
-
-@pytest.mark.parametrize(
-    ("address", "change"), [(BREAKS[name][0], name) for name in BREAKS], indirect=["address"]
-)
-def test_a_broken_change_is_reported_with_its_commit_until_it_is_mended(
-    address: str, bare: Path, person: Person, change: str, caplog: pytest.LogCaptureFixture
-) -> None:
-    _, make, where = BREAKS[change]
-    with rig.running(address, fetch_interval=SOON_S) as generator:
-        rig.book(generator, goal(1), goal(2))
-        broken = make(bare)
-        mended = {path: file_of(bare, path) for path in broken}
-        standing = rig.git(bare, "rev-parse", "main:clusters")
-        made = person.change(broken, "A merge gone wrong")
-        followed(bare, made)
-        told = problems(bare)
-        assert told and all(problem["since"] == made for problem in told)
-        assert {problem["author"] for problem in told} == {"Petra Platform <petra@example.org>"}
-        assert all(problem["file"].startswith(where) for problem in told), told
-        rig.wait_until(lambda: generator.snapshot.problems, "diagnostics show the change")
-        assert rig.git(bare, "rev-parse", "main:clusters") == standing
-        report = rig.git(bare, "rev-parse", f"main:{last_valid_config.PATH}")
-        rig.book(generator, goal(3), goal(6), leave(3))
-        assert rig.git(bare, "rev-parse", f"main:{last_valid_config.PATH}") == report, (
-            "a demand must not change the report"
-        )
-        assert [c.one("Operation") for c in rig.commits(bare)][-3:] == ["join", "join", "shutdown"]
-        logged = [r.getMessage() for r in caplog.records if r.levelname == "ERROR"]
-        assert len(logged) == len(set(logged)) == len(told)
-        followed(bare, person.change(mended, "Mend it"))
-        assert problems(bare) == []
-        rig.wait_until(lambda: not generator.snapshot.problems, "diagnostics show the change")
-    assert rig.books(bare) == rig.books_after([goal(1), goal(2), goal(6)])
-    rig.assert_sound(bare)
-
-
-def test_a_problem_that_stands_at_a_restart_is_reported_no_second_time(
-    url: str, bare: Path, person: Person
-) -> None:
-    with rig.running(url, fetch_interval=SOON_S) as generator:
-        rig.book(generator, goal(1), goal(2))
-        followed(bare, person.change(_claim_on_no_node(bare), "Nowhere"))
-        rig.book(generator, goal(6))  # for the application of goal 1
-    tip = rig.tip(bare)
-    with rig.running(url, fetch_interval=SOON_S) as generator:
-        rig.wait_until(lambda: generator.snapshot.problems, "the generator sees the problem again")
-        assert rig.tip(bare) == tip
-        assert rig.book(generator, leave(6))[0].outcome == "released"
-    rig.assert_sound(bare)
-
-
-def test_a_report_that_a_person_removes_or_edits_is_put_right(bare: Path, person: Person) -> None:
-    with rig.running(bare, fetch_interval=SOON_S) as generator:
-        rig.book(generator, goal(1))
-        made = person.change(_node_on_no_cluster(bare), "A merge gone wrong")
-        followed(bare, made)
-        report = file_of(bare, last_valid_config.PATH)
-        followed(bare, person.change({last_valid_config.PATH: None}, "No reports, please"))
-        assert file_of(bare, last_valid_config.PATH) == report
-        followed(
-            bare, person.change({last_valid_config.PATH: "problems: [{file: x}, 3]\n"}, "Mine")
-        )
-        assert file_of(bare, last_valid_config.PATH) == report
-    rig.assert_sound(bare)
-
-
-def test_several_peoples_commits_are_all_named_and_a_readme_is_not(
-    url: str, bare: Path, person: Person
-) -> None:
-    with rig.running(url) as generator:
-        rig.book(generator, goal(1))
-        first = person.change(_move_broker(bare), "Elsewhere")
-        person.change({"README.md": "Ours\n"}, "Say whose it is")
-        second = person.edit(BROKERS, "elsewhere", "somewhere")
-        rig.book(generator, goal(2))
-    (commit,) = [c for c in rig.commits(bare) if c.one("Operation") == "follow"]
-    named = [value.split()[0] for key, value in commit.trailers if key == "Caused-By"]
-    assert named == [first, second]
 
 
 def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from random import Random
 
 import pytest
 from demandops.repo.write.journal import DamagedJournal
+from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -156,6 +157,20 @@ def test_a_demand_that_is_refused_around_a_kill_is_refused_in_the_log(
     told = rf"demand op-wrong \('demand-0'\) from the journal: refused: {reason}"
     assert re.search(told, caplog.text)
     assert sorted(rig.operations(bare)) == ["op-opening", "op-right"]
+
+
+def test_a_rollback_that_a_crash_left_in_the_journal_is_carried_out_at_the_next_start(
+    bare: Path, drivers: Drivers
+) -> None:
+    with rig.running(bare) as generator:
+        rig.book(generator, goal(1))
+        to, then = rig.tip(bare), rig.books(bare)
+        rig.book(generator, goal(2))
+    back = evaluation.goal(to, drop_newer=True, reason="a test", who=("A", "a@example.org"))
+    drivers.start(bare, [[demand("back", back)]], die_at="journaled").listen()
+    assert rig.books(bare) != then
+    assert rig.restart(bare)
+    assert rig.books(bare) == then
 
 
 # ---- what was released stays released ----

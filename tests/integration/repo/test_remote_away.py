@@ -11,32 +11,9 @@ from demandops.base.errors import StateRepoError
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
-from tests.kit.rig import Person, Stages, goal
+from tests.kit.rig import Person, goal
 
 # ---- away and back ----
-
-
-def test_goals_stay_open_while_the_remote_is_away_and_are_published_once_it_is_back(
-    url: str, bare: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    with rig.running(url) as generator:
-        rig.book(generator, goal(0))
-        with rig.away(bare):
-            stages = Stages()
-            tickets = [generator.submit(goal(1), listener=stages)]
-            rig.wait_until(lambda: "committed" in stages.names, "the first demand is committed")
-            tickets += [generator.submit(goal(number)) for number in (2, 3)]
-            rig.wait_until(lambda: "trying again" in caplog.text, "the generator tries again")
-            assert not any(ticket.future.done() for ticket in tickets)
-        receipts = [rig.receipt(ticket) for ticket in tickets]
-    assert [receipt.commit for receipt in receipts] == [commit.id for commit in rig.commits(bare)][
-        1:
-    ]
-    assert stages.names == ["admitted", "booked", "committed", "away", "pushed"], (
-        "each stage must be told once"
-    )
-    assert rig.books(bare) == rig.books_after(map(goal, range(4)))
-    rig.assert_sound(bare)
 
 
 def test_a_start_while_the_remote_is_away_goes_on_from_what_was_fetched_last(
@@ -68,50 +45,6 @@ def test_without_a_clone_a_remote_that_is_away_is_told_at_once(bare: Path) -> No
 
 
 # ---- denied ----
-
-
-@pytest.mark.parametrize("name", ["pre-receive", "update"])
-def test_a_declined_push_fails_the_demand_with_the_hooks_words_and_leaves_no_trace(
-    url: str, bare: Path, name: str
-) -> None:
-    with rig.running(url) as generator:
-        rig.book(generator, goal(0))
-        hook = rig.hook(bare, name, "echo 'main is frozen until Monday' >&2; exit 1")
-        with pytest.raises(StateRepoError, match="main is frozen until Monday"):
-            rig.receipt(generator.submit(goal(1), "op-denied"))
-        hook.unlink()
-        rig.book(generator, goal(2))
-    assert "op-denied" not in rig.operations(bare)
-    assert rig.claims(bare, "user1") == []
-    assert rig.books(bare) == rig.books_after([goal(0), goal(2)])
-    tip = rig.tip(bare)
-    assert rig.restart(url) is True
-    assert rig.tip(bare) == tip, "the journal must not have the declined demand"
-    rig.assert_sound(bare)
-
-
-def test_a_rejected_push_is_told_to_its_batch_and_a_refusal_to_the_refused_demand(
-    url: str, bare: Path
-) -> None:
-    """``moved`` contradicts ``goal(2)`` of the same batch, but the batch is never published.
-
-    So ``moved`` must fail because of the push, and not because of the contradiction.
-    """
-    hook = rig.hook(bare, "pre-receive", "echo 'not today' >&2; exit 1")
-    moved = goal(7)
-    moved["apps"][0]["header"] = {"id": "edge/fusion-2", "node_id": "cloud"}
-    with rig.running(url) as generator:
-        with rig.busy(generator, goal(1)) as first:
-            refused = generator.submit(rig.impossible())
-            others = [generator.submit(made) for made in (goal(2), goal(3), moved)]
-        for ticket in (first, *others):
-            with pytest.raises(StateRepoError, match="rejects the push"):
-                rig.receipt(ticket)
-        assert rig.outcome(refused) == "unknown-node"
-        hook.unlink()
-        rig.book(generator, goal(4))
-    assert rig.books(bare) == rig.books_after([goal(4)])
-    rig.assert_sound(bare)
 
 
 def test_the_requester_or_the_log_is_told_that_the_remote_cannot_take_a_push(
