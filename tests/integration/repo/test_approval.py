@@ -6,7 +6,6 @@ The tests run git in the person's place: merges, squashes, rebases, deleted bran
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
 from datetime import datetime
@@ -85,34 +84,6 @@ def test_a_demand_that_needs_approval_waits_on_a_branch_and_the_merge_completes_
     assert rig.books(bare) == rig.books_after([goal(1)])
     assert rig.restart(address) is True
     assert rig.tip(bare) == commit.id, "a fast-forward merge must need no further commit"
-
-
-@pytest.mark.parametrize(
-    ("way", "moved"),
-    [
-        pytest.param(lambda p, b: p.merge(b, "--no-ff", "-m", "Merge it"), True, id="merge-commit"),
-        pytest.param(lambda p, b: p.squash(b, "Its trailers are lost"), True, id="squash"),
-        pytest.param(
-            lambda p, b: p.squash(b, f"Squashed\n\n{git(p.bare, 'log', '-1', '--format=%B', b)}"),
-            False,
-            id="squash-with-trailers",
-        ),
-        pytest.param(Person.rebase, False, id="rebase"),
-        pytest.param(Person.rebase, True, id="rebase-main-moved-on"),
-    ],
-)
-def test_however_it_is_merged_the_demand_is_booked_and_the_files_fit(
-    bare: Path, petra: Person, generator: Generator, way: Callable[..., None], moved: bool
-) -> None:
-    proposed = Proposed(generator, goal(1), "op-1")
-    branch = proposed.branch
-    if moved:
-        petra.change({"inventory/README.md": "Ours"})
-    way(petra, branch)
-    assert proposed.outcome() == "booked"
-    wait_until_none(bare)
-    assert rig.books(bare) == rig.books_after([goal(1)])
-    assert_rendered(bare)
 
 
 def test_a_requester_may_have_only_so_many_proposals(

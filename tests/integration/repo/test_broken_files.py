@@ -16,14 +16,13 @@ import pygit2
 import pytest
 import yaml
 from demandops.base.errors import InvalidInput
-from demandops.base.settings import GENERATED_ROOTS, RENDER_VERSION
+from demandops.base.settings import GENERATED_ROOTS
 from demandops.repo.history import commit_message
 from demandops.repo.load import snapshot, state_in_effect
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.chance import IN_FULL
-from tests.kit.cli import Run
 from tests.kit.config import override
 from tests.kit.repo import FORGER
 from tests.kit.repo import read as text
@@ -279,61 +278,3 @@ def test_after_people_squash_the_history_a_start_needs_valid_files_and_no_more(
         rig.book(generator, goal(4))
         assert values(bare)[0] == "v2"
     rig.assert_sound(bare, verify_last=2)
-
-
-ROOT = "demandops.yaml"
-VERSION = f"renderVersion: {RENDER_VERSION}"
-MISTAKES: dict[str, Callable[[str], str | None]] = {
-    shown: lambda root, old=old, new=new: root.replace(old, new)  # type: ignore[misc]
-    for shown, (old, new) in {
-        "negative": (VERSION, "renderVersion: -1"),
-        "lower": (VERSION, f"renderVersion: {RENDER_VERSION - 1}"),
-        "higher": (VERSION, f"renderVersion: {RENDER_VERSION + 1}"),
-        "5000 digits": (VERSION, f"renderVersion: {'9' * 5000}"),
-        "true": (VERSION, "renderVersion: true"),
-        "nothing": (VERSION, "renderVersion:"),
-        "unknown gitops": ("gitops: flux", "gitops: helm"),
-        "another schema": ("demandops/v1", "demandops/v99"),
-    }.items()
-} | {"empty": lambda root: "", "no text": lambda root: "\0", "deleted": lambda root: None}
-
-
-@pytest.mark.parametrize("mistake", MISTAKES)
-def test_no_mistake_in_the_settings_stops_demands(
-    bare: Path, person: Person, tmp_path: Path, demandops: Run, mistake: str
-) -> None:
-    """A running generator and a restarted one both keep what was in effect before."""
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-        person.change({ROOT: MISTAKES[mistake](person.read(ROOT))})
-        rig.book(generator, goal(2))
-        assert any(each.file == ROOT for each in generator.snapshot.problems)
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(3))
-        assert any(each.file == ROOT for each in generator.snapshot.problems)
-    person.fetch()
-    checked = demandops("check", person.folder, "--output", "json")
-    assert checked.code == 1
-    assert ROOT in checked.out
-
-
-def test_no_file_in_the_ledger_stops_demands(bare: Path, person: Person, demandops: Run) -> None:
-    """A claim of a schema that no program wrote, and folders that DemandOps does not have."""
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-        path = rig.claims(bare)[0]
-        newer = text(bare, path).replace("demandops.ledger/v2", "demandops.ledger/v99")
-        edit = dict.fromkeys(
-            ("ledger/placements/aa/some.yaml", "ledger/new/some.yaml"), "kind: Unknown\n"
-        )
-        edit[path] = newer
-        person.fetch()
-        for place, content in edit.items():
-            (person.folder / place).parent.mkdir(parents=True, exist_ok=True)
-            (person.folder / place).write_text(content)
-        checked = demandops("check", person.folder, "--output", "json")
-        assert checked.code == 1
-        assert {each["file"] for each in checked.json()["faults"]} == {*edit}
-        person.change(edit)
-        rig.book(generator, goal(2))
-        assert generator.snapshot.quarantined_files == (path,)

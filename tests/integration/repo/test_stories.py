@@ -14,6 +14,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.decide.state import rendered_files
+from demandops.repo.pull_request import merge_check
 from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
@@ -171,6 +172,10 @@ class Story:
     def squash(self, name: str) -> None:
         self._person.squash(self._sent[name].branch, "Without trailers")
 
+    def squash_with_trailers(self, name: str) -> None:
+        text = rig.git(self._bare, "log", "-1", "--format=%B", self._sent[name].branch)
+        self._person.squash(self._sent[name].branch, f"Squashed\n\n{text}")
+
     def delete(self, name: str) -> None:
         self._person.delete(self._sent[name].branch)
 
@@ -308,6 +313,12 @@ class Story:
         found = [fault.file for fault in self._generator.snapshot.problems]
         assert {f for f in files if any(one.startswith(f) for one in found)} == {*files}, found
         assert all(one.startswith((*files,)) for one in found), found
+
+    def check_tells(self, files: list[str]) -> None:
+        """Check in which files `demandops check` finds faults once the last change is merged."""
+        self._person.fetch()
+        faults = merge_check.check(self._person.folder).faults
+        assert {fault.file for fault in faults} == {*files}
 
     def fails(self, what: str) -> None:
         assert any(name.startswith(what) for name in self._generator.failures)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 from demandops.repo import reader
 from demandops.repo.verification import Verdict
-from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
@@ -63,19 +62,6 @@ def test_a_held_file_must_equal_the_file_of_the_commit_before(
     assert (made.holds, made.differing) == (False, (path,))
 
 
-def test_a_held_file_that_a_person_edited_is_what_the_next_commits_start_from(
-    generator: Generator, bare: Path, person: Person
-) -> None:
-    rig.book(generator, rig.goal(1), rig.goal(3))
-    person.override(frozen=HOLD)
-    rig.book(generator, rig.goal(2))
-    path = fusion(bare)
-    person.change({path: file(bare, path).replace("replicas: 1", "replicas: 2")})
-    rig.book(generator, rig.leave(2), rig.goal(4))
-    assert "replicas: 2" in file(bare, path)
-    assert all_hold(bare)
-
-
 def test_a_claim_that_is_kept_is_accounted_for_by_its_override(
     generator: Generator, bare: Path, person: Person
 ) -> None:
@@ -89,46 +75,3 @@ def test_a_claim_that_is_kept_is_accounted_for_by_its_override(
     assert path in forged(bare, person, generator, path, other, trailer).touched
     trailer += "\nOverride: overrides/lasting.yaml"
     assert path not in forged(bare, person, generator, path, text, trailer).touched
-
-
-def test_rolling_back_leaves_to_overrides_what_they_keep(
-    generator: Generator, bare: Path, person: Person
-) -> None:
-    rig.book(generator, rig.goal(1))
-    asked = rig.tip(bare)
-    person.override(lasting=KEEP)
-    rig.book(generator, rig.leave(1))
-    kept = rig.tip(bare)
-
-    def back(to: str, *, drop_newer: bool = False) -> tuple[str, int]:
-        """Roll back; return the outcome, and how many claims the override keeps then."""
-        goal = evaluation.goal(to, drop_newer=drop_newer, reason="x", who=WHO)
-        outcome = rig.receipt(generator.submit(goal)).outcome
-        return outcome, len(rig.claims(bare, "override:lasting"))
-
-    # a claim that an override keeps is not newer, and a demand takes over from the override
-    assert back(asked) == ("restored", 0)
-    rig.book(generator, rig.leave(1))
-    assert back(kept) == ("unchanged", 1)
-    person.override(lasting=None)
-    rig.book(generator, rig.goal(2), rig.leave(2))
-    assert back(kept) == ("unchanged", 0)
-    person.override(lasting=KEEP)
-    rig.book(generator, rig.goal(2), rig.leave(2))
-    assert back(kept, drop_newer=True) == ("restored", 2)
-    assert all_hold(bare)
-
-
-def test_rolling_back_leaves_the_markers_alone(
-    generator: Generator, bare: Path, person: Person
-) -> None:
-    rig.book(generator, rig.goal(1))
-    before = rig.tip(bare)
-    expired = override({"nodes": ["edge"]}, keep=True, expires="2020-01-01T00:00:00Z")
-    person.override(brief=expired)
-    rig.book(generator, rig.leave(1))
-    marker = file(bare, "ledger/overrides/brief.yaml")
-    goal = evaluation.goal(before, drop_newer=False, reason="x", who=WHO)
-    assert rig.receipt(generator.submit(goal)).outcome == "restored"
-    assert file(bare, "ledger/overrides/brief.yaml") == marker
-    rig.assert_sound(bare)
