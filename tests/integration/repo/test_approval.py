@@ -282,16 +282,6 @@ def test_gitlab_is_asked_for_a_merge_request_by_push_options_if_it_takes_them(
         assert "Why: request 'demand-1', received" in description
 
 
-def test_a_server_that_refuses_the_branch_is_told_to_the_requester(
-    url: str, bare: Path, petra: Person
-) -> None:
-    rig.hook(bare, "pre-receive", "echo 'no branches here' >&2; exit 1")
-    refused = pytest.raises(StateRepoError, match=r"rejects the push: .*no branches here")
-    with rig.running(url) as generator, refused:
-        rig.receipt(generator.submit(goal(1)))
-    assert branches(bare) == []
-
-
 def test_a_branch_called_demand_is_told_to_the_requester_and_delays_nothing(
     address: str, bare: Path, petra: Person
 ) -> None:

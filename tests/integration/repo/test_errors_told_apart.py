@@ -25,10 +25,8 @@ from demandops.repo.git.repository import (
     disk_error,
 )
 from demandops.repo.git.signing import create_commit
-from demandops.repo.git.tree import commit_of
 from demandops.repo.history.commit_message import generator_signature
 from demandops.serve.generator import Generator
-from pygit2 import Oid, Repository
 
 from tests.kit import rig
 from tests.kit.cli import Run
@@ -300,11 +298,6 @@ def test_a_failure_of_a_disk_is_no_refusal_by_the_remote(
     error = repository.push_error(gitpython.GitCommandError(["push"], 1, words.encode()))
     assert isinstance(error, RemoteAway)
     assert str(error) == f"{url} cannot be pushed to: {reason}"
-
-
-def test_a_commit_that_is_not_there_is_no_mistake_of_a_person(bare: Path) -> None:
-    with pytest.raises(StateRepoError, match=r"a{40} cannot be read; check the disk"):
-        commit_of(Repository(str(bare)), Oid(hex="a" * 40))
 
 
 def lose(repo: Path, tmp_path: Path, spec: str) -> str:

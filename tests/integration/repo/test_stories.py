@@ -113,9 +113,6 @@ class Story:
     def passes(self, seconds: float) -> None:
         self._clock.pass_(seconds)
 
-    def set_clock_by(self, seconds: float) -> None:
-        self._clock.set_by(seconds)
-
     # ---- demands ----
 
     def book(self, demands: list[Any]) -> None:

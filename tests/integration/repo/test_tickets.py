@@ -24,24 +24,9 @@ from tests.kit import rig
 from tests.kit.clock import Clock
 from tests.kit.goals import put
 from tests.kit.limits import files_end_at
-from tests.kit.rig import Drivers, Stages, demand, goal
+from tests.kit.rig import Drivers, demand, goal
 
 # ---- withdrawals ----
-
-
-def test_a_demand_that_waits_can_be_taken_back_and_leaves_no_trace(
-    address: str, bare: Path
-) -> None:
-    with rig.running(address) as generator:
-        with rig.busy(generator, goal(1), "op-1"):
-            stages = Stages()
-            ticket = generator.submit(goal(2), "op-2", stages)
-            assert generator.withdraw("op-2") is True
-            assert generator.withdraw("op-2") is True, "a second withdrawal must do no harm"
-        assert rig.outcome(ticket) == "Withdrawn"
-    assert (rig.claims(bare, "user2"), stages.names) == ([], [])
-    assert rig.restart(address) is True
-    assert rig.operations(bare) == ["op-1"]
 
 
 @pytest.mark.parametrize(
