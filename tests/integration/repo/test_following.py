@@ -1,8 +1,6 @@
 """A running generator follows what people merge, even if no demand comes.
 
-The generator uses the state repo by its path, by a file URL or by smart HTTP. No test
-measures time: each wait ends with the expected event. Tests repair every file that they break, and
-every commit verifies.
+No test measures time: each wait ends with the expected event.
 """
 
 from __future__ import annotations
@@ -11,53 +9,23 @@ import threading
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops.base.errors import QueueFull
-from demandops.repo.load import last_valid_config
 from demandops.serve.generator import Generator
 
 from tests.kit import rig
 from tests.kit.cli import Run
 from tests.kit.git_over_http import Server
-from tests.kit.repo import read as file_of
 from tests.kit.rig import Person, Stages, goal
 
-NODES, CLUSTERS = "inventory/nodes.yaml", "inventory/clusters.yaml"
-BROKERS, CHARTS = "inventory/brokers.yaml", "registry/charts.yaml"
-APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
-SOON_S = 0.1
+NODES, SOON_S = "inventory/nodes.yaml", 0.1
 
 
-def edited(bare: Path, path: str, old: str, new: str) -> dict[str, str | None]:
-    text = file_of(bare, path)
-    assert old in text
-    return {path: text.replace(old, new, 1)}
-
-
-def newest(bare: Path) -> rig.Commit:
-    return rig.commits(bare)[-1]
-
-
-def followed(bare: Path, made: str) -> rig.Commit:
-    """Wait until the generator has followed a person's commit; return the generator's commit."""
-    rig.wait_until(lambda: newest(bare).id != made, "the generator follows")
+def followed(bare: Path, made: str) -> str:
+    """Wait until a generator has followed a person's commit; return the generator's commit."""
+    rig.wait_until(lambda: rig.tip(bare) != made, "the generator follows")
     (commit,) = [c for c in rig.commits(bare, f"{made}..main") if c.one("Operation") == "follow"]
     assert commit.one("Follows") == made
-    return commit
-
-
-def problems(bare: Path) -> list[dict[str, str]]:
-    text = rig.git(bare, "show", f"main:{last_valid_config.PATH}", check=False)
-    data = yaml.safe_load(text) if "problems:" in text else {"problems": []}
-    return list(data["problems"])
-
-
-def _move_broker(bare: Path) -> dict[str, str | None]:
-    return edited(bare, BROKERS, "service-mqtt-broker-edge", "elsewhere")
-
-
-def _node_on_no_cluster(bare: Path) -> dict[str, str | None]:
-    return edited(bare, NODES, "cluster: c-its", "cluster: c-itz")
+    return commit.id
 
 
 def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> None:
@@ -67,11 +35,12 @@ def test_off_means_off(url: str, bare: Path, person: Person, tmp_path: Path) -> 
     ):
         rig.book(off, goal(1))
         known = str(off.snapshot.commit)
-        commit = followed(bare, person.change(_move_broker(bare)))
-        rig.wait_until(lambda: str(on.snapshot.commit) == commit.id, "the other generator follows")
+        made = person.edit("inventory/brokers.yaml", "service-mqtt-broker-edge", "elsewhere")
+        commit = followed(bare, made)
+        rig.wait_until(lambda: str(on.snapshot.commit) == commit, "the other generator follows")
         assert str(off.snapshot.commit) == known
         off.fetch_now()  # as after a webhook's call
-        rig.wait_until(lambda: str(off.snapshot.commit) == commit.id, "the generator follows now")
+        rig.wait_until(lambda: str(off.snapshot.commit) == commit, "the generator follows now")
 
 
 # ---- the remote is slow, or away ----
@@ -156,7 +125,7 @@ def test_views_go_on_while_something_is_not_valid_and_say_so(
 ) -> None:
     with rig.running(bare, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
-        made = person.change(_node_on_no_cluster(bare), "A merge gone wrong")
+        made = person.edit(NODES, "cluster: c-its", "cluster: c-itz")
         followed(bare, made)
     status = demandops("status", "--state-repo", bare)
     problem = status.out.splitlines()[1].strip()

@@ -11,7 +11,6 @@ from demandops.base.errors import StateRepoError
 from tests.kit import rig
 from tests.kit.rig import Person, goal
 
-NODES = "inventory/nodes.yaml"
 BROKERS = "inventory/brokers.yaml"
 OLD_BROKER, NEW_BROKER = "service-mqtt-broker-edge", "broker-of-the-edge"
 

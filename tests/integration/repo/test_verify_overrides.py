@@ -16,7 +16,6 @@ from tests.kit.rig import Person
 
 HOLD = override({"services": ["object-fusion"]}, hold=True)
 KEEP = override({"applications": ["edge/*"]}, keep=True)
-WHO = ("A", "a@example.org")
 
 
 def verdicts(bare: Path) -> dict[str, Verdict]:

@@ -21,7 +21,6 @@ from tests.kit.turns import Turns
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 NODES, DOMAINS = "inventory/nodes.yaml", "policy/access-domains.yaml"
-SOON_S = 0.1
 
 
 def _with_room_for_one(bare: Path) -> dict[str, str | None]:
