@@ -61,6 +61,7 @@ class Story:
     ) -> None:
         self._bare, self._person, self._data, self._log = bare, person, data, caplog
         self._clock = Clock()
+        self._options: dict[str, Any] = {"runtime": self._clock, "fetch_interval": 0.1}
         self._open = ExitStack()
         self._running: dict[str, ExitStack] = {}
         self._generators: dict[str, Generator] = {}
@@ -83,9 +84,13 @@ class Story:
         """Start a generator that uses a clone, or the repo itself if it is called `local`."""
         address = self._bare if name == "local" else self._bare.as_uri()
         self._running[name] = self._open.enter_context(ExitStack())
-        more: Any = {"data": self._data / name, "fetch_interval": 0.1, "runtime": self._clock}
-        made = self._running[name].enter_context(rig.running(address, **more))
-        self._generators[name] = made
+        made = rig.running(address, data=self._data / name, **self._options)
+        self._generators[name] = self._running[name].enter_context(made)
+
+    def looks(self, at: str) -> None:
+        """Let generators that use a clone look at the state repo only for demands."""
+        assert at == "for demands"
+        del self._options["fetch_interval"]
 
     def stop(self, name: str) -> None:
         del self._generators[name]
