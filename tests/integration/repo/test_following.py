@@ -123,9 +123,10 @@ def test_a_full_queue_says_that_the_remote_is_away(http: str, server: Server) ->
 def test_views_go_on_while_something_is_not_valid_and_say_so(
     bare: Path, person: Person, demandops: Run
 ) -> None:
+    first = "  - id: vehicle00\n    type: vehicle\n    cluster: "
     with rig.running(bare, fetch_interval=SOON_S) as generator:
         rig.book(generator, goal(1))
-        made = person.edit(NODES, "cluster: c-its", "cluster: c-itz")
+        made = person.edit(NODES, f"{first}c-its", f"{first}c-itz")
         followed(bare, made)
     status = demandops("status", "--state-repo", bare)
     problem = status.out.splitlines()[1].strip()
