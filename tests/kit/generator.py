@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from demandops.base.errors import InvalidInput
 from demandops.serve.generator import Generator
 from demandops.serve.queue import Receipt, Ticket
 
@@ -33,6 +34,14 @@ def restart(address: str | Path) -> bool:
 
 def receipt(ticket: Ticket, timeout: float = PATIENCE_S) -> Receipt:
     return ticket.future.result(timeout)
+
+
+def outcome(ticket: Ticket) -> str:
+    """Return a demand's outcome, the code of its first fault, or the name of its error's class."""
+    error = ticket.future.exception(PATIENCE_S)
+    if isinstance(error, InvalidInput):
+        return error.faults[0].code
+    return type(error).__name__ if error else receipt(ticket).outcome
 
 
 def wait_until_queued(tickets: Iterable[Ticket]) -> None:
@@ -59,6 +68,18 @@ class Gate:
         if stage == self._stage:
             self.reached.set()
             self.open.wait(PATIENCE_S)
+
+
+@contextmanager
+def busy(generator: Generator, made: Goal, operation: str | None = None) -> Iterator[Ticket]:
+    """Keep the worker busy with a demand for the length of a block."""
+    gate = Gate()
+    ticket = generator.submit(made, operation, gate)
+    try:
+        assert gate.reached.wait(PATIENCE_S)
+        yield ticket
+    finally:
+        gate.open.set()
 
 
 @dataclass
@@ -96,4 +117,4 @@ class Proposed:
         return proposed()[-1].split()[2]
 
     def outcome(self) -> str:
-        return receipt(self.ticket).outcome
+        return outcome(self.ticket)

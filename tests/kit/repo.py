@@ -1,8 +1,8 @@
 """State repos in Git for tests: a bare repository, a person with a clone, and the history.
 
 Commits and files are read with git and pygit2, not with the generator's own code, so that tests do
-not depend on that code. Only :func:`books` and :func:`differing` read with it, and
-:func:`write_tree` writes with it.
+not depend on that code. Only :func:`state_of`, :func:`books` and :func:`differing` read with it,
+and :func:`write_tree` writes with it.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from typing import Any
 
 import pygit2
 import yaml
+from demandops.decide.state import State
 from demandops.repo import new_repo, reader
 from demandops.repo.git import tree as trees
 from demandops.repo.git.objects import NewObjects
@@ -290,10 +291,13 @@ def branches(repo: Path) -> list[str]:
     return sorted(b for b in pygit2.Repository(str(repo)).branches.local if b.startswith("demand/"))
 
 
-def books(repo: Path, revision: str = "main") -> dict[str, Any]:
+def state_of(repo: Path, revision: str = "main") -> State:
     opened = pygit2.Repository(str(repo))
-    state = snapshots.load(opened, opened.revparse_single(revision).id).state
-    return as_data(bookkeeping(state), "")
+    return snapshots.load(opened, opened.revparse_single(revision).id).state
+
+
+def books(repo: Path, revision: str = "main") -> dict[str, Any]:
+    return as_data(bookkeeping(state_of(repo, revision)), "")
 
 
 def claims(repo: Path, needle: str = "") -> list[str]:

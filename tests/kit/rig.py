@@ -6,6 +6,8 @@ from tests.kit.generator import (
     Proposed,
     Stages,
     book,
+    busy,
+    outcome,
     receipt,
     restart,
     running,

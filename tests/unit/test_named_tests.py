@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.integration.repo.test_stories import STORIES
 from tests.scenarios import running
 
 ROOT = Path(__file__).parents[2]
@@ -34,7 +35,7 @@ def test_a_test_that_a_page_names_exists(page: str) -> None:
     assert len(named) > 20
     missing = [name for file, name, _ in named if name not in names_in(ROOT / file)]
     assert missing == []
-    assert {scenario for _, _, scenario in named} - {""} <= set(running.scenarios())
+    assert {case for _, _, case in named} - {""} <= {*running.scenarios(), *STORIES}
 
 
 def test_each_function_on_the_path_of_a_demand_exists() -> None:

@@ -9,20 +9,19 @@ import json
 import logging
 import re
 import shutil
-from datetime import datetime, timedelta
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
 from demandops.base import settings
-from demandops.base.errors import Refused
 from demandops.model.demand.claim import Claim
 from demandops.repo.write.journal import JournalEntry, Slot
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
-from tests.kit.repo import GitRepo, Person
+from tests.kit.repo import GitRepo
 
 DOMAINS = "policy/access-domains.yaml"
 POLICY = """\
@@ -66,23 +65,12 @@ def expiries(repo: Path) -> list[rig.Commit]:
     return [c for c in rig.commits(repo) if c.one("Operation") == "expire"]
 
 
-def ends(generator: Generator, demand: str) -> datetime:
-    return max(claim.lease.expires_at for claim in held(generator, demand) if claim.lease)
-
-
-def leave_in_journal(repo: Path, operation: str, goal: rig.Goal, received: datetime) -> None:
-    """Write a demand into the journal, as a killed generator would leave it there."""
-    slot = Slot(settings.data_home(str(repo)))
-    slot.journal.append([JournalEntry(operation, goal, received.isoformat(), rig.tip(repo))])
-    slot.close()
-
-
 def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(
     clock: Clock, url: str, bare: Path
 ) -> None:
     with rig.running(url, runtime=clock) as generator:
         rig.book(generator, put("short"), put("stays", None))
-        end = ends(generator, "short")
+        end = max(c.lease.expires_at for c in held(generator, "short") if c.lease)
         clock.pass_(60)
         wait_until_gone(generator, "short")
         assert held(generator, "stays")
@@ -93,47 +81,12 @@ def test_a_lease_that_ends_is_one_commit_in_the_requesters_names(
     assert commit.all("Application") == ["edge/short"]
     assert commit.all("Connection") == ["derived/vehicle00/edge"]
     assert len(commit.all("Operation-Id")) == 1
-    author, made, body = rig.git(bare, "log", "-1", "--format=%an <%ae>%n%ct%n%b", commit.id).split(
-        "\n", 2
-    )
+    form = "--format=%an <%ae>%n%ct%n%b"
+    author, made, body = rig.git(bare, "log", "-1", form, commit.id).split("\n", 2)
     assert author == "station00, vehicle00 (requesters) <short@requester.demandops.invalid>"
     assert int(made) >= int(end.timestamp()), "the lease was ended too early"
-    told = end.strftime("%Y-%m-%d %H:%M:%S UTC")
-    assert "the lease of demand 'short' on 1 application and 1 connection in the name" in body
-    assert f"ended at {told} and was not renewed" in body.replace("\n", " ")
+    assert f"ended at {end:%Y-%m-%d %H:%M:%S} UTC" in body.replace("\n", " ")
     assert list(rig.books(bare)["connections"]) == ["derived/vehicle00/edge"]
-    rig.assert_sound(bare)
-
-
-def test_what_ended_while_the_generator_was_down_goes_when_it_is_back(
-    clock: Clock, url: str, bare: Path
-) -> None:
-    with rig.running(url, runtime=clock) as generator:
-        rig.book(generator, put("b", 120), put("a", 60), put("long", "1h"))
-    assert expiries(bare) == []
-    clock.pass_(120)
-    with rig.running(url, runtime=clock) as generator:
-        wait_until_gone(generator, "b")
-        wait_until_gone(generator, "a")
-        assert held(generator, "long")
-    assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["a"], ["b"]]
-    rig.assert_sound(bare)
-
-
-def test_renewing_a_lease_keeps_the_claim_and_changes_no_cluster_file(
-    clock: Clock, bare: Path
-) -> None:
-    with rig.running(bare, runtime=clock) as generator:
-        rig.book(generator, put("kept", 120), put("other"))
-        files = rig.git(bare, "rev-parse", "main:clusters")
-        (answer,) = rig.book(generator, renew("kept"))
-        assert answer.outcome == "booked"
-        assert rig.git(bare, "rev-parse", "main:clusters") == files
-        clock.pass_(60)
-        wait_until_gone(generator, "other")
-        rig.book(generator, put("kept", "1h"))
-    assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["other"]]
-    assert rig.commits(bare)[-1].summary.startswith("Renew edge/kept")
     rig.assert_sound(bare)
 
 
@@ -143,7 +96,10 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
     with rig.running(bare, runtime=clock) as generator:
         rig.book(generator, put("d", 60))
     # by the record, the lease ended 40 s ago; the renewal came before, while no generator ran
-    leave_in_journal(bare, "op-renew", renew("d"), clock.now() + timedelta(seconds=50))
+    received = (clock.now() + timedelta(seconds=50)).isoformat()
+    slot = Slot(settings.data_home(str(bare)))
+    slot.journal.append([JournalEntry("op-renew", renew("d"), received, rig.tip(bare))])
+    slot.close()
     clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:
         rig.wait_until(lambda: "op-renew" in rig.operations(bare), "the renewal is taken up")
@@ -187,52 +143,6 @@ def test_a_lease_that_another_generator_renewed_does_not_expire(
     rig.assert_sound(bare)
 
 
-def test_an_idle_generator_releases_what_another_process_booked(clock: Clock, bare: Path) -> None:
-    """The other process is, for example, ``demandops request`` beside ``demandops serve``."""
-    with rig.running(bare, runtime=clock) as idle:
-        with rig.running(bare, runtime=clock) as other:
-            rig.book(other, put("d"))
-        clock.pass_(60)
-        rig.wait_until(lambda: expiries(bare), "'d' is released")
-        wait_until_gone(idle, "d")
-    rig.assert_sound(bare)
-
-
-def test_two_generators_release_once(
-    clock: Clock, url: str, bare: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO, logger="demandops")
-    with rig.running(url, runtime=clock) as first, rig.running(url, runtime=clock) as second:
-        rig.book(first, put("d"))
-        rig.book(second, put("other", None))  # now the second one knows 'd'
-        assert held(second, "d")
-        clock.pass_(60)
-        wait_until_gone(first, "d")
-        wait_until_gone(second, "d")
-    assert [commit.all("Demand-Id") for commit in expiries(bare)] == [["d"]]
-    assert "the lease of 'd' has ended: released" in caplog.text
-    rig.assert_sound(bare)
-
-
-def test_a_hand_in_counts_once_though_the_remote_moved(
-    url: str, bare: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level(logging.INFO, logger="demandops")
-    _with_policy(bare, ", quotas: {demandsPerMinute: 2}")
-    person = Person(bare, tmp_path / "person")
-    with rig.running(url) as generator:
-        for number in range(2):
-            person.change({"README.md": f"Version {number}.\n"}, "Ours")
-            (answer,) = rig.book(generator, put(f"d{number}", None))
-            assert answer.outcome == "booked"
-        assert caplog.text.count("another writer was first") == 2
-        with pytest.raises(Refused) as refused:
-            rig.book(generator, put("d2", None))
-        assert [found.code for found in refused.value.faults] == ["quota", "quota"]
-        (answer,) = rig.book(generator, put("d2", None, requesters=["vehicle03"]))
-    assert answer.outcome == "booked"
-
-
 def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
     bare: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
@@ -255,24 +165,18 @@ def test_odd_goals_are_refusals_and_no_faults_of_the_generator(
     ]
     with rig.running(bare) as generator:
         tip = rig.tip(bare)
-        for goal in hostile:
-            with pytest.raises(Refused):
-                rig.book(generator, goal)
-        assert rig.tip(bare) == tip
+        codes = [rig.outcome(generator.submit(goal)) for goal in hostile]
+        assert rig.tip(bare) == tip and not {"booked", "released"} & {*codes}
         names = ["d" * 1024, "<a@b> (c), d", "ü" * 200, "a: b", "-rf", "#1", "🚗/🚕", "%s\\n$(x)"]
-        for name in names:
-            rig.book(generator, put(name, None, who=name))
+        rig.book(generator, *(put(name, None, who=name) for name in names))
     assert "internal error" not in caplog.text
     made = rig.commits(bare)[-len(names) :]
-    written = [name.replace("#1", r'"\x231"') for name in names]
-    assert [commit.all("Demand-Id") for commit in made] == [[name] for name in written]
-    assert [set(commit.all("Requester")) for commit in made] == [
-        {name, "station00"} for name in written
+    assert [(commit.one("Demand-Id"), {*commit.all("Requester")}) for commit in made] == [
+        (name, {name, "station00"}) for name in (n.replace("#1", r'"\x231"') for n in names)
     ]
+    release = {"kind": "Demand", "operation": "release"}
     with rig.running(bare) as generator:
-        assert {claim.demand for claim in generator.snapshot.state.ledger} == set(names)
-        for name in names:
-            release = {"kind": "Demand", "operation": "release", "demand": name}
-            rig.book(generator, release | {"requesters": [name]})
+        assert {claim.demand for claim in generator.snapshot.state.ledger} == {*names}
+        rig.book(generator, *(release | {"demand": n, "requesters": [n]} for n in names))
     assert rig.claims(bare) == []
     rig.assert_sound(bare, verify_last=3)

@@ -27,22 +27,19 @@ def _leave(bare: Path) -> list[Path]:
     return [folder, keep]
 
 
-def test_a_start_removes_what_a_killed_process_left(bare: Path) -> None:
+@pytest.mark.parametrize("is_written", [False, True])
+def test_a_start_removes_what_a_killed_process_left_unless_another_writes_a_pack(
+    bare: Path, is_written: bool
+) -> None:
     left = _leave(bare)
     of_a_person = bare / "objects" / "pack" / "pack-1.keep"
     of_a_person.write_text("")
-    with rig.running(bare):
-        assert [path for path in left if path.exists()] == []
-    assert of_a_person.exists()
-
-
-def test_a_start_removes_nothing_while_another_process_writes_a_pack(bare: Path) -> None:
-    left = _leave(bare)
     handle = os.open(bare / "objects" / "pack", os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_SH)
+        if is_written:
+            fcntl.flock(handle, fcntl.LOCK_SH)
         with rig.running(bare):
-            assert [path for path in left if not path.exists()] == []
+            assert [path.exists() for path in (*left, of_a_person)] == [is_written] * 2 + [True]
     finally:
         os.close(handle)
 
@@ -52,7 +49,6 @@ def test_a_published_demand_without_an_answer_is_written_to_new_files(bare: Path
         before = tip(bare)
         rig.receipt(generator.submit(rig.goal(1), "op-1"))
         journal = generator._slot.folder / "outbox.jsonl"
-        folder = generator._slot.folder
     branch, packs = bare / "refs/heads/main", bare / "objects" / "pack"
     inodes = {path.name: path.stat().st_ino for path in (branch, *packs.iterdir())}
     at = tip(bare)
@@ -60,7 +56,6 @@ def test_a_published_demand_without_an_answer_is_written_to_new_files(bare: Path
     again.append([JournalEntry("op-1", rig.goal(1), "2026-03-01T00:00:00+00:00", before)])
     again.close()
     assert rig.restart(bare) is True
-    assert folder.exists()
     assert (tip(bare), rig.operations(bare)) == (at, ["op-1"])
     assert branch.stat().st_ino != inodes["main"]
     assert any(path.stat().st_ino != inodes.get(path.name) for path in packs.glob("*.pack"))
@@ -93,8 +88,8 @@ def test_a_repo_that_borrows_objects_is_refused(bare: Path, tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("", "refs/heads/main: corrupted loose reference file: refs/heads/main"),
-        ("x" * 40 + "\n", "refs/heads/main: corrupted loose reference file: refs/heads/main"),
+        ("", "corrupted loose reference file"),
+        ("x" * 40 + "\n", "corrupted loose reference file"),
         ("1" * 40 + "\n", f"its commit {'1' * 40} is missing"),
     ],
 )
@@ -104,9 +99,6 @@ def test_a_branch_that_cannot_be_read_is_told_with_the_remedy(
     branch = bare / "refs/heads/main"
     branch.parent.mkdir(exist_ok=True)
     branch.write_text(text)
-    with pytest.raises(StateRepoError) as error:
+    remedy = f"{what}.*; check its disk, .* restore it from a backup or a clone"
+    with pytest.raises(StateRepoError, match=remedy):
         LocalRepository(bare)
-    assert str(error.value) == (
-        f"{bare} cannot be read: {what}; check its disk, and if `git -C {bare} fsck` finds it "
-        "broken, restore it from a backup or a clone"
-    )

@@ -17,7 +17,7 @@ from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig
 from tests.kit.git_over_http import Server
-from tests.kit.rig import Gate, Goal, Person, goal, wait_until
+from tests.kit.rig import Goal, Person, goal, wait_until
 
 STATEFUL_SET = Path(__file__).parents[3] / "deploy/chart/templates/statefulset.yaml"
 
@@ -58,14 +58,10 @@ def probe(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Probe:
 
 
 def test_it_fails_while_the_worker_is_stuck(bare: Path, probe: Probe) -> None:
-    gate = Gate()
     with rig.running(bare) as generator:
-        ticket = generator.submit(goal(1), listener=gate)
-        assert gate.reached.wait(rig.PATIENCE_S)
-        probe.make_old()
-        assert not probe.passes()
-        gate.open.set()
-        rig.receipt(ticket)
+        with rig.busy(generator, goal(1)):
+            probe.make_old()
+            assert not probe.passes()
         rig.book(generator, goal(2))
         assert probe.passes()
 
@@ -99,7 +95,7 @@ def test_it_passes_during_a_start_whatever_an_earlier_process_left(
 def test_it_passes_during_a_long_check_of_proposals(
     bare: Path, petra: Person, probe: Probe, made: Callable[[int], Goal]
 ) -> None:
-    gate, passed = Gate(), list[bool]()
+    passed = list[bool]()
 
     def proposed(stage: str, text: str) -> None:
         if stage == "proposed":
@@ -107,10 +103,8 @@ def test_it_passes_during_a_long_check_of_proposals(
             probe.make_old()
 
     with rig.running(bare) as generator:
-        generator.submit(goal(9), listener=gate)
-        assert gate.reached.wait(rig.PATIENCE_S)
-        for number in (1, 2, 3):
-            generator.submit(made(number), listener=proposed)
-        gate.open.set()
+        with rig.busy(generator, goal(9)):
+            for number in (1, 2, 3):
+                generator.submit(made(number), listener=proposed)
         wait_until(lambda: len(passed) == 3, "the demands wait for approval")
     assert passed == [True] * 3

@@ -72,16 +72,6 @@ def test_a_persons_commit_that_quotes_trailers_is_a_persons(
     assert (entry.trailers, entry.why) == ({}, "")
 
 
-def test_a_start_trusts_no_record_that_is_not_the_generators(bare: Path, person: Person) -> None:
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(1))
-    person.change({"README.md": "x\n"}, f"Forged\n\n{FORGED}")
-    person.change({"README.md": "y\n"}, f"Forged\n\n{FORGED}", FORGER)
-    with rig.running(bare) as generator:
-        rig.book(generator, goal(2))
-    assert rig.books(bare) == rig.books_after([goal(1), goal(2)])
-
-
 def test_where_keys_are_listed_an_unsigned_commit_is_a_persons(
     bare: Path, person: Person, tmp_path: Path
 ) -> None:
@@ -128,15 +118,10 @@ def held(bare: Path) -> set[tuple[str, ...]]:
 @pytest.mark.parametrize(
     ("requester", "most", "app", "why"),
     [
-        ("control-room", 10, "edge/d1", "no rule of access domain 'perception' is for 'control-ro"),
+        ("control-room", 10, "edge/d1", "no rule of access domain 'perception' is for"),
         ("user1", 2, "edge/d1", "'user1' would hold 3 claims"),
-        (
-            "user1\u2060",
-            10,
-            "edge/d1",
-            "has the invisible character U+2060; choose an id without it",
-        ),
-        ("user1", 10, "edge-d1", "application 'edge/d1' already publishes this topic on 'edge'"),
+        ("user1\u2060", 10, "edge/d1", "U+2060"),
+        ("user1", 10, "edge-d1", "application 'edge/d1' already publishes this topic"),
     ],
 )
 def test_a_claim_by_hand_that_a_demand_could_not_book_is_held_back(

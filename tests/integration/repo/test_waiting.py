@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from demandops.model.ledger import records
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.repo.write.journal import JournalEntry, Slot
 from demandops.serve.generator import Generator
@@ -22,7 +21,6 @@ from tests.kit.turns import Turns
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 NODES, DOMAINS = "inventory/nodes.yaml", "policy/access-domains.yaml"
-SOON_S = 0.1
 
 
 def _with_room_for_one(bare: Path) -> dict[str, str | None]:
@@ -46,57 +44,8 @@ def _put(name: str, **more: Any) -> dict[str, Any]:
     return head | {"applications": [app | {"inputs": inputs}]} | more
 
 
-def _release(name: str) -> dict[str, Any]:
-    return {"kind": "Demand", "operation": "release", "demand": name, "requesters": ["vehicle00"]}
-
-
 def _runs(bare: Path) -> list[str]:
     return sorted(rig.books(bare)["services"])
-
-
-def test_demands_wait_and_are_booked_in_turn_by_any_generator(
-    bare: Path, person: Person, tmp_path: Path
-) -> None:
-    person.change(_with_room_for_one(bare), "One at a time")
-    options: dict[str, Any] = {"fetch_interval": SOON_S}
-    with (
-        rig.running(bare.as_uri(), **options) as first,
-        rig.running(bare.as_uri(), data=tmp_path / "other", **options) as second,
-    ):
-        outcomes = [
-            receipt.outcome
-            for generator, goal in (
-                (first, _put("a")),
-                (second, _put("b", lease="10m")),
-                (first, _put("c", priority=1)),
-                (second, _put("d")),
-                (first, _put("b", lease="10m")),
-            )
-            for receipt in rig.book(generator, goal)
-        ]
-        assert outcomes == ["booked", *["waiting"] * 4]
-        (again,) = rig.book(second, _put("b", lease="10m"))
-        assert (again.commit, again.lease_s) == (rig.tip(bare), 600)
-        rig.book(second, _release("a"))
-        assert _runs(bare) == ["of-c"]
-    assert rig.git(bare, "ls-tree", "-r", "--name-only", "main", records.WAITING_ROOT).split() == (
-        sorted(records.waiting_path(name) for name in ("b", "d"))
-    )
-    with rig.running(bare.as_uri(), **options) as third:
-        rig.book(third, _release("d"), _release("c"))
-        assert _runs(bare) == ["of-b"]
-        message = rig.git(bare, "log", "-1", "--format=%an%n%B", "main")
-        assert message.startswith("vehicle00 (requester)\nPut b, derived/vehicle00/edge\n")
-        assert "It waited for room." in message
-        person.change({records.waiting_path("nobody"): "not: valid\n"}, "A file that is none")
-        rig.book(third, _release("b"))
-    assert _runs(bare) == []
-    operations = [commit.one("Operation") for commit in rig.commits(bare)]
-    made = [operation for operation in operations if operation not in ("", "follow")]
-    assert made == [
-        "put", "wait", "wait", "wait", "release", "put", "release", "release", "put", "release",
-    ]  # fmt: skip
-    rig.assert_sound(bare)
 
 
 def test_a_waiting_demand_whose_answer_was_lost_is_answered_again(
