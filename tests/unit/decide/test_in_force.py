@@ -25,6 +25,7 @@ from demandops.views.bookkeeping import bookkeeping
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.appdefs.test_scaling import FOLLOWING
 from tests.kit.chance import examples
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal
 from tests.kit.memory import NOW, MemoryRepo
@@ -82,7 +83,7 @@ def demands(draw: st.DrawFn) -> tuple[str, Any]:
 @given(st.lists(demands(), max_size=14))
 @examples(25)
 def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> None:
-    books = MemoryRepo(CROWD)
+    books = MemoryRepo(CROWD | FOLLOWING)
     for made in sent:
         before = dict(books.files)
         try:
