@@ -17,7 +17,7 @@ from demandops.base import naming
 from demandops.base.errors import MOST_FAULTS, Fault, Refused, suggestion
 from demandops.model.demand import demand_goal
 
-from tests.kit.config import brokers, skeleton
+from tests.kit.config import skeleton
 from tests.kit.goals import (
     BODY,
     ROS_NAMES,
@@ -79,13 +79,6 @@ def test_a_topic_name_that_ros_forbids_is_refused_wherever_it_stands(topic: str)
             "connections[1].target_topics[0]",
         )
     ]
-
-
-def test_without_any_broker_the_file_to_mend_is_told() -> None:
-    (found,) = MemoryRepo(brokers()).faults(goal([], [connection(broker="")]))
-    assert found.startswith("connections[0].broker_node_id: ")
-    assert "name one of" not in found
-    assert "inventory/brokers.yaml" in found
 
 
 def limited(**limits: int) -> MemoryRepo:
