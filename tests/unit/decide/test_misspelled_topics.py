@@ -9,54 +9,34 @@ from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo
 
 USUAL = "/vehicles/vehicle00/drivers/lidar/pointcloud"
-
-
-def told(topic: str, *known: str) -> list[str]:
-    """Return the warnings about spelling that a demand for ``topic`` gives.
-
-    Before it, other demands for the topics ``known`` are booked.
-    """
-    books = MemoryRepo()
-    for number, one in enumerate(known):
-        books.send(_demand(f"known-{number}", one))
-    warnings = books.send(_demand("own", topic)).warnings
-    return [one for one in warnings if "did you mean" in one]
-
-
-def _demand(id: str, topic: str, source: str = "vehicle00") -> dict[str, object]:
-    inputs = {"point_cloud": [{"topic": topic, "source": source}]}
-    app = {"id": f"edge/{id}", "type": "object-detection-fusion", "node": "edge"}
-    return put(id, id, applications=[app | {"inputs": inputs}], connections=[])
-
-
-@pytest.mark.parametrize("wrong", ["pontcloud", "pointcluod", "pointclouds", "pointCloud"])
-def test_it_is_told_with_the_topic_of_the_inventory(wrong: str) -> None:
-    topic = USUAL.replace("pointcloud", wrong)
-    assert told(topic) == [
-        f"application 'edge/own': 'vehicle00' is not known to publish {topic}; did you mean "
-        f"'{USUAL}'?"
-    ]
+"""The topic of vehicle00 in the inventory."""
 
 
 @pytest.mark.parametrize(
-    ("topic", "known"),
+    ("source", "topic", "known", "meant"),
     [
-        (USUAL, []),
-        (f"{USUAL}2", []),
-        (USUAL.replace("lidar", "camera"), []),
-        ("/cameras/front_l", ["/cameras/front_r"]),
-        ("/local_objects", ["/global_objects"]),
+        ("vehicle00", USUAL.replace("pointcloud", "pontcloud"), [], USUAL),
+        ("vehicle00", USUAL.replace("pointcloud", "pointcluod"), [], USUAL),
+        ("vehicle00", f"{USUAL}s", [], USUAL),
+        ("vehicle00", USUAL.replace("pointcloud", "pointCloud"), [], USUAL),
+        ("cloud", "/objcts", ["/objects"], "/objects"),
+        ("vehicle00", USUAL, [], ""),
+        ("vehicle00", f"{USUAL}2", [], ""),
+        ("vehicle00", USUAL.replace("lidar", "camera"), [], ""),
+        ("vehicle00", "/cameras/front_l", ["/cameras/front_r"], ""),
+        ("vehicle00", "/local_objects", ["/global_objects"], ""),
     ],
 )
-def test_another_topic_is_no_mistake(topic: str, known: list[str]) -> None:
-    assert told(topic, *known) == []
-
-
-def test_a_node_without_topics_in_the_inventory_has_those_of_earlier_demands() -> None:
+def test_it_is_told_with_the_topic_of_the_inventory_or_of_an_earlier_demand(
+    source: str, topic: str, known: list[str], meant: str
+) -> None:
     books = MemoryRepo()
-    books.send(_demand("known", "/objects", "cloud"))
-    told = books.send(_demand("own", "/objcts", "cloud")).warnings
-    assert any("did you mean '/objects'?" in one for one in told)
+    for one in known:
+        books.send(put("known", "other", topic=(one, source)))
+    decision = books.send(put("own", topic=(topic, source)))
+    told = f"'{source}' is not known to publish {topic}; did you mean '{meant}'?"
+    warned = [text for text in decision.warnings if "did you mean" in text]
+    assert [told in text for text in warned] == [True] * bool(meant)
 
 
 def test_check_tells_of_it_with_the_file_of_the_claim() -> None:

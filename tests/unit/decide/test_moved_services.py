@@ -11,23 +11,19 @@ from dataclasses import replace
 from random import Random
 from typing import Any
 
-import yaml
 from demandops.base.errors import Refused
 from demandops.decide.placement.relocation import changed_claim_files, following_overrides
 from demandops.decide.planning.release_keys import all_keys
 from demandops.decide.state import rendered_files
 from demandops.decide.warnings import policy_warnings
 from demandops.model.config.config import Config
-from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile, Selector
 from demandops.model.release import ServiceKey
-from demandops.views.release_causes import releases
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
-from tests.kit.config import configuration, override, state_of
-from tests.kit.goals import application, goal
+from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo, ledger_in
 from tests.unit.decide.test_flows import (
     NODES,
@@ -112,6 +108,8 @@ def test_every_topic_comes_in_one_way_while_overrides_move_services(
         for app in apps:
             if not any(f"'{app['id']}'" in why for _, why in stays):
                 assert moved[app["id"]] == wanted(graphs, app, active.values())
+        told = [(one.file, one.message) for one in policy_warnings(repo.state)]
+        assert {*stays} <= {*told}, "check must tell what stays"
         assert ledger_in(repo.files) == ledger
         running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
         assert running == {key for app in apps for key in instances(graphs, app, moved[app["id"]])}
@@ -119,26 +117,3 @@ def test_every_topic_comes_in_one_way_while_overrides_move_services(
     configure(repo, plain)
     assert not repo.state.ledger.moved_applications()
     assert_every_topic_comes_in_one_way(repo, demands)
-
-
-def test_what_a_quota_does_not_let_move_stays_and_check_says_so() -> None:
-    head = {"apiVersion": "demandops/v1", "kind": "AccessDomains"}
-    places = (("edges", ["edge", "vehicle*"], {}), ("cloud", ["cloud"], {"servicesPerNode": 1}))
-    domains = [
-        {"name": name, "namespace": name, "nodes": nodes, "quotas": quotas}
-        for name, nodes, quotas in places
-    ]
-    files = {"policy/access-domains.yaml": yaml.safe_dump(head | {"domains": domains})}
-    repo = MemoryRepo(files)
-    for id in ("a", "b"):
-        repo.send(goal([application(id, ego=[("/ego", "vehicle00")], clouds=[])], id=id))
-    moves = override({"services": ["object-fusion"]}, node="cloud")
-    stays = configure(repo, load(configuration(files | {"overrides/away.yaml": moves})))
-    ((path, why),) = stays
-    assert path == "overrides/away.yaml"
-    assert why.startswith("does not move object-fusion of application 'b' to 'cloud': 'cloud' ")
-    assert [f.message for f in policy_warnings(repo.state) if f.file == path] == [why]
-    booked = (repo.state.ledger.application(id) for id in ("a", "b"))
-    assert [app and dict(app.moved) for app in booked] == [{"object-fusion": "cloud"}, {}]
-    repo.send(goal([application("b", ego=[("/more", "vehicle00")], clouds=[])], id="b"))
-    assert [release.node.id for release in releases(repo.state)] == ["cloud", "edge"]

@@ -1,9 +1,11 @@
-"""The scope ``cluster``: one service for all applications of a cluster that use it."""
+"""The scope ``cluster``: one service for all applications of a cluster that use it.
+
+``tests/scenarios/a-service-for-a-cluster.yaml`` has a story of it.
+"""
 
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from random import Random
@@ -17,7 +19,7 @@ from demandops.model.release import ServiceKey
 from hypothesis import given
 
 from tests.kit.chance import chances, examples
-from tests.kit.config import edited, override, skeleton
+from tests.kit.config import edited, skeleton
 from tests.kit.memory import MemoryRepo, ledger_in
 
 PAGE = (Path(__file__).parents[3] / "docs" / "appdef.md").read_text()
@@ -29,7 +31,7 @@ APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 )
 
 
-def files(service: str = EXAMPLE, **more: str) -> dict[str, str]:
+def files(service: str = EXAMPLE) -> dict[str, str]:
     nodes = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
     for node in nodes["nodes"]:
         node["cluster"] = "depot" if node["id"] in ("vehicle02", "vehicle03") else "c-its"
@@ -42,7 +44,6 @@ def files(service: str = EXAMPLE, **more: str) -> dict[str, str]:
         "appdefs/map-server/service.yaml": service,
         "appdefs/map-server/values/map-server.yaml.j2": "replicas: {{ replicas }}\n",
         **edited(APPDEF, "inputs:\n", used),
-        **more,
     }
 
 
@@ -59,8 +60,7 @@ def put(demand: str, node: str = "edge", topic: str = "/ego") -> dict[str, Any]:
 
 
 def release(demand: str) -> dict[str, Any]:
-    made = put(demand)
-    return made | {"operation": "release", "applications": []}
+    return put(demand) | {"operation": "release", "applications": []}
 
 
 def servers(repo: MemoryRepo) -> dict[str, list[str]]:
@@ -107,94 +107,23 @@ def test_one_runs_while_any_application_of_the_cluster_uses_it(random: Random) -
     assert repo.files == empty().files
 
 
-def test_a_cluster_without_a_node_for_it_is_refused() -> None:
-    demanded = put("a", "vehicle02")
-    demanded["applications"][0]["connect"] = "none"
-    assert MemoryRepo(files()).faults(demanded) == [
-        "applications[0].node: 'vehicle02' is in cluster 'depot', where the application's service "
-        "map-server has no node; choose a node in cluster c-its, or ask for an entry for cluster "
-        "'depot' in the field nodes of appdefs/map-server/service.yaml"
-    ]
-
-
-def test_its_node_counts_it_and_its_rules_hold() -> None:
-    domains = [
-        {"name": "most", "namespace": "most", "nodes": ["vehicle*", "station*", "edge"]},
-        {
-            "name": "servers",
-            "namespace": "servers",
-            "nodes": ["cloud"],
-            "rules": [{"name": "a", "requesters": ["for-a"], "peers": ["most"]}],
-            "quotas": {"servicesPerNode": 1},
-        },
-    ]
-    domains[0]["rules"] = [{"name": "all", "peers": ["servers"]}]
-    head = {"apiVersion": "demandops/v1", "kind": "AccessDomains", "domains": domains}
-    repo = MemoryRepo(files() | {"policy/access-domains.yaml": yaml.safe_dump(head)})
-    assert repo.send(put("a")).outcome == "booked"
-    assert "no rule of access domain 'servers' is for 'for-b'" in repo.faults(put("b"))[0]
-    moved = put("a", "cloud")
-    assert "'cloud' would run 2 services" in repo.faults(moved)[0]
-
-
-PLAIN = """
-apiVersion: demandops/v1
-kind: ApplicationDefinition
-name: plain
-inputs: {ego_data: {}}
-services:
-  plain: {prefix: pl, inputs: {ego_data: ego_data}, chart: object-fusion, values: values/p.yaml.j2}
-"""
-
-
-def test_a_quota_does_not_count_it_if_all_claims_on_it_are_suspended() -> None:
-    domain = {"name": "all", "namespace": "all", "quotas": {"servicesPerNode": 1}}
-    head = {"apiVersion": "demandops/v1", "kind": "AccessDomains", "domains": [domain]}
-    more = {
-        "appdefs/plain/appdef.yaml": PLAIN,
-        "appdefs/plain/values/p.yaml.j2": "replicas: 1\n",
-        "policy/access-domains.yaml": yaml.safe_dump(head),
-    }
-    repo = MemoryRepo(files(**more))
-    repo.send(put("a"))
-    plain = put("b", "cloud")
-    plain["applications"][0]["type"] = "plain"
-    assert "'cloud' would run 2 services" in repo.faults(plain)[0]
-    denied = override({"applications": ["edge/a"]}, deny=True)
-    suspending = MemoryRepo(files(**more, **{"overrides/no.yaml": denied}))
-    suspending.state = replace(suspending.state, ledger=repo.state.ledger)
-    suspending.send(plain)
-
-
 @pytest.mark.parametrize(
-    ("old", "new", "fault"),
+    ("old", "new", "field", "told"),
     [
-        (
-            "nodes: {c-its: cloud}\n",
-            "",
-            "scope 'cluster' needs 'nodes' (the service's node in each cluster)",
-        ),
-        (
-            "scope: cluster",
-            "scope: node",
-            "scope 'cluster' needs 'nodes' (the service's node in each cluster)",
-        ),
-        (
-            "nodes: {c-its: cloud}",
-            "nodes: {c-its: cloud}\nplacement: source",
-            "with scope 'cluster' the service runs on the nodes in 'nodes'; leave out 'placement'",
-        ),
-        (
-            "nodes: {c-its: cloud}",
-            "nodes: {depot: cloud}",
-            "nodes.depot: 'cloud' is in cluster 'c-its'; name a node of 'depot'",
-        ),
-        ("{c-its: cloud}", "{c-its: clod}", "nodes.c-its: 'clod' is not in nodes.yaml"),
-        ("{c-its: cloud}", "{town: cloud}", "nodes.town: 'town' is not in clusters.yaml"),
+        ("nodes: {c-its: cloud}\n", "", "", "scope 'cluster' needs 'nodes'"),
+        ("scope: cluster", "scope: node", "", "no other scope may have 'nodes'"),
+        ("scope: cluster", "scope: cluster\nplacement: source", "", "leave out 'placement'"),
+        ("{c-its: cloud}", "{depot: cloud}", "nodes.depot", "'cloud' is in cluster 'c-its'"),
+        ("{c-its: cloud}", "{c-its: clod}", "nodes.c-its", "'clod' is not in nodes.yaml"),
+        ("{c-its: cloud}", "{town: cloud}", "nodes.town", "'town' is not in clusters.yaml"),
     ],
 )
-def test_a_definition_that_does_not_fit_is_a_fault(old: str, new: str, fault: str) -> None:
+def test_a_definition_that_does_not_fit_is_a_fault(
+    old: str, new: str, field: str, told: str
+) -> None:
     assert old in EXAMPLE
     with pytest.raises(InvalidInput) as raised:
         MemoryRepo(files(EXAMPLE.replace(old, new)))
-    assert fault in str(raised.value)
+    found = raised.value.faults[0]
+    assert (found.file, found.field) == ("appdefs/map-server/service.yaml", field)
+    assert told in found.message
