@@ -31,9 +31,10 @@ def test_it_is_told_with_the_topic_of_the_inventory_or_of_an_earlier_demand(
     source: str, topic: str, known: list[str], meant: str
 ) -> None:
     books = MemoryRepo()
-    for one in known:
-        books.send(put("known", "other", topic=(one, source)))
-    decision = books.send(put("own", topic=(topic, source)))
+    for number, one in enumerate([*known, topic]):
+        demand = put(f"d{number}")
+        demand["applications"][0]["inputs"] = {"point_cloud": [{"topic": one, "source": source}]}
+        decision = books.send(demand)
     told = f"'{source}' is not known to publish {topic}; did you mean '{meant}'?"
     warned = [text for text in decision.warnings if "did you mean" in text]
     assert [told in text for text in warned] == [True] * bool(meant)
