@@ -9,7 +9,6 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import Refused
 from demandops.decide.decision import Decision
 from demandops.decide.restoration import Restoration
 from demandops.model.demand.demand_request import Decommission
@@ -40,12 +39,8 @@ def waiting_repo() -> MemoryRepo:
 def put(name: str, topics: int = 1, **more: Any) -> dict[str, Any]:
     """Return a demand for a recorder, which has one replica for every two topics."""
     cloud = [{"topic": f"/{name}/t{number}", "source": "vehicle01"} for number in range(topics)]
-    app = {
-        "id": name,
-        "type": "recorder",
-        "place": {"role": "edge"},
-        "inputs": {"point_cloud": cloud},
-    }
+    app = {"id": name, "type": "recorder", "place": {"role": "edge"}}
+    app |= {"inputs": {"point_cloud": cloud}}
     head = {"kind": "Demand", "demand": name, "requesters": ["v"], "applications": [app]}
     return head | {"connections": []} | more
 
@@ -125,14 +120,6 @@ def test_a_rollback_leaves_what_waits() -> None:
     repo.send(Restoration("back", claims=(), drop_newer=True, to="0" * 40))
     assert waits(repo) == ["a", "b"]
     assert book_waiting(repo) == ["a", "b"]
-
-
-def test_a_demand_that_holds_something_does_not_wait_for_more() -> None:
-    repo = full_repo()
-    more = put("full2", 5)
-    with pytest.raises(Refused) as refused:
-        repo.decide(more)
-    assert {fault.code for fault in refused.value.faults} == {"capacity"}
 
 
 @pytest.mark.parametrize(
