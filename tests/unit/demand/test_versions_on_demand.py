@@ -1,4 +1,7 @@
-"""The newest of the demanded versions runs; some updates need approval."""
+"""The newest of the demanded versions runs, or each by itself; some updates need approval.
+
+``tests/scenarios`` has stories of it.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ import pytest
 from demandops.base.errors import InvalidInput, Refused
 from demandops.decide.state import rendered_files, try_configuration
 from demandops.model.config.registry import precedence
+from demandops.model.release import ServiceRelease
 from hypothesis import given
 
 from tests.kit.chance import chances, examples
@@ -25,19 +29,12 @@ DEFAULT = "1.0.0"
 
 def config(policy: str, **more: Any) -> dict[str, str]:
     """Return a configuration in which each version pins the images of both services."""
-    pins = {
-        version: {
-            "images": {name: {"tag": version} for name in ("object-detection", "object-fusion")}
-        }
-        for version in LISTED
-    }
+    services = ("object-detection", "object-fusion")
+    pins = {one: {"images": {name: {"tag": one} for name in services}} for one in LISTED}
     entry = {"default": DEFAULT, "channels": CHANNELS, "versions": pins} | more
-    head = {"apiVersion": "demandops/v1", "kind": "Versions"}
-    made = {
-        "registry/versions.yaml": json.dumps(
-            head | {"applications": {"object-detection-fusion": entry}}
-        )
-    }
+    file = {"apiVersion": "demandops/v1", "kind": "Versions"}
+    file |= {"applications": {"object-detection-fusion": entry}}
+    made = {"registry/versions.yaml": json.dumps(file)}
     return made | edited(APPDEF, "inputs:\n", f"versions: {policy}\ninputs:\n")
 
 
@@ -55,14 +52,7 @@ def release(demand: str) -> dict[str, Any]:
     return put(demand) | {"operation": "release", "applications": []}
 
 
-def running(repo: MemoryRepo) -> dict[str, str]:
-    """Return the version of each running service."""
-    return {name: entry["application_version"] for name, entry in repo.books()["services"].items()}
-
-
 ASKS = "application definition 'object-detection-fusion', for "
-
-
 EDGE = "application 'edge/a'"
 UPGRADE = f"{ASKS}the upgrade of {EDGE} from version"
 RUNS = f"{EDGE} runs version"
@@ -145,66 +135,66 @@ def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
     assert sorted(shuffled, key=precedence) == listed
 
 
-class Walk:
-    """Random demands and releases, with checks of the versions that run."""
+def assert_versions(repo: MemoryRepo, policy: str, asked: dict[str, tuple[str, str, str]]) -> None:
+    """Check that each service runs the newest version of the applications that use it.
 
-    def __init__(self, random: Random, policy: str) -> None:
-        self.random = random
-        self.repo = MemoryRepo(config(policy))
-        self.asked: dict[str, tuple[str, str, str]] = {}
-
-    def step(self) -> None:
-        demand = self.random.choice("abcde")
-        if demand in self.asked and self.random.random() < 0.4:
-            del self.asked[demand]
-            self.repo.send(release(demand))
-        else:
-            wanted = (
-                self.random.choice(["", *LISTED, *CHANNELS]),
-                self.random.choice(["edge/a", "edge/b"]),
-                self.random.choice(["/points", "/more"]),
-            )
-            before = running(self.repo)
-            taken = self.repo.take(put(demand, *wanted))
-            if isinstance(taken, Refused):
-                assert {one.code for one in taken.faults} == {"conflict"}
-                assert running(self.repo) == before
-            else:
-                self.asked[demand] = wanted
-
-    def assert_newest_versions_run(self) -> None:
-        """Check that each service runs the newest version of the applications that use it.
-
-        The version of an application is the newest one that is demanded for it.
-        """
-        newest: dict[str, str] = {}
-        for version, app, _ in self.asked.values():
-            name = CHANNELS.get(version, version or DEFAULT)
-            newest[app] = max(name, newest.get(app, name), key=LISTED.index)
-        for entry in self.repo.books()["services"].values():
-            versions = [newest[app] for app in entry["applications"]]
-            assert entry["application_version"] == max(versions, key=LISTED.index)
-
-    def assert_rendered_from_the_claims(self) -> None:
-        """Check that rendering the claims, in any order, gives the files of the repo."""
-        claims = sorted(self.repo.state.ledger, key=lambda claim: str(claim.key))
-        self.random.shuffle(claims)
-        for ledger in (rebuilt(claims), ledger_in(self.repo.files)):
-            files = rendered_files(state_of(self.repo.config, ledger))
-            assert files == self.repo.below("clusters", "bootstrap")
+    The version of an application is the newest one that is demanded for it. With separate versions,
+    each version except the default has an application of its own.
+    """
+    newest: dict[str, str] = {}
+    for version, app, _ in asked.values():
+        name = CHANNELS.get(version, version or DEFAULT)
+        id = f"{app}@{name}" if policy == "separate" and name != DEFAULT else app
+        newest[id] = max(name, newest.get(id, name), key=LISTED.index)
+    services = [one for one in repo.state.plans.values() if isinstance(one, ServiceRelease)]
+    assert {id for one in services for id in one.applications} == {*newest}
+    for one in services:
+        versions = {newest[id] for id in one.applications}
+        assert one.version.name == max(versions, key=LISTED.index)
+        assert policy != "separate" or len(versions) == 1
+        if one.key.service == "object-fusion":
+            assert {topic.topic for topic in one.inputs["object_list"]} == {
+                topic
+                for other in services
+                if other.key.service == "object-detection"
+                and {*one.applications} <= {*other.applications}
+                for topic in other.outputs.values()
+            }
+    made = [topic for one in services for topic in one.outputs.values()]
+    assert len({*made}) == len(made), "no topic is published twice"
 
 
-@pytest.mark.parametrize("policy", ["refuse", "update", "upgrade"])
+@pytest.mark.parametrize("policy", ["refuse", "update", "upgrade", "separate"])
 @examples(15)
 @given(random=chances)
 def test_what_runs_follows_from_the_claims_whatever_their_order(
     random: Random, policy: str
 ) -> None:
-    walk = Walk(random, policy)
+    repo, asked = MemoryRepo(config(policy)), dict[str, tuple[str, str, str]]()
+    empty = dict(repo.files)
     for _ in range(12):
-        walk.step()
-        walk.assert_newest_versions_run()
-    walk.assert_rendered_from_the_claims()
+        demand = random.choice("abcde")
+        if demand in asked and random.random() < 0.4:
+            del asked[demand]
+            repo.send(release(demand))
+        else:
+            version = random.choice(["", *LISTED, *CHANNELS])
+            wanted = (version, random.choice(["edge/a", "edge/b"]), random.choice(["/p", "/q"]))
+            taken = repo.take(put(demand, *wanted))
+            if isinstance(taken, Refused):
+                assert policy == "refuse"
+                assert {one.code for one in taken.faults} == {"conflict"}
+            else:
+                asked[demand] = wanted
+        assert_versions(repo, policy, asked)
+    claims = sorted(repo.state.ledger, key=lambda claim: str(claim.key))
+    random.shuffle(claims)
+    for ledger in (rebuilt(claims), ledger_in(repo.files)):
+        files = rendered_files(state_of(repo.config, ledger))
+        assert files == repo.below("clusters", "bootstrap")
+    for demand in asked:
+        repo.send(release(demand))
+    assert repo.files == empty
 
 
 def test_each_listed_version_is_rendered_before_anybody_asks_for_it() -> None:
