@@ -6,21 +6,16 @@
 from __future__ import annotations
 
 import re
-from functools import lru_cache
 from pathlib import Path
-from random import Random
-from typing import Any
 
 import pytest
 import yaml
 from demandops.base.errors import InvalidInput
-from demandops.decide.state import rendered_files
 from demandops.model.release import ServiceKey
-from hypothesis import given
 
-from tests.kit.chance import chances, examples
 from tests.kit.config import edited, skeleton
-from tests.kit.memory import MemoryRepo, ledger_in
+from tests.kit.goals import put
+from tests.kit.memory import MemoryRepo
 
 PAGE = (Path(__file__).parents[3] / "docs" / "appdef.md").read_text()
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
@@ -31,7 +26,7 @@ APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
 )
 
 
-def files(service: str = EXAMPLE) -> dict[str, str]:
+def files(service: str) -> dict[str, str]:
     nodes = yaml.safe_load(skeleton()["inventory/nodes.yaml"])
     for node in nodes["nodes"]:
         node["cluster"] = "depot" if node["id"] in ("vehicle02", "vehicle03") else "c-its"
@@ -47,64 +42,23 @@ def files(service: str = EXAMPLE) -> dict[str, str]:
     }
 
 
-@lru_cache(maxsize=1)
-def empty() -> MemoryRepo:
-    return MemoryRepo(files())
+def test_the_example_of_the_page_reads_the_objects_of_all_applications() -> None:
+    repo = MemoryRepo(files(EXAMPLE))
 
+    def read() -> list[list[str]]:
+        plans = repo.state.plans.items()
+        servers = (one for key, one in plans if isinstance(key, ServiceKey) and key.for_cluster)
+        return [sorted(topic.topic for topic in one.inputs["objects"]) for one in servers]
 
-def put(demand: str, node: str = "edge", topic: str = "/ego") -> dict[str, Any]:
-    inputs = {"ego_data": [{"topic": topic, "source": "vehicle00"}]}
-    app = {"id": f"{node}/{demand}", "type": "object-detection-fusion", "node": node}
-    made = {"kind": "Demand", "demand": demand, "requesters": [f"for-{demand}"]}
-    return made | {"applications": [app | {"inputs": inputs}]}
-
-
-def release(demand: str) -> dict[str, Any]:
-    return put(demand) | {"operation": "release", "applications": []}
-
-
-def servers(repo: MemoryRepo) -> dict[str, list[str]]:
-    """Return the applications that use each map server, by the node of the map server."""
-    return {
-        entry["node"]: entry["applications"]
-        for entry in repo.books()["services"].values()
-        if entry["service"] == "map-server"
-    }
-
-
-@given(chances)
-@examples(12)
-def test_one_runs_while_any_application_of_the_cluster_uses_it(random: Random) -> None:
-    repo, held = empty().copy(), dict[str, str]()
-    for _ in range(8):
-        name = random.choice("abcd")
-        if name in held and random.random() < 0.5:
-            repo.send(release(name))
-            del held[name]
-        else:
-            held[name] = random.choice(("edge", "cloud"))
-            repo.send(put(name, held[name]))
-        wanted = sorted(f"{node}/{name}" for name, node in held.items())
-        assert servers(repo) == ({"cloud": wanted} if wanted else {})
-        topics = [
-            topic.topic
-            for key, one in repo.state.plans.items()
-            if isinstance(key, ServiceKey) and key.for_cluster
-            for topic in one.inputs["objects"]
-        ]
-        assert len(topics) == len(held), "the service must read a topic of each application"
-        for application in wanted:
-            node = application.partition("/")[0]
-            carried = repo.books()["connections"].get(f"derived/{node}/cloud", {"topics": {}})
-            named = f"/{application.replace('/', '_')}_global_objectlist"
-            assert named in topics
-            assert (named in carried["topics"]) is (node != "cloud")
-        assert ledger_in(repo.files) == repo.state.ledger
-        again = rendered_files(repo.state)
-        assert {path: repo.files[path] for path in again} == again
-    for name in held:
-        repo.send(release(name))
-    assert repo.files == empty().files
+    repo.send(put("a", node="edge"))
+    repo.send(put("b", node="cloud"))
+    assert read() == [["/edge_a_global_objectlist", "/edge_b_global_objectlist"]]
+    carried = repo.books()["connections"]["derived/edge/cloud"]["topics"]
+    assert [*carried] == ["/edge_a_global_objectlist"]
+    repo.send(put("b", operation="release", applications=[]))
+    assert read() == [["/edge_a_global_objectlist"]]
+    repo.send(put("a", operation="release", applications=[]))
+    assert repo.rendered() == {}
 
 
 @pytest.mark.parametrize(
