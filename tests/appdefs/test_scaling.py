@@ -81,16 +81,6 @@ def fact(repo: MemoryRepo) -> str:
     return told.removeprefix("replicas ")
 
 
-def replicas_by_overrides(*replicas: int) -> dict[str, str]:
-    """Return an override file for each number of replicas; the last override takes precedence."""
-    return {
-        f"overrides/o{rank}.yaml": override(
-            {"services": ["recorder"]}, priority=rank, replicas=number
-        )
-        for rank, number in enumerate(replicas)
-    }
-
-
 def test_the_page_has_a_row_for_each_way() -> None:
     written = " ".join(row[0] for row in ROWS)
     ways = ("topics", "sources", "claims", "requesters", "sizes", "autoscaler")
@@ -205,62 +195,46 @@ def test_who_gives_up_one_topic_of_two_counts_for_the_other() -> None:
     assert (replicas["od-edge-vehicle00"], replicas["od-edge-station00"]) == (1, 2)
 
 
-class TestAutoscaler:
-    """A HorizontalPodAutoscaler owns the number of replicas.
+def test_argo_cd_leaves_the_number_of_an_autoscaler_alone() -> None:
+    repo = books(AUTOSCALED, gitops="argocd")
+    repo.send(demand())
+    spec = release(repo)["spec"]
+    (ignored,) = spec["ignoreDifferences"]
+    assert (ignored["kind"], ignored["jsonPointers"]) == ("Deployment", ["/spec/replicas"])
+    assert "RespectIgnoreDifferences=true" in spec["syncPolicy"]["syncOptions"]
+    of_driver, _ = sorted(repo.objects("Application").items())
+    assert "ignoreDifferences" not in of_driver[1]["spec"]
 
-    No GitOps controller sets the number. An override sets both bounds of the autoscaler.
-    """
 
-    def test_flux_leaves_the_number_alone(self) -> None:
-        repo = books(AUTOSCALED)
-        repo.send(demand())
-        assert release(repo)["spec"]["driftDetection"] == {
-            "mode": "enabled",
-            "ignore": [{"paths": ["/spec/replicas"], "target": {"kind": "Deployment"}}],
-        }
-        assert values(repo)["autoscaler"] == {"min": 2, "max": 5, "cpu": 70}
-        assert "replicas" not in values(repo)
-        of_driver = {name[:4]: one["spec"] for name, one in repo.objects("HelmRelease").items()}
-        assert of_driver["drv-"]["driftDetection"] == {"mode": "enabled"}
-
-    def test_argo_cd_leaves_the_number_alone(self) -> None:
-        repo = books(AUTOSCALED, gitops="argocd")
-        repo.send(demand())
-        spec = release(repo)["spec"]
-        (ignored,) = spec["ignoreDifferences"]
-        assert (ignored["kind"], ignored["jsonPointers"]) == ("Deployment", ["/spec/replicas"])
-        assert "RespectIgnoreDifferences=true" in spec["syncPolicy"]["syncOptions"]
-
-    def test_the_last_override_sets_both_bounds(self) -> None:
-        repo = books(AUTOSCALED, **replicas_by_overrides(0, 3))
-        repo.send(demand())
-        assert values(repo)["autoscaler"] == {"min": 3, "max": 3, "cpu": 70}
-        assert "ignore" in release(repo)["spec"]["driftDetection"]
-
-    @pytest.mark.parametrize(
-        ("files", "place", "told"),
-        [
-            (replicas_by_overrides(3, 0), "overrides/o1.yaml: replicas: ", "'deny' instead"),
-            (
-                {TEMPLATE: ADDITIONS["appdefs/driver/values/driver.yaml.j2"]},
-                f"{TEMPLATE}:1: ",
-                "'replicas' is undefined",
-            ),
-        ],
-        ids=["an override that stops it", "a template that knows only replicas"],
+STOPPED = {
+    f"overrides/o{replicas}.yaml": override(
+        {"services": ["recorder"]}, priority=3 - replicas, replicas=replicas
     )
-    def test_what_does_not_go_with_it_is_a_fault(
-        self, files: dict[str, str], place: str, told: str
-    ) -> None:
-        repo = books(AUTOSCALED, **files)
-        for render in (
-            lambda: repo.send(demand()),
-            lambda: render_trial_demands(repo.state, repo.state.evaluate),
-        ):
-            with pytest.raises(InvalidInput) as invalid:
-                render()
-            assert str(invalid.value).startswith(place)
-            assert told in str(invalid.value)
+    for replicas in (0, 3)
+}
+ONLY_REPLICAS = {TEMPLATE: ADDITIONS["appdefs/driver/values/driver.yaml.j2"]}
+
+
+@pytest.mark.parametrize(
+    ("files", "place", "told"),
+    [
+        (STOPPED, "overrides/o0.yaml: replicas: ", "'deny' instead"),
+        (ONLY_REPLICAS, f"{TEMPLATE}:1: ", "'replicas' is undefined"),
+    ],
+    ids=["an override that stops it", "a template that knows only replicas"],
+)
+def test_what_does_not_go_with_an_autoscaler_is_a_fault(
+    files: dict[str, str], place: str, told: str
+) -> None:
+    repo = books(AUTOSCALED, **files)
+    for render in (
+        lambda: repo.send(demand()),
+        lambda: render_trial_demands(repo.state, repo.state.evaluate),
+    ):
+        with pytest.raises(InvalidInput) as invalid:
+            render()
+        assert str(invalid.value).startswith(place)
+        assert told in str(invalid.value)
 
 
 def doubled(**changed: str) -> list[tuple[str, str]]:

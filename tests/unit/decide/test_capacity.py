@@ -1,26 +1,31 @@
-"""Each change updates a node's usage without a recount; the usage never exceeds the capacity."""
+"""Services never use more of a node than it has, and demands that lack only room may wait for it.
+
+Each change updates a node's usage without a recount.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from datetime import timedelta
 from functools import cache
 from random import Random
 from typing import Any
 
 import pytest
 from demandops.base.errors import Refused
+from demandops.decide.decision import Decision
 from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.state import State
 from demandops.model.config.inventory import Node, amount_of, amount_text
 from demandops.model.config.load import load
 from demandops.model.ledger.ledger import ClaimChange
+from demandops.model.ledger.records import in_turn
 from hypothesis import given
-from hypothesis import strategies as st
 
-from tests.kit.chance import examples
+from tests.kit.chance import chances, examples
 from tests.kit.config import state_of
-from tests.kit.memory import MemoryRepo
+from tests.kit.memory import MemoryRepo, ledger_in
 from tests.scenarios.running import configuration
 
 VEHICLES = ("vehicle00", "vehicle01")
@@ -29,7 +34,7 @@ CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
 
 
 @cache
-def recorders() -> State:
+def recorders(when_full: str = "refuse") -> State:
     """Return a state in which each driver and each replica of a recorder requests 1 cpu."""
     nodes = [
         {"id": id, "type": "vehicle" if id in VEHICLES else "edge", "cluster": "c-its"}
@@ -37,6 +42,7 @@ def recorders() -> State:
         for id in (*VEHICLES, "west", "east")
     ]
     requests = {"cpu": 1}
+    domain = {"name": "all", "namespace": "all", "whenFull": when_full}
     files = configuration(
         ("recorder",),
         {
@@ -44,7 +50,7 @@ def recorders() -> State:
             "appdefs/driver/service.yaml": {"requests": requests},
             "inventory/nodes.yaml": {"nodes": nodes},
             "inventory/brokers.yaml": {"brokers": [{"node": "west", "host": "broker"}]},
-            "policy/access-domains.yaml": {"domains": [{"name": "all", "namespace": "all"}]},
+            "policy/access-domains.yaml": {"domains": [domain]},
         },
     )
     return state_of(load(files))
@@ -62,13 +68,16 @@ def recorder(random: Random) -> dict[str, Any]:
     } | where
 
 
-def goal(random: Random) -> dict[str, Any]:
+def goal(random: Random, *, own: bool) -> dict[str, Any]:
+    """Return a random demand; if ``own``, no other demand has its applications."""
     who = random.choice(VEHICLES)
     made = {"kind": "Demand", "demand": f"{who}-{random.randrange(3)}", "requesters": [who]}
     if random.random() < 0.25:
         return made | {"operation": "release"}
     apps = {app["id"]: app for app in (recorder(random) for _ in range(random.randint(1, 3)))}
-    return made | {"applications": list(apps.values())}
+    if own:
+        apps = {id: app | {"id": f"{made['demand']}/{id}"} for id, app in apps.items()}
+    return made | {"applications": list(apps.values()), "priority": random.randrange(2)}
 
 
 def used(repo: MemoryRepo) -> Counter[str]:
@@ -81,23 +90,48 @@ def used(repo: MemoryRepo) -> Counter[str]:
     return found
 
 
+def book_waiting(repo: MemoryRepo) -> list[str]:
+    """Try to book each waiting demand in order; return the ids of those that were booked."""
+    booked = []
+    for one in in_turn(repo.state.ledger.waiting):
+        taken = repo.take(dict(one.goal))
+        assert isinstance(taken, Decision)
+        booked += [one.demand] if taken.outcome == "booked" else []
+    return booked
+
+
+@pytest.mark.parametrize("when_full", ["refuse", "wait"])
 @examples(12)
-@given(st.randoms(use_true_random=False))
-def test_it_is_counted_by_what_changes_and_no_node_gets_more_than_it_has(random: Random) -> None:
-    repo = MemoryRepo(state=recorders())
-    refused = 0
-    for _ in range(8):
-        before = used(repo)
-        demand = goal(random)
-        taken = repo.take(demand)
+@given(chances)
+def test_no_node_gets_more_than_it_has_and_what_waits_does_not_fit_and_is_booked_in_turn(
+    when_full: str, random: Random
+) -> None:
+    repo, sent = MemoryRepo(state=recorders(when_full)), dict[str, dict[str, Any]]()
+    for _ in range(10):
+        repo.now += timedelta(minutes=1)
+        # who waits for an application that another demand books by a node's name is not told
+        made = goal(random, own=when_full == "wait")
+        taken = repo.take(made)
+        if isinstance(taken, Refused):
+            codes = {fault.code for fault in taken.faults}
+            assert "operation" not in made or codes == {"not-held"}
+        elif taken.outcome == "waiting":
+            sent[made["demand"]] = made
+        if isinstance(taken, Decision) and taken.frees:
+            book_waiting(repo)
         now = used(repo)
         assert {id: repo.state.usage().of(id, "cpu") / 1000 for id in now} == dict(now)
         assert repo.state.usage().amounts == whole_usage(repo.state).amounts
         assert all(now[id] <= most for id, most in CAPACITY.items())
-        if isinstance(taken, Refused):
-            refused += 1
-            assert "operation" not in demand or {f.code for f in taken.faults} == {"not-held"}
-            assert now == before
+        waiting = in_turn(repo.state.ledger.waiting)
+        assert not waiting or when_full == "wait"
+        for one in waiting:
+            assert one.goal == sent[one.demand]
+            assert not repo.state.ledger.claims_of_demand(one.demand)
+            assert repo.decide(dict(one.goal)).outcome == "waiting"
+        turns = [(-one.priority, one.since) for one in waiting]
+        assert turns == sorted(turns)
+        assert ledger_in(repo.files) == repo.state.ledger
     claims = list(repo.state.ledger)
     random.shuffle(claims)
     half = claims[: len(claims) // 2]
@@ -105,8 +139,7 @@ def test_it_is_counted_by_what_changes_and_no_node_gets_more_than_it_has(random:
     known.usage()
     ledger = known.ledger.without(half)
     edited = known.with_ledger(ledger, [ClaimChange(claim, None) for claim in half])
-    anew = replace(known, ledger=ledger)
-    assert edited.usage().amounts == anew.usage().amounts
+    assert edited.usage().amounts == replace(known, ledger=ledger).usage().amounts
 
 
 def test_the_bookkeeping_has_what_is_requested_of_nodes_with_a_capacity() -> None:

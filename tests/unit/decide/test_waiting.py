@@ -1,39 +1,23 @@
-"""Waiting demands are booked in the order in which they wait, and no demand waits if it fits."""
+"""What ends the waiting of a demand; ``test_capacity`` has who waits, and in which order."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from datetime import timedelta
-from random import Random
 from typing import Any
 
 import pytest
 import yaml
-from demandops.decide.decision import Decision
 from demandops.decide.restoration import Restoration
 from demandops.model.demand.demand_request import Decommission
 from demandops.model.ledger import records
 from demandops.model.ledger.records import in_turn
-from hypothesis import given
-from hypothesis import strategies as st
 
-from tests.kit.chance import chances, examples
-from tests.kit.config import state_of
-from tests.kit.memory import MemoryRepo, ledger_in
-from tests.unit.decide.test_capacity import CAPACITY, recorders, used
+from tests.kit.memory import MemoryRepo
+from tests.unit.decide.test_capacity import book_waiting, recorders
 
 
 def waiting_repo() -> MemoryRepo:
     """Return a repo whose only access domain lets demands wait."""
-    state = recorders()
-    (domain,) = state.config.domains.values()
-    domain = domain.model_copy(update={"when_full": "wait"})
-    config = replace(
-        state.config,
-        domains={domain.name: domain},
-        domain_of=dict.fromkeys(state.config.domain_of, domain),
-    )
-    return MemoryRepo(state=state_of(config, state.ledger))
+    return MemoryRepo(state=recorders("wait"))
 
 
 def put(name: str, topics: int = 1, **more: Any) -> dict[str, Any]:
@@ -49,45 +33,8 @@ def release(name: str) -> dict[str, Any]:
     return {"kind": "Demand", "operation": "release", "demand": name, "requesters": ["v"]}
 
 
-def book_waiting(repo: MemoryRepo) -> list[str]:
-    """Try to book each waiting demand in order; return the ids of those that were booked."""
-    booked = []
-    for one in in_turn(repo.state.ledger.waiting):
-        taken = repo.take(dict(one.goal))
-        assert isinstance(taken, Decision)
-        booked += [one.demand] if taken.outcome == "booked" else []
-    return booked
-
-
 def waits(repo: MemoryRepo) -> list[str]:
     return [one.demand for one in in_turn(repo.state.ledger.waiting)]
-
-
-@examples(8)
-@given(chances, st.integers(4, 14))
-def test_what_waits_does_not_fit_and_is_booked_in_turn(random: Random, length: int) -> None:
-    repo, sent = waiting_repo(), dict[str, dict[str, Any]]()
-    for _ in range(length):
-        repo.now += timedelta(minutes=1)
-        name = f"d{random.randrange(6)}"
-        held = bool(repo.state.ledger.claims_of_demand(name))
-        if held or (name in waits(repo) and random.random() < 0.5):
-            taken = repo.take(release(name))
-        else:
-            more = {"priority": random.randrange(2)}
-            sent[name] = put(name, random.choice((1, 3, 5)), **more)
-            taken = repo.take(sent[name])
-        assert isinstance(taken, Decision)
-        if taken.frees:
-            book_waiting(repo)
-        for one in in_turn(repo.state.ledger.waiting):
-            assert one.goal == sent[one.demand]
-            assert not repo.state.ledger.claims_of_demand(one.demand)
-            assert repo.decide(dict(one.goal)).outcome == "waiting"
-        turns = [(-one.priority, one.since) for one in in_turn(repo.state.ledger.waiting)]
-        assert turns == sorted(turns)
-        assert all(used(repo)[id] <= most for id, most in CAPACITY.items())
-        assert ledger_in(repo.files) == repo.state.ledger
 
 
 def full_repo() -> MemoryRepo:
