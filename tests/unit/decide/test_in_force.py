@@ -22,6 +22,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.appdefs.test_scaling import FOLLOWING
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal
 from tests.kit.memory import MemoryRepo
@@ -36,23 +37,8 @@ def files(**overrides: Mapping[str, Any]) -> dict[str, str | None]:
     }
 
 
-CROWD = files(
-    denied={"select": [{"requesters": ["eve"]}, {"connections": ["v2/*"]}], "deny": True},
-    off={"select": [{"services": ["object-detection"], "nodes": ["cloud"]}], "deny": True},
-    kept={
-        "select": [{"applications": ["app/a"], "requesters": ["adam"]}, {"connections": ["v1/*"]}],
-        "keep": True,
-    },
-    frozen={"select": [{"applications": ["app/b"]}], "hold": True, "priority": 5},
-    many={"select": [{"requesters": ["ada*"], "services": ["object-*"]}], "replicas": 3},
-    moved={
-        "select": [{"services": ["object-fusion"], "applications": ["app/a"]}],
-        "node": "cloud",
-        "priority": 9,
-    },
-    pinned={"select": [{"nodes": ["edge"]}], "images": {"mqtt-client": {"tag": "old"}}},
-)
-
+TABLES = plain_yaml.beside(__file__)
+CROWD = files(**TABLES["crowd"])
 people = st.lists(
     st.sampled_from(["adam", "ada", "bob", "eve"]), min_size=1, max_size=2, unique=True
 )
@@ -128,22 +114,7 @@ def test_only_an_override_of_higher_priority_than_a_hold_changes_the_held_releas
     assert (yaml.safe_load(held) != yaml.safe_load(books.files[DETECTION])) is changes
 
 
-@pytest.mark.parametrize(
-    ("select", "fields"),
-    [
-        ({"applications": ["edge/*"]}, ["apps[0].header.id"]),
-        ({"appdefs": ["object-*"]}, ["apps[0].type"]),
-        ({"nodes": ["edge"], "services": ["object-fusion"]}, ["apps[0].type"]),
-        ({"labels": {"node_id": "edge"}, "applications": ["edge/*"]}, ["apps[0].header.id"]),
-        ({"nodes": ["ed?e"], "appdefs": ["*"]}, ["apps[0].type"]),
-        ({"connections": ["vehicle00/*"]}, ["connections[0].id"]),
-        ({"connections": ["*"], "nodes": ["vehicle00"]}, ["connections[0].id"]),
-        ({"requesters": ["vehicle0?"], "applications": ["*"]}, ["apps[0].header.id"]),
-        ({"nodes": ["edge"]}, ["apps[0].header.node_id", "connections[0].target_node_id"]),
-        ({"labels": {"node_id": "vehicle00"}}, ["connections[0].source_node_id"]),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("select", "fields"), TABLES["denied"], ids=str)
 def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
     select: dict[str, Any], fields: list[str]
 ) -> None:

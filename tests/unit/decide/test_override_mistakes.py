@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from demandops.base.errors import Fault, InvalidInput
 from demandops.model.config.load import load
 from demandops.model.ledger.ledger import Ledger, World
 
+from tests.kit import plain_yaml
 from tests.scenarios.running import configuration
 
-_READ = yaml.safe_load(Path(__file__).with_name("override_mistakes.yaml").read_text())
+_READ = plain_yaml.beside(__file__)
 Files = dict[str, dict[str, Any]]
 
 

@@ -9,6 +9,7 @@ from functools import lru_cache
 from itertools import product
 from typing import Any
 
+import pytest
 from demandops.decide.changeset import trial_releases
 from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
 from demandops.model.config.config import Config
@@ -24,6 +25,7 @@ from demandops.model.release import ServiceRelease
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.config import configuration, may_select_same_release
 
@@ -95,27 +97,20 @@ def test_selectors_that_cannot_meet_never_do(one: list[Selector], other: list[Se
         assert not all(hit), traits
 
 
-def test_selectors_that_differ_in_a_single_valued_trait_never_meet() -> None:
-    apart: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        ({"nodes": ["edge"]}, {"nodes": ["cloud", "v*"]}),
-        ({"services": [SHARED]}, {"services": [OWN]}),
-        ({"services": [OWN]}, {"connections": ["*"]}),
-        ({"labels": {"node_id": "a"}}, {"labels": {"node_id": "b"}}),
-        (
-            {"services": [OWN], "applications": ["a"]},
-            {"services": [OWN], "applications": ["b"]},
-        ),
-        ({"connections": ["a"]}, {"connections": ["b"]}),
-    ]
-    together: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        ({"applications": ["a"]}, {"applications": ["b"]}),  # one shared service may serve both
-        ({"requesters": ["a"]}, {"requesters": ["b"]}),
-        ({"nodes": ["edge"]}, {"services": [OWN]}),
-    ]
-    for expected, pairs in ((False, apart), (True, together)):
-        for pair in pairs:
-            one, other = (Selector.model_validate(fields) for fields in pair)
-            assert may_select_same_release([one], [other], config()) is expected, pair
+@pytest.mark.parametrize(
+    ("pair", "meet"),
+    [
+        (pair, name == "together")
+        for name, pairs in plain_yaml.beside(__file__).items()
+        for pair in pairs
+    ],
+    ids=str,
+)
+def test_selectors_that_differ_in_a_single_valued_trait_never_meet(
+    pair: list[dict[str, Any]], meet: bool
+) -> None:
+    one, other = (Selector.model_validate(fields) for fields in pair)
+    assert may_select_same_release([one], [other], config()) is meet
 
 
 json = st.recursive(

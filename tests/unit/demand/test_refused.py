@@ -1,6 +1,6 @@
 """Demands that are refused.
 
-``tests/unit/messages`` has the messages for the tables of ``refused.yaml``.
+``tests/unit/messages`` has the messages for the tables of ``test_refused.yaml``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def _made(make: Callable[..., Any], written: Any) -> Any:
 
 
 def demand_of(written: Any) -> Any:
-    """Return the demand that an entry of ``refused.yaml`` describes."""
+    """Return the demand that an entry of ``test_refused.yaml`` describes."""
     if not isinstance(written, dict) or "kind" in written:
         return written
     apps = [_made(application, one) for one in written.get("apps", ())]
@@ -48,7 +48,7 @@ def demand_of(written: Any) -> Any:
     return _made(goal, written | {"apps": apps, "connections": connections})
 
 
-_TEXT = Path(__file__).with_name("refused.yaml").read_text()
+_TEXT = Path(__file__).with_suffix(".yaml").read_text()
 REFUSED, CONTRADICTING, WRONG = (
     {name: demand_of(written) for name, written in cases.items()}
     for cases in yaml.safe_load(re.sub(r"(\w)\*(\d+)", lambda x: x[1] * int(x[2]), _TEXT)).values()

@@ -16,6 +16,7 @@ from demandops.model.config.registry import precedence
 from demandops.model.release import ServiceRelease
 from hypothesis import given
 
+from tests.kit import plain_yaml
 from tests.kit.chance import chances, examples
 from tests.kit.config import edited, skeleton, state_of
 from tests.kit.memory import MemoryRepo, ledger_in, rebuilt
@@ -53,43 +54,19 @@ def release(demand: str) -> dict[str, Any]:
 
 
 ASKS = "application definition 'object-detection-fusion', for "
-EDGE = "application 'edge/a'"
-UPGRADE = f"{ASKS}the upgrade of {EDGE} from version"
-RUNS = f"{EDGE} runs version"
+CASES = plain_yaml.beside(__file__)
 
 
-@pytest.mark.parametrize(
-    ("policy", "first", "then", "approval", "warning"),
-    [
-        pytest.param("update", "", "1.1.0", "", "", id="an update"),
-        pytest.param("update", "testing", "1.1.0", "", "", id="the same by another name"),
-        pytest.param(
-            "update", "1.1.0", "1.1.0-rc.2",
-            "", f"{RUNS} 1.1.0, which others ask for, not 1.1.0-rc.2", id="an older one",
-        ),
-        pytest.param("update", "2.0.0", "", "", "", id="one that names none takes an upgrade"),
-        pytest.param("upgrade", "", "2.0.0", "", "", id="an upgrade that needs nobody"),
-        pytest.param("update", "", "2.0.0", f"{UPGRADE} 1.0.0 to 2.0.0", "", id="an upgrade"),
-        pytest.param(
-            "update", "0.9.0", "", f"{UPGRADE} 0.9.0 to 1.0.0", "", id="the default is an upgrade"
-        ),
-        pytest.param(
-            "update", "2.0.0", "1.1.0",
-            f"{ASKS}version 1.1.0 of {EDGE}, which runs in version 2.0.0",
-            f"{RUNS} 2.0.0, which others ask for, not 1.1.0", id="an older major version by name",
-        ),
-    ],
-)  # fmt: skip
-def test_what_follows_from_another_version(
-    policy: str, first: str, then: str, approval: str, warning: str
-) -> None:
-    repo = MemoryRepo(config(policy))
-    assert repo.send(put("a", first)).approval == (), "the first demand contradicts nobody"
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_what_follows_from_another_version(case: dict[str, str]) -> None:
+    repo, then = MemoryRepo(config(case["policy"])), case.get("then", "")
+    first = repo.send(put("a", case.get("first", "")))
+    assert first.approval == (), "the first demand contradicts nobody"
     before = repo.rendered()
     decision = repo.send(put("b", then))
     assert decision.outcome == "booked"
-    assert decision.approval == ((approval,) if approval else ())
-    assert decision.warnings == ((warning,) if warning else ())
+    assert decision.approval == ((ASKS + case["approval"],) if "approval" in case else ())
+    assert [case["warns"] in text for text in decision.warnings] == [True] * ("warns" in case)
     again = repo.send(put("b", then, cloud="/more"))
     assert again.approval == (), "a booked demand needs no second approval"
     assert repo.send(release("b")).approval == ()
