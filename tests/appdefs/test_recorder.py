@@ -11,6 +11,7 @@ from typing import Any
 
 import pytest
 
+from tests.kit import plain_yaml
 from tests.kit.config import skeleton
 from tests.kit.goals import CLOUD
 from tests.kit.memory import NOW, MemoryRepo
@@ -45,29 +46,8 @@ def merged(name: str, given: list[object]) -> object:
     return found
 
 
-@pytest.mark.parametrize(
-    ("name", "given", "result"),
-    [
-        ("labels", [["b", "a"], ["c", "b"]], ["a", "b", "c"]),
-        ("labels", ["b", ["a"]], ["a", "b"]),
-        ("labels", [[], []], []),
-        ("labels", [["yes", "1e3"], None], ["1e3", "yes"]),
-        ("rate", [10, 20], 20),
-        ("rate", [2.5, 2], 2.5),
-        ("rate", [-3, -2], -2),
-        ("rate", [0.5, None], 0.5),  # the default of 1 does not count
-        ("rate", [None, None], 1),
-        ("quality", [10, 20], 10),
-        ("quality", [0, 0.5], 0),
-        ("title", ["first", "second"], "second"),
-        ("title", ["{{ x }}\n: 'y'", None], "{{ x }}\n: 'y'"),
-        ("format", ["bag", "bag"], "bag"),
-        ("format", ["bag", None], "bag"),
-    ],
-)
-def test_the_definition_says_how_values_of_several_demands_merge(
-    name: str, given: list[object], result: object
-) -> None:
-    assert merged(name, given) == result
-    if name != "title":  # of several titles, the last one counts
-        assert merged(name, given[::-1]) == result
+@pytest.mark.parametrize("case", plain_yaml.beside(__file__), ids=str)
+def test_the_definition_says_how_values_of_several_demands_merge(case: dict[str, Any]) -> None:
+    assert merged(case["name"], case["given"]) == case["merged"]
+    if case["name"] != "title":  # of several titles, the last one counts
+        assert merged(case["name"], case["given"][::-1]) == case["merged"]

@@ -5,28 +5,12 @@ from __future__ import annotations
 import pytest
 from demandops.decide import warnings
 
-from tests.kit.goals import put
+from tests.kit import plain_yaml
+from tests.kit.goals import CLOUD, put
 from tests.kit.memory import MemoryRepo
 
-USUAL = "/vehicles/vehicle00/drivers/lidar/pointcloud"
-"""The topic of vehicle00 in the inventory."""
 
-
-@pytest.mark.parametrize(
-    ("source", "topic", "known", "meant"),
-    [
-        ("vehicle00", USUAL.replace("pointcloud", "pontcloud"), [], USUAL),
-        ("vehicle00", USUAL.replace("pointcloud", "pointcluod"), [], USUAL),
-        ("vehicle00", f"{USUAL}s", [], USUAL),
-        ("vehicle00", USUAL.replace("pointcloud", "pointCloud"), [], USUAL),
-        ("cloud", "/objcts", ["/objects"], "/objects"),
-        ("vehicle00", USUAL, [], ""),
-        ("vehicle00", f"{USUAL}2", [], ""),
-        ("vehicle00", USUAL.replace("lidar", "camera"), [], ""),
-        ("vehicle00", "/cameras/front_l", ["/cameras/front_r"], ""),
-        ("vehicle00", "/local_objects", ["/global_objects"], ""),
-    ],
-)
+@pytest.mark.parametrize(("source", "topic", "known", "meant"), plain_yaml.beside(__file__))
 def test_it_is_told_with_the_topic_of_the_inventory_or_of_an_earlier_demand(
     source: str, topic: str, known: list[str], meant: str
 ) -> None:
@@ -43,8 +27,8 @@ def test_it_is_told_with_the_topic_of_the_inventory_or_of_an_earlier_demand(
 def test_check_tells_of_it_with_the_file_of_the_claim() -> None:
     books = MemoryRepo()
     link = {"id": "own/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
-    link |= {"topics": [{"source": USUAL.replace("vehicles", "vehicle")}]}
+    link |= {"topics": [{"source": CLOUD[0].replace("vehicles", "vehicle")}]}
     books.send(put("own", "own", applications=[], connections=[link]))
     (found,) = warnings.misspelled_topic_warnings(books.state)
     assert found.file.startswith("ledger/connections/")
-    assert f"did you mean '{USUAL}'?" in found.message
+    assert f"did you mean '{CLOUD[0]}'?" in found.message

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from itertools import combinations
+from typing import Any
 
 import pytest
 import yaml
 
+from tests.kit import plain_yaml
 from tests.kit.config import brokers
 from tests.kit.goals import application, connection, goal
 from tests.kit.memory import MemoryRepo
@@ -19,35 +21,22 @@ def hosts(books: MemoryRepo) -> set[str]:
     }
 
 
-@pytest.mark.parametrize(
-    ("there", "requested", "ends", "chosen"),
-    [
-        (("cloud", "edge", "vehicle00"), "cloud", ("vehicle00", "edge"), "cloud"),
-        (("edge",), "edge", ("vehicle00", "cloud"), "edge"),
-        (("cloud", "edge", "vehicle00"), "", ("vehicle00", "edge"), "edge"),
-        (("cloud", "vehicle00"), "", ("vehicle00", "edge"), "vehicle00"),
-        (("cloud",), "", ("vehicle00", "edge"), "cloud"),
-        (("cloud",), "edge", ("vehicle00", "edge"), "cloud"),
-        (("cloud", "edge"), "nowhere", ("vehicle00", "edge"), "edge"),
-        (("cloud", "vehicle00"), "station00", ("vehicle00", "edge"), "vehicle00"),
-    ],
-    ids=["the requested", "the requested, which is the only one", "the target's",
-         "the source's", "the only one", "the only one instead of the requested",
-         "the target's instead of one that is not there",
-         "the source's instead of one that is not there"],
-)  # fmt: skip
+CASES = plain_yaml.beside(__file__)
+
+
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_the_broker_is_chosen_by_rule_and_told_if_it_is_not_the_requested_one(
-    there: tuple[str, ...], requested: str, ends: tuple[str, str], chosen: str
+    case: dict[str, Any],
 ) -> None:
-    books = MemoryRepo(brokers(*there))
-    decision = books.send(goal([], [connection(broker=requested, ends=ends)]))
+    asked, chosen, ends = case["asked"], case["chosen"], ("vehicle00", case["to"])
+    books = MemoryRepo(brokers(*case["there"]))
+    decision = books.send(goal([], [connection(broker=asked, ends=ends)]))
     assert hosts(books) == {f"broker-{chosen}"}
     told = (
         f"'vehicle00/edge' uses the broker on '{chosen}', because inventory/brokers.yaml has none"
     )
-    assert [f"{told} on '{requested}'" in one for one in decision.warnings] == [True] * (
-        requested not in ("", chosen)
-    )
+    warned = [f"{told} on '{asked}'" in one for one in decision.warnings]
+    assert warned == [True] * (asked not in ("", chosen))
     again = books.send(goal([], [connection(broker=chosen, ends=ends)], id="2"))
     assert again.outcome == "booked", "both goals must get the same broker"
 
