@@ -6,6 +6,7 @@ Each change updates a node's usage without a recount.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import timedelta
 from functools import cache
@@ -56,26 +57,28 @@ def recorders(when_full: str = "refuse") -> State:
     return state_of(load(files))
 
 
-def recorder(random: Random) -> dict[str, Any]:
+def recorder(random: Random, vehicles: Sequence[str]) -> dict[str, Any]:
     """Return a random recorder application with one replica for every two topics."""
-    known = [(vehicle, f"/t{number}") for vehicle in VEHICLES for number in range(3)]
-    topics = random.sample(known, random.randint(1, 5))
+    known = [(vehicle, f"/t{number}") for vehicle in vehicles for number in range(3)]
+    topics = random.sample(known, random.randint(1, min(5, len(known))))
     where = random.choice(({"place": {"role": "edge"}}, {"node": "west"}, {"node": "east"}))
-    return {
-        "id": f"app{random.randrange(4)}",
-        "type": "recorder",
-        "inputs": {"point_cloud": [{"topic": topic, "source": of} for of, topic in topics]},
-    } | where
+    inputs = {"point_cloud": [{"topic": topic, "source": of} for of, topic in topics]}
+    return {"id": f"app{random.randrange(4)}", "type": "recorder", "inputs": inputs} | where
 
 
-def goal(random: Random, *, own: bool) -> dict[str, Any]:
-    """Return a random demand; if ``own``, no other demand has its applications."""
+def goal(random: Random, *, alone: bool) -> dict[str, Any]:
+    """Return a random demand; if ``alone``, it can share nothing that would be new on a full node.
+
+    A demand that waits, and fits because another one books what both share, is not tried at once.
+    """
     who = random.choice(VEHICLES)
     made = {"kind": "Demand", "demand": f"{who}-{random.randrange(3)}", "requesters": [who]}
     if random.random() < 0.25:
         return made | {"operation": "release"}
-    apps = {app["id"]: app for app in (recorder(random) for _ in range(random.randint(1, 3)))}
-    if own:
+    vehicles = VEHICLES[1:] if alone else VEHICLES
+    found = [recorder(random, vehicles) for _ in range(random.randint(1, 3))]
+    apps = {app["id"]: app for app in found}
+    if alone:
         apps = {id: app | {"id": f"{made['demand']}/{id}"} for id, app in apps.items()}
     return made | {"applications": list(apps.values()), "priority": random.randrange(2)}
 
@@ -109,8 +112,7 @@ def test_no_node_gets_more_than_it_has_and_what_waits_does_not_fit_and_is_booked
     repo, sent = MemoryRepo(state=recorders(when_full)), dict[str, dict[str, Any]]()
     for _ in range(10):
         repo.now += timedelta(minutes=1)
-        # who waits for an application that another demand books by a node's name is not told
-        made = goal(random, own=when_full == "wait")
+        made = goal(random, alone=when_full == "wait")
         taken = repo.take(made)
         if isinstance(taken, Refused):
             codes = {fault.code for fault in taken.faults}
