@@ -11,16 +11,11 @@ from demandops.base.errors import InvalidInput
 from demandops.decide.changeset import render_trial_demands
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import rendered_files
-from demandops.model.config.appdef import Scaling
-from demandops.model.demand.claim import InputTopic
-from demandops.model.release import ServiceKey, replicas_of
+from demandops.model.release import ServiceKey
 from demandops.views.release_causes import override_report, warnings
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.appdefs.test_recorder import ADDITIONS
 from tests.kit import plain_yaml
-from tests.kit.chance import examples
 from tests.kit.config import override, skeleton
 from tests.kit.goals import CLOUD, STATION_CLOUD, application, goal
 from tests.kit.memory import NOW, MemoryRepo
@@ -106,36 +101,6 @@ def test_the_page_shows_the_template_that_serves_both() -> None:
     text = re.sub("^    ", "", shown, flags=re.MULTILINE)
     for path in (ROOT / "appdefs" / "object-detection-fusion" / "values").iterdir():
         assert text in path.read_text(), path.name
-
-
-COUNTS = st.integers(0, 60)
-SCALINGS = st.builds(
-    lambda low, more, measure, share: Scaling.model_validate(
-        {"min": low, "max": low + more, "per": {measure: share}}
-        | ({"mayDependOnRequesters": True} if measure == "requesters" else {})
-    ),
-    st.integers(0, 5),
-    st.integers(1, 9),
-    st.sampled_from(["topics", "sources", "claims", "requesters"]),
-    st.integers(1, 9),
-)
-
-
-@given(SCALINGS, st.lists(COUNTS, min_size=4, max_size=4), st.lists(COUNTS, min_size=4, max_size=4))
-@examples(80)
-def test_more_of_anything_never_gives_fewer_and_bounds_hold(
-    scaling: Scaling, counts: list[int], more: list[int]
-) -> None:
-    def replicas(topics: int, sources: int, claims: int, requesters: int) -> int:
-        listed = [InputTopic(f"/{one}", str(one % (sources + 1))) for one in range(topics)]
-        many: Any = range(claims), range(requesters)
-        found = replicas_of(scaling, {}, listed, *many)
-        assert isinstance(found, int)
-        return found
-
-    few = replicas(*counts)
-    many = replicas(*(one + other for one, other in zip(counts, more, strict=True)))
-    assert scaling.min <= few <= many <= scaling.max
 
 
 def test_the_largest_demanded_size_applies_and_an_unknown_size_is_refused() -> None:

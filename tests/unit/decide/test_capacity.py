@@ -18,7 +18,7 @@ from demandops.base.errors import Refused
 from demandops.decide.decision import Decision
 from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.state import State
-from demandops.model.config.inventory import Node, amount_of, amount_text
+from demandops.model.config.inventory import amount_of, amount_text
 from demandops.model.config.load import load
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.model.ledger.records import in_turn
@@ -183,10 +183,3 @@ def test_a_quantity_is_read_as_kubernetes_does(
 def test_an_invalid_quantity_is_a_fault(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a quantity|is finer than a thousandth"):
         amount_of(text)
-
-
-def test_a_node_limits_what_it_declares() -> None:
-    plain = Node(id="a", type="edge", cluster="c")
-    node = plain.model_copy(update={"capacity": {"gpu": "2"}})
-    assert [plain.most(name) for name in ("cpu", "gpu")] == [None, None]
-    assert [node.most(name) for name in ("cpu", "memory", "gpu", "fpga")] == [None, None, 2000, 0]

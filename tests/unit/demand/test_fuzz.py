@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 from unicodedata import category
 
@@ -82,41 +81,28 @@ def test_the_form_is_judged_alike_with_and_without_a_catalog(data: Any) -> None:
     assert request is not None or faults
 
 
-def goals(text: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    """Return a strategy for goals of the right form, whose texts come from the strategy `text`."""
-    topics = st.lists(st.tuples(text, text), max_size=2)
-    apps = st.lists(
-        st.builds(
-            application,
-            text,
-            node=text,
-            who=st.lists(text, max_size=2),
-            ego=topics,
-            clouds=topics,
-            type=st.integers(0, 2),
-        ),
-        max_size=2,
-    )
-    connections = st.lists(
-        st.builds(
-            connection,
-            text,
-            who=st.lists(text, max_size=2),
-            ends=st.tuples(text, text),
-            topics=st.lists(text, max_size=2),
-            targets=st.lists(text, max_size=2),
-            broker=text,
-            type=st.integers(0, 3),
-        ),
-        max_size=2,
-    )
-    make: Callable[..., Any] = goal
-    return st.builds(make, apps, connections, id=text, shutdown=st.booleans())
+TEXTS = st.lists(TEXT, max_size=2)
+TOPICS = st.lists(st.tuples(TEXT, TEXT), max_size=2)
+TYPE = st.integers(0, 3)
+APPLICATIONS = st.builds(
+    application, TEXT, node=TEXT, who=TEXTS, ego=TOPICS, clouds=TOPICS, type=TYPE
+)
+CONNECTIONS = st.builds(
+    connection, TEXT, who=TEXTS, ends=st.tuples(TEXT, TEXT), topics=TEXTS, targets=TEXTS,
+    broker=TEXT, type=TYPE,
+)  # fmt: skip
+GOALS: st.SearchStrategy[Any] = st.builds(
+    goal,
+    st.lists(APPLICATIONS, max_size=2),
+    st.lists(CONNECTIONS, max_size=2),
+    id=TEXT,
+    shutdown=st.booleans(),
+)
 
 
 @examples(70)
 @example(goal([], [connection(ends=("\x7f", "\x7f"), topics=["/a"])]))
-@given(goals(TEXT))
+@given(GOALS)
 def test_a_goal_of_the_right_form_is_decided_or_refused(data: Any) -> None:
     found = outcome(data)
     if isinstance(found, tuple):
