@@ -5,19 +5,15 @@ from __future__ import annotations
 from typing import Any
 from unicodedata import category
 
-import yaml
-from demandops.base.errors import Fault, InvalidInput, Refused
+from demandops.base.errors import Fault, Refused
 from demandops.decide.decision import Decision, decide
 from demandops.model.demand import deployment_request_goal
-from demandops.repo.history import commit_message
-from demandops.repo.history.commit_log import parse
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
 from tests.kit.goals import APP, CLOUD, application, connection, goal
 from tests.kit.memory import NOW, MemoryRepo
-from tests.kit.plain_yaml import FAST
 
 TEXT = st.text(max_size=12) | st.sampled_from(
     ["", "edge", "vehicle00", APP, CLOUD[0], "/a", "..", "~", "\\", "\ud800", "a" * 1100, "{{ x }}"]
@@ -107,35 +103,6 @@ def test_a_goal_of_the_right_form_is_decided_or_refused(data: Any) -> None:
     found = outcome(data)
     if isinstance(found, tuple):
         assert_told(found)
-
-
-ID = st.text(min_size=1, max_size=30)
-
-
-@examples(70)
-@given(ID, ID, ID)
-@example("\\", "\\", "\\")
-@example(".", "<>", " ")
-@example("Operation: x", "Request-Id: y", "#")
-@example("a\u00a0b", "a", "a")
-def test_any_id_is_refused_or_booked_rendered_committed_and_released(
-    id: str, who: str, request: str
-) -> None:
-    asked = goal([application(id, who=[who])], [connection(id, who=[who])], id=request)
-    books = MemoryRepo()
-    try:
-        decision = books.send(asked)
-    except InvalidInput as refused:
-        assert isinstance(refused, Refused)
-        assert_told(refused.faults)
-        return
-    for text in books.rendered().values():
-        assert all(isinstance(item, dict) for item in yaml.load_all(text, Loader=FAST))
-    assert commit_message.author(decision, NOW).name
-    text = commit_message.of_decision(decision, "operation", NOW)
-    assert parse(text).trailers["Requester"] == [who]
-    books.send(asked | {"shutdown": True})
-    assert books.rendered() == {}
 
 
 def test_a_name_with_half_a_character_is_refused_wherever_it_stands() -> None:

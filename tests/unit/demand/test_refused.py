@@ -17,7 +17,6 @@ from demandops.base import naming
 from demandops.base.errors import MOST_FAULTS, Fault, Refused, suggestion
 from demandops.model.demand import demand_goal
 
-from tests.kit.config import skeleton
 from tests.kit.goals import (
     BODY,
     ROS_NAMES,
@@ -28,7 +27,7 @@ from tests.kit.goals import (
     put,
 )
 from tests.kit.memory import MemoryRepo
-from tests.unit.decide.test_budget import counted
+from tests.unit.decide.test_budget import counted, repo
 
 
 def _made(make: Callable[..., Any], written: Any) -> Any:
@@ -81,14 +80,8 @@ def test_a_topic_name_that_ros_forbids_is_refused_wherever_it_stands(topic: str)
     ]
 
 
-def limited(**limits: int) -> MemoryRepo:
-    """Return a state repo with these ``limits`` in its demandops.yaml."""
-    settings = yaml.safe_load(skeleton()["demandops.yaml"])
-    return MemoryRepo({"demandops.yaml": yaml.safe_dump(settings | {"limits": limits})})
-
-
-def faults(repo: MemoryRepo, asked: Goal) -> tuple[Fault, ...]:
-    refused = repo.take(asked)
+def faults(books: MemoryRepo, asked: Goal) -> tuple[Fault, ...]:
+    refused = books.take(asked)
     assert isinstance(refused, Refused)
     return refused.faults
 
@@ -99,8 +92,8 @@ def test_a_demand_that_lists_too_much_is_refused_at_once() -> None:
     assert (found.field, found.code) == ("", "too-large")
     assert "limits.demandItems" in found.message
     item = goal([], [connection(topics=["/a", "/b"])])
-    assert limited(demandItems=4).send(item).outcome == "booked"
-    assert len(faults(limited(demandItems=3), item)) == 1
+    assert repo(demandItems=4).send(item).outcome == "booked"
+    assert len(faults(repo(demandItems=3), item)) == 1
 
 
 @pytest.mark.parametrize("key", ["k{}".format, int])
@@ -119,13 +112,13 @@ def test_of_many_faults_of_form_the_first_are_told() -> None:
 
 def test_a_file_that_would_grow_too_large_is_refused_and_may_shrink() -> None:
     topics = [f"/topic_{i}" for i in range(30)]
-    found = faults(limited(fileBytes=1000), goal([], [connection(topics=topics)]))
+    found = faults(repo(fileBytes=1000), goal([], [connection(topics=topics)]))
     assert {one.file.split("/")[0] for one in found} == {"clusters"}
     assert all("at most 1000 are allowed" in one.message for one in found)
-    repo = MemoryRepo()
-    repo.send(goal([], [connection(topics=topics)]))
-    small = limited(fileBytes=1000)
-    small.state, small.files = replace(small.state, ledger=repo.state.ledger), repo.files
+    before = MemoryRepo()
+    before.send(goal([], [connection(topics=topics)]))
+    small = repo(fileBytes=1000)
+    small.state, small.files = replace(small.state, ledger=before.state.ledger), before.files
     small.send(goal([], [connection(topics=topics[:1])], shutdown=True))
 
 
