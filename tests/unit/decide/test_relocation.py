@@ -15,24 +15,16 @@ from demandops.decide.booking import Drain
 from demandops.decide.placement.relocation import with_moves
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import all_keys
-from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
 from demandops.model.demand.claim import Application, Requirement
-from demandops.model.release import ServiceKey, ServiceRelease
+from demandops.model.release import ServiceRelease
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
 from tests.kit.config import state_of
-from tests.kit.memory import MemoryRepo, ledger_in, rebuilt
-from tests.unit.decide.test_flows import (
-    NODES,
-    Demands,
-    Graphs,
-    assert_every_topic_comes_in_one_way,
-    in_clusters,
-    instances,
-)
+from tests.kit.memory import MemoryRepo, rebuilt
+from tests.unit.decide.test_flows import NODES, Demands, Graphs, assert_follows
 
 MOST = 2
 PLACE = {"place": {"capabilities": ["gpu"]}, "requests": {"slot": 1}}
@@ -108,19 +100,13 @@ def assert_sound(repo: MemoryRepo, demands: Demands) -> None:
             assert name in placed[app["id"]] or not definition.place
         for name, node in app.get("services", {}).items():
             assert placed[app["id"]].get(name, app["node"]) == node
-    running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
-    assert running == {k for one in apps for k in instances(demands.graphs, one, placed[one["id"]])}
+    releases = (plan(repo.state, key) for key in all_keys(repo.state))
     used = Counter(
-        release.node.id
-        for key in running
-        for release in [plan(repo.state, key)]
-        if isinstance(release, ServiceRelease) and release.service.requests
+        one.node.id for one in releases if isinstance(one, ServiceRelease) and one.service.requests
     )
     assert all(used[node] <= MOST for node in used), used
     assert {*used} <= {*NODES}
-    assert_every_topic_comes_in_one_way(repo, demands)
-    assert ledger_in(repo.files) == repo.state.ledger
-    assert in_clusters(repo.files) == in_clusters(rendered_files(repo.state))
+    assert_follows(repo, demands, placed)
 
 
 @pytest.mark.parametrize("kind", [Demands, NamingServices, Placed])
