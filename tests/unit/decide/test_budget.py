@@ -17,7 +17,7 @@ from demandops.base.errors import OverBudget, Refused
 from demandops.decide.decision import MOST_TRIALS, decide
 
 from tests.kit.config import override, skeleton
-from tests.kit.goals import Goal, application, connection, goal
+from tests.kit.goals import Goal, application, connection, goal, perception
 from tests.kit.memory import MemoryRepo
 
 ENDS = ("vehicle00", "edge")
@@ -42,10 +42,10 @@ def app(number: int, topics: int = 1, **more: Any) -> dict[str, Any]:
     return made | ({} if "node" in more else {"place": {"role": "edge"}}) | more
 
 
-def link(number: int, ends: tuple[str, str] = ENDS, topics: int = 1, **more: Any) -> dict[str, Any]:
+def link(number: int, ends: tuple[str, str] = ENDS, topics: int = 1) -> dict[str, Any]:
     listed = [{"source": f"/c{number}/n{index}"} for index in range(topics)]
     made = {"id": f"c{number}", "type": "mqtt", "source": ends[0], "target": ends[1]}
-    return made | {"topics": listed} | more
+    return made | {"topics": listed}
 
 
 def demand(
@@ -181,16 +181,13 @@ def test_what_was_booked_is_released_however_long_it_takes() -> None:
     def checkpoint() -> None:
         raise OverBudget("too long")
 
-    books = repo()
-    books.send(demand([app(0)], [link(n) for n in range(20)]))
-    release = {"kind": "Demand", "operation": "release", "demand": "d", "requesters": ["attacker"]}
-    made = decide(books.state, release, books.now, books.files.get, checkpoint=checkpoint)
-    assert made.outcome == "released"
-    books.send(release)
-    books.send(goal([application()], [connection()]))
-    leave = goal([application()], [connection()], shutdown=True)
-    made = decide(books.state, leave, books.now, books.files.get, checkpoint=checkpoint)
-    assert made.outcome == "released"
+    own, reference = demand([app(0)], [link(n) for n in range(20)]), perception()
+    release = demand(operation="release")
+    for made, end in ((own, release), (reference, reference | {"shutdown": True})):
+        books = repo()
+        books.send(made)
+        ended = decide(books.state, end, books.now, books.files.get, checkpoint=checkpoint)
+        assert ended.outcome == "released"
 
 
 @pytest.mark.parametrize(

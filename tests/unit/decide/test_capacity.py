@@ -24,6 +24,7 @@ from demandops.model.ledger.ledger import ClaimChange
 from demandops.model.ledger.records import in_turn
 from hypothesis import given
 
+from tests.kit import plain_yaml
 from tests.kit.chance import chances, examples
 from tests.kit.config import state_of
 from tests.kit.memory import MemoryRepo, ledger_in
@@ -157,20 +158,10 @@ def test_the_bookkeeping_has_what_is_requested_of_nodes_with_a_capacity() -> Non
     assert "nodes" not in MemoryRepo().bookkeeping()
 
 
-@pytest.mark.parametrize(
-    ("text", "thousandths", "of_cpu", "of_memory"),
-    [
-        ("2", 2_000, "2", "2"),
-        ("500m", 500, "0.5", "0.5"),
-        ("1.25", 1_250, "1.25", "1.25"),
-        ("2k", 2_000_000, "2000", "2000"),
-        ("1.5Ki", 1_536_000, "1536", "1536"),
-        ("1024Mi", 2**30 * 1000, str(2**30), "1Gi"),
-        ("1.5Gi", 1536 * 2**20 * 1000, str(1536 * 2**20), "1536Mi"),
-        ("1000", 1_000_000, "1000", "1000"),
-        ("0", 0, "0", "0"),
-    ],
-)
+TABLES = plain_yaml.beside(__file__)
+
+
+@pytest.mark.parametrize(("text", "thousandths", "of_cpu", "of_memory"), TABLES["quantities"])
 def test_a_quantity_is_read_as_kubernetes_does(
     text: str, thousandths: int, of_cpu: str, of_memory: str
 ) -> None:
@@ -179,7 +170,7 @@ def test_a_quantity_is_read_as_kubernetes_does(
     assert amount_text(thousandths, "memory") == of_memory
 
 
-@pytest.mark.parametrize("text", ["", "-1", "1e3", "1 Gi", "0.5m", "1.2345", "many", "1GB"])
+@pytest.mark.parametrize("text", TABLES["invalid"])
 def test_an_invalid_quantity_is_a_fault(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a quantity|is finer than a thousandth"):
         amount_of(text)

@@ -48,21 +48,15 @@ def demand_of(written: Any) -> Any:
 
 
 _TEXT = Path(__file__).with_suffix(".yaml").read_text()
+TABLES = yaml.safe_load(re.sub(r"(\w)\*(\d+)", lambda x: x[1] * int(x[2]), _TEXT))
 REFUSED, CONTRADICTING, WRONG = (
-    {name: demand_of(written) for name, written in cases.items()}
-    for cases in yaml.safe_load(re.sub(r"(\w)\*(\d+)", lambda x: x[1] * int(x[2]), _TEXT)).values()
+    {name: demand_of(written) for name, written in TABLES[table].items()}
+    for table in ("refused", "contradicting", "form")
 )
 WRONG["keys that are no text"][1, 2] = "x"
 
 
-@pytest.mark.parametrize(
-    "topic",
-    [
-        "/a b", "/a\tb", "/a\nb", "/a'b", '/a"b', "/a$(touch /tmp/x)b", "/a`id`", "/{{ 7 * 7 }}",
-        "/{% raw %}", "/a;b", "/a&b", "/a|b", "/a//b", "/a/", "/", "/1a", "/a/1b", "/a-b", "/a.b",
-        "/a+b", "/#", "/ü", "/a\0", "/a\u200bb", "/é", "/a\\b", "/{node}", "/*",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("topic", TABLES["topics"])
 def test_a_topic_name_that_ros_forbids_is_refused_wherever_it_stands(topic: str) -> None:
     shown = topic if topic.isprintable() else topic.encode("unicode_escape").decode()
     asked = goal(
