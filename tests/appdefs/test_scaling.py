@@ -17,7 +17,6 @@ from demandops.views.release_causes import override_report, warnings
 from tests.appdefs.test_recorder import ADDITIONS
 from tests.kit import plain_yaml
 from tests.kit.config import override, skeleton
-from tests.kit.goals import CLOUD, STATION_CLOUD, application, goal
 from tests.kit.memory import NOW, MemoryRepo
 
 ROOT = Path(__file__).parents[2]
@@ -103,17 +102,6 @@ def test_the_page_shows_the_template_that_serves_both() -> None:
         assert text in path.read_text(), path.name
 
 
-def test_the_largest_demanded_size_applies_and_an_unknown_size_is_refused() -> None:
-    repo = books("{sizes: {parameter: size, replicas: {small: 1, medium: 2, large: 4}}}")
-    for name, size, replicas in (("a", "medium", 2), ("b", "large", 4), ("c", ["small"], 4)):
-        repo.send(demand(name, size=size))
-        assert values(repo)["replicas"] == replicas
-    (found,) = repo.faults(demand("b", size="lage"))
-    assert found.startswith("parameters.size: ['lage', 'medium', 'small'] is not a size; known: l")
-    repo.send(demand("b") | {"operation": "release", "applications": []})
-    assert values(repo)["replicas"] == 2
-
-
 SHIPPED = "appdefs/object-detection-fusion/appdef.yaml"
 BY_WHO = "{min: 0, max: 9, per: {requesters: 1}, mayDependOnRequesters: true, dividesWork: true}"
 BY_CLAIMS = "{min: 0, max: 9, per: {claims: 1}, dividesWork: true}"
@@ -149,15 +137,6 @@ def test_a_change_of_requesters_replans_only_what_depends_on_them(
         again = rendered_files(decision.state)
         assert {path: repo.files[path] for path in again} == again
         assert sum(path.startswith("clusters/") for path in decision.files) == files
-
-
-def test_who_gives_up_one_topic_of_two_counts_for_the_other() -> None:
-    repo, clouds = MemoryRepo(FOLLOWING), [CLOUD, STATION_CLOUD]
-    repo.send(goal([application(who=["a", "b"], clouds=clouds)]))
-    repo.send(goal([application(who=["a"], clouds=[CLOUD])], shutdown=True))
-    found = repo.objects("HelmRelease")
-    replicas = {name: one["spec"]["values"]["replicas"] for name, one in found.items()}
-    assert (replicas["od-edge-vehicle00"], replicas["od-edge-station00"]) == (1, 2)
 
 
 def test_argo_cd_leaves_the_number_of_an_autoscaler_alone() -> None:
