@@ -116,17 +116,16 @@ def test_the_bookkeeping_accepts_two_claims_that_a_person_made_inconsistent(
         for claim in books.state.ledger
     ]
     books.state = replace(books.state, ledger=rebuilt(claims))
-    lanes = [
+    (lanes,) = (
         one["inputs"]
         for one in books.books()["services"].values()
         if (one["service"], one["source"]) == ("lane-detection", "vehicle01")
-    ]
-    assert lanes == [{"points": {"/vehicle01_points": ["vehicle00"]}}]
+    )
+    assert lanes == {"points": {"/vehicle01_points": ["vehicle00"]}}
 
 
 def marked_further(app: Application) -> Application:
-    inputs = {
-        role: tuple(one._replace(further=True) for one in topics)
-        for role, topics in app.inputs.items()
-    }
-    return app.with_inputs(inputs)
+    inputs = app.inputs.items()
+    return app.with_inputs(
+        {role: tuple(t._replace(further=True) for t in ts) for role, ts in inputs}
+    )

@@ -39,20 +39,14 @@ CLUSTER_NODE = "cloud"
 
 
 class Origin(NamedTuple):
-    """What a service can read: the topics of an input role, or the output of a service.
-
-    The ``kind`` of the topics is one of these:
-
-    - ``source``: topics at their sources.
-    - ``topic``: topics at the node of an application, one for each input topic.
-    - ``once``: a single topic for an application, a node or a cluster.
-
-    ``roots`` are the input roles from which the topics are made. They are empty for ``once``.
-    """
+    """What a service can read: the topics of an input role, or the output of a service."""
 
     name: str
     roots: frozenset[str]
+    """The input roles from which the topics are made; none for the kind ``once``."""
     kind: str
+    """``source``: topics at their sources; ``topic``: one for each input topic, at the node of an
+    application; ``once``: one for an application, a node or a cluster."""
 
 
 class Graphs:
@@ -190,7 +184,7 @@ class Demands:
         self.types = {"x": "one", "y": "one", "z": "two"}
 
     def next(self) -> dict[str, Any]:
-        demand = self.random.choice(["d", "e", "f"])
+        demand = self.random.choice("def")
         head = {"kind": "Demand", "demand": demand, "requesters": [f"of {demand}"]}
         if demand in self.held and self.random.random() < 0.4:
             del self.held[demand]

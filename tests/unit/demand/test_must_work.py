@@ -41,15 +41,6 @@ def test_the_broker_is_chosen_by_rule_and_told_if_it_is_not_the_requested_one(
     assert again.outcome == "booked", "both goals must get the same broker"
 
 
-def test_a_broker_left_open_and_one_named_for_one_connection_agree() -> None:
-    books = MemoryRepo(brokers("cloud", "edge"))
-    books.send(goal([], [connection(broker="")], id="1"))
-    assert books.send(goal([], [connection(broker="cloud")], id="2")).outcome == "booked"
-    assert hosts(books) == {"broker-cloud"}
-    books.send(goal([], [connection(broker="cloud")], id="2", shutdown=True))
-    assert hosts(books) == {"broker-edge"}
-
-
 def test_every_pair_of_odd_requesters_makes_its_own_demand() -> None:
     texts = ["a", "a,b", "b", "a b", '["a"]', "a\\", "\\a", '"']
     books = MemoryRepo()

@@ -95,15 +95,6 @@ def test_a_shared_service_follows_the_newest_of_its_applications() -> None:
     assert older.warnings == (f"{what} runs version 2.0.0, which others ask for, not 1.0.0",)
 
 
-def test_two_applications_of_one_demand_must_agree_where_versions_are_refused() -> None:
-    goal = put("a", "1.0.0")
-    goal["applications"] += put("a", "1.1.0", id="edge/b")["applications"]
-    one, other = MemoryRepo(config("refuse")).faults(goal)
-    assert one.startswith("applications[0].version: object-detection for /points of 'edge' would")
-    assert one.endswith("shared with 'edge/b' in version 1.1.0; request version 1.1.0")
-    assert other.startswith("applications[1].version: ")
-
-
 def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
     before = "1.0.0-1 1.0.0-2 1.0.0-10 1.0.0-a 1.0.0-a.1 1.0.0-a.b 1.0.0-b"
     listed = f"{before} 1.0.0 1.0.2 1.0.10 1.2.0 2.0.0".split()
