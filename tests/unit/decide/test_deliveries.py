@@ -1,7 +1,4 @@
-"""A delivery ends when nothing makes the delivered output any longer.
-
-The output may have lost its inputs because a node was decommissioned.
-"""
+"""A delivery ends when nothing makes the delivered output any longer."""
 
 from __future__ import annotations
 

@@ -55,11 +55,7 @@ class Graphs:
     def __init__(
         self, random: Random, place: Mapping[str, Any] | None = None, *, each: bool = False
     ) -> None:
-        """Make the definitions.
-
-        ``place`` has fields for the definitions of services with the scope ``application``. If
-        ``each`` is set, some services with the scope ``topic`` get the fields too.
-        """
+        """Add ``place`` to services for an application and, if ``each``, to some for a topic."""
         self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
         self.files: dict[str, str | None] = {**brokers("edge")}
@@ -211,7 +207,7 @@ class Demands:
         return app | {"deliver": self._deliveries(self.types[id])}
 
     def _deliveries(self, type: str) -> list[dict[str, Any]]:
-        """Return at most one delivery, of an output that only one node makes under its name."""
+        # each output is one that only one node makes under its name
         services = self.graphs.services[type].items()
         names = [name for name, one in services if one["scope"] != "topic" or one["at_source"]]
         chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
@@ -245,10 +241,7 @@ def instances(
 def delivered(
     repo: MemoryRepo, demands: Demands, services: list[ServiceRelease]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the topic and the receiving node of each delivery that the demands hold.
-
-    A demand's delivery has only outputs that are made from the inputs of this demand.
-    """
+    """Yield (topic, receiving node) of each delivery, which has what its demand's inputs make."""
     for app in (app for apps in demands.held.values() for app in apps):
         booked = repo.state.ledger.application(app["id"])
         assert booked is not None

@@ -1,10 +1,4 @@
-"""Under overrides too, the generated files follow from the configuration and the ledger.
-
-Random goals join and shut down. After each goal, the generated files, which changed goal by goal,
-equal the files that are rendered anew from the configuration and the ledger. The bookkeeping lists
-exactly the denied claims as suspended. The claim of an override that keeps a subject is the only
-claim on this subject.
-"""
+"""Under overrides too, the generated files follow from the configuration and the ledger."""
 
 from __future__ import annotations
 

@@ -58,10 +58,7 @@ class Placed(Demands):
 
 
 def with_gpus(config: Config, random: Random, drained: str = "") -> Config:
-    """Return the configuration with GPUs and a capacity on some nodes.
-
-    The nodes are in random order, and the node ``drained`` is drained.
-    """
+    """Return the configuration with GPUs on some nodes, which are in random order."""
     nodes = [
         node.model_copy(
             update={
@@ -158,10 +155,7 @@ def test_what_is_placed_fits_stays_and_leaves_drained_nodes(
 
 
 def on_cloud(count: int, *stuck: int) -> MemoryRepo:
-    """Return a repo with applications on the drained node ``cloud``, which can all move elsewhere.
-
-    The ``stuck`` ones cannot: their demands ask for a label that no other node has.
-    """
+    """Return a repo with applications on the drained node ``cloud``; the ``stuck`` must stay."""
     repo = MemoryRepo()
     for number in range(count):
         app = {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from datetime import datetime, timedelta
-from functools import lru_cache
 from pathlib import Path
 
 import pytest
@@ -18,7 +17,7 @@ from pydantic import ValidationError
 
 from tests.appdefs.test_scaling import books, demand, fact, values
 from tests.kit.chance import examples
-from tests.kit.memory import NOW, MemoryRepo, ledger_in
+from tests.kit.memory import NOW, ledger_in
 
 PAGE = (Path(__file__).parents[3] / "docs" / "appdef.md").read_text()
 WINDOW = timedelta(minutes=10)
@@ -32,17 +31,12 @@ If the number is 0, the demand is released. If it is None, only the time passes.
 """
 
 
-@lru_cache(maxsize=1)
-def empty() -> MemoryRepo:
-    return books(SCALING)
-
-
 @given(STEPS)
 @examples(15)
 def test_a_service_has_the_most_that_it_needed_in_the_time(
     steps: list[tuple[int, int | None]],
 ) -> None:
-    repo, now = empty().copy(), NOW
+    repo, now = books(SCALING), NOW
     needs: list[tuple[datetime, int]] = []
     """(time, number) of each need: from this time on, the service needed this many replicas."""
     for seconds, topics in [(0, 1), *steps]:
