@@ -76,9 +76,8 @@ def fact(repo: MemoryRepo) -> str:
 
 
 def test_the_page_has_a_row_for_each_way() -> None:
-    written = " ".join(row[0] for row in ROWS)
     ways = ("topics", "sources", "claims", "requesters", "sizes", "autoscaler")
-    assert all(way in written for way in ways)
+    assert all(any(way in row[0] for row in ROWS) for way in ways)
 
 
 @pytest.mark.parametrize(("scaling", "count", "what", "size", "replicas"), ROWS)
