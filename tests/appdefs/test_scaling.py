@@ -9,23 +9,15 @@ from typing import Any, Literal
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.decide.changeset import render_trial_demands
-from demandops.decide.planning.planner import replicas_of
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.state import rendered_files
-from demandops.model.config.appdef import Scaling
-from demandops.model.demand.claim import InputTopic
 from demandops.model.release import ServiceKey
 from demandops.views.release_causes import override_report, warnings
-from hypothesis import given
-from hypothesis import strategies as st
 
 from tests.appdefs.test_recorder import ADDITIONS
 from tests.kit import plain_yaml
-from tests.kit.chance import examples
 from tests.kit.config import override, skeleton
-from tests.kit.goals import CLOUD, STATION_CLOUD, application, goal
 from tests.kit.memory import NOW, MemoryRepo
-from tests.unit.decide.test_in_force import demands
 
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "appdef.md").read_text()
@@ -72,6 +64,10 @@ def release(repo: MemoryRepo) -> dict[str, Any]:
     return found
 
 
+def values(repo: MemoryRepo) -> dict[str, Any]:
+    return dict(release(repo)["spec"]["values"])
+
+
 def fact(repo: MemoryRepo) -> str:
     """Return what the commit message says about the recorder's replicas."""
     (found,) = (plan for plan in repo.state.plans.values() if plan.name.startswith("rec-"))
@@ -79,22 +75,9 @@ def fact(repo: MemoryRepo) -> str:
     return told.removeprefix("replicas ")
 
 
-def replicas_by_overrides(*replicas: int) -> dict[str, str]:
-    """Return an override file for each number of replicas; the last override takes precedence."""
-    return {
-        f"overrides/o{rank}.yaml": override(
-            {"services": ["recorder"]}, priority=rank, replicas=number
-        )
-        for rank, number in enumerate(replicas)
-    }
-
-
 def test_the_page_has_a_row_for_each_way() -> None:
-    assert {key for row in ROWS for key in plain_yaml.load(row[0]).get("per", {})} == {
-        *("topics", "sources", "claims", "requesters")
-    }
-    assert any("sizes" in row[0] for row in ROWS)
-    assert any("autoscaler" in row[0] for row in ROWS)
+    ways = ("topics", "sources", "claims", "requesters", "sizes", "autoscaler")
+    assert all(any(way in row[0] for row in ROWS) for way in ways)
 
 
 @pytest.mark.parametrize(("scaling", "count", "what", "size", "replicas"), ROWS)
@@ -118,48 +101,6 @@ def test_the_page_shows_the_template_that_serves_both() -> None:
         assert text in path.read_text(), path.name
 
 
-COUNTS = st.integers(0, 60)
-SCALINGS = st.builds(
-    lambda low, more, measure, share: Scaling.model_validate(
-        {"min": low, "max": low + more, "per": {measure: share}}
-        | ({"mayDependOnRequesters": True} if measure == "requesters" else {})
-    ),
-    st.integers(0, 5),
-    st.integers(1, 9),
-    st.sampled_from(["topics", "sources", "claims", "requesters"]),
-    st.integers(1, 9),
-)
-
-
-@given(SCALINGS, st.lists(COUNTS, min_size=4, max_size=4), st.lists(COUNTS, min_size=4, max_size=4))
-@examples(80)
-def test_more_of_anything_never_gives_fewer_and_bounds_hold(
-    scaling: Scaling, counts: list[int], more: list[int]
-) -> None:
-    def replicas(topics: int, sources: int, claims: int, requesters: int) -> int:
-        listed = [InputTopic(f"/{one}", str(one % (sources + 1))) for one in range(topics)]
-        many: Any = range(claims), range(requesters)
-        found = replicas_of(scaling, {}, listed, *many)
-        assert isinstance(found, int)
-        return found
-
-    few = replicas(*counts)
-    many = replicas(*(one + other for one, other in zip(counts, more, strict=True)))
-    assert scaling.min <= few <= many <= scaling.max
-
-
-def test_the_largest_demanded_size_applies_and_an_unknown_size_is_refused() -> None:
-    repo = books("{sizes: {parameter: size, replicas: {small: 1, medium: 2, large: 4}}}")
-    for name, size, replicas in (("a", "medium", 2), ("b", "large", 4), ("c", ["small"], 4)):
-        repo.send(demand(name, size=size))
-        assert release(repo)["spec"]["values"]["replicas"] == replicas
-    assert repo.faults(demand("b", size="lage")) == [
-        "parameters.size: ['lage', 'medium', 'small'] is not a size; known: large, medium, small"
-    ]
-    repo.send(demand("b") | {"operation": "release", "applications": []})
-    assert release(repo)["spec"]["values"]["replicas"] == 2
-
-
 SHIPPED = "appdefs/object-detection-fusion/appdef.yaml"
 BY_WHO = "{min: 0, max: 9, per: {requesters: 1}, mayDependOnRequesters: true, dividesWork: true}"
 BY_CLAIMS = "{min: 0, max: 9, per: {claims: 1}, dividesWork: true}"
@@ -171,152 +112,91 @@ FOLLOWING = {
 """An appdef with one detection for each requester and one fusion for each claim."""
 
 
-@given(st.lists(demands(), max_size=14))
-@examples(20)
-def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> None:
-    repo = MemoryRepo(FOLLOWING)
-    for made in sent:
-        repo.take(made)
-        again = rendered_files(repo.state)
-        kept = {path: text for path, text in repo.files.items() if path.startswith("clusters/")}
-        assert {path: text for path, text in again.items() if path in kept} == kept
-
-
-class TestRequesters:
-    """A change of requesters replans only services whose definition or override depends on them."""
-
-    @staticmethod
-    def changed(repo: MemoryRepo, requesters: int) -> tuple[list[str], set[str]]:
-        """Demand the recorder again, with this number of requesters.
-
-        Return the generated files that change, and the names of the services that are planned
-        again.
-        """
+@pytest.mark.parametrize(
+    ("scaling", "selected", "requesters", "files", "services"),
+    [
+        (BY_REQUESTERS, [], 4, 1, {"recorder", "driver"}),
+        ("{max: 4, per: {topics: 2}}", [], 9, 0, {"recorder"}),
+        ("{min: 1}", ["d-1"], 2, 3, {"recorder", "driver"}),
+    ],
+    ids=["the definition depends on them", "nothing does", "an override selects them"],
+)
+def test_a_change_of_requesters_replans_only_what_depends_on_them(
+    scaling: str, selected: list[str], requesters: int, files: int, services: set[str]
+) -> None:
+    select = {"requesters": selected, "services": ["driver"]}
+    overrides = {"overrides/tested.yaml": override(select, replicas=0)} if selected else {}
+    repo = books(scaling, **overrides)
+    repo.send(demand(topics=3, requesters=requesters - 1))
+    for count in (requesters, requesters - 1):
         before = repo.state
-        decision = repo.send(demand(topics=3, requesters=requesters))
+        decision = repo.send(demand(topics=3, requesters=count))
         keys = affected_keys(before, decision.state, decision.changes.claims)
+        assert {key.service for key in keys if isinstance(key, ServiceKey)} == services
         again = rendered_files(decision.state)
         assert {path: repo.files[path] for path in again} == again
-        generated = [path for path in decision.files if path.startswith("clusters/")]
-        return generated, {key.service for key in keys if isinstance(key, ServiceKey)}
-
-    def test_they_scale_where_the_definition_allows_it(self) -> None:
-        repo = books(BY_REQUESTERS)
-        repo.send(demand(topics=3, requesters=3))
-        (path,) = (path for path in repo.rendered() if "/rec-" in path)
-        for requesters, replicas in ((4, "2"), (3, "1")):
-            assert self.changed(repo, requesters) == ([path], {"recorder", "driver"})
-            assert fact(repo) == replicas
-
-    def test_an_override_that_selects_them_is_looked_at(self) -> None:
-        selected = override({"requesters": ["d-1"], "services": ["driver"]}, replicas=0)
-        repo = books("{min: 1}", **{"overrides/tested.yaml": selected})
-        repo.send(demand(topics=3))
-        assert len(self.changed(repo, 2)[0]) == 3
-
-    def test_who_gives_up_one_topic_of_two_counts_for_the_other(self) -> None:
-        repo, clouds = MemoryRepo(FOLLOWING), [CLOUD, STATION_CLOUD]
-        repo.send(goal([application(who=["a", "b"], clouds=clouds)]))
-        repo.send(goal([application(who=["a"], clouds=[CLOUD])], shutdown=True))
-        found = repo.objects("HelmRelease")
-        replicas = {name: one["spec"]["values"]["replicas"] for name, one in found.items()}
-        assert (replicas["od-edge-vehicle00"], replicas["od-edge-station00"]) == (1, 2)
-
-    def test_else_they_change_no_file(self) -> None:
-        repo = books("{max: 4, per: {topics: 2}}")
-        repo.send(demand(topics=3))
-        assert self.changed(repo, 9) == ([], {"recorder"})
+        assert sum(path.startswith("clusters/") for path in decision.files) == files
 
 
-class TestAutoscaler:
-    """A HorizontalPodAutoscaler owns the number of replicas.
+def test_argo_cd_leaves_the_number_of_an_autoscaler_alone() -> None:
+    repo = books(AUTOSCALED, gitops="argocd")
+    repo.send(demand())
+    spec = release(repo)["spec"]
+    (ignored,) = spec["ignoreDifferences"]
+    assert (ignored["kind"], ignored["jsonPointers"]) == ("Deployment", ["/spec/replicas"])
+    assert "RespectIgnoreDifferences=true" in spec["syncPolicy"]["syncOptions"]
+    of_driver, _ = sorted(repo.objects("Application").items())
+    assert "ignoreDifferences" not in of_driver[1]["spec"]
 
-    No GitOps controller sets the number. An override sets both bounds of the autoscaler.
-    """
 
-    def test_flux_leaves_the_number_alone(self) -> None:
-        repo = books(AUTOSCALED)
-        repo.send(demand())
-        spec = release(repo)["spec"]
-        assert spec["driftDetection"] == {
-            "mode": "enabled",
-            "ignore": [{"paths": ["/spec/replicas"], "target": {"kind": "Deployment"}}],
-        }
-        assert spec["values"]["autoscaler"] == {"min": 2, "max": 5, "cpu": 70}
-        assert "replicas" not in spec["values"]
+STOPPED = {
+    f"overrides/o{replicas}.yaml": override(
+        {"services": ["recorder"]}, priority=3 - replicas, replicas=replicas
+    )
+    for replicas in (0, 3)
+}
+ONLY_REPLICAS = {TEMPLATE: ADDITIONS["appdefs/driver/values/driver.yaml.j2"]}
 
-    def test_argo_cd_leaves_the_number_alone(self) -> None:
-        repo = books(AUTOSCALED, gitops="argocd")
-        repo.send(demand())
-        spec = release(repo)["spec"]
-        assert spec["ignoreDifferences"] == [
-            {"group": "apps", "kind": "Deployment", "jsonPointers": ["/spec/replicas"]}
-        ]
-        assert spec["syncPolicy"]["syncOptions"] == [
-            "ApplyOutOfSyncOnly=true",
-            "RespectIgnoreDifferences=true",
-        ]
 
-    def test_a_service_without_one_is_watched_as_before(self) -> None:
-        repo = books(AUTOSCALED)
-        repo.send(demand())
-        (name,) = (name for name in repo.objects("HelmRelease") if name.startswith("drv-"))
-        driver = repo.objects("HelmRelease")[name]["spec"]
-        assert driver["driftDetection"] == {"mode": "enabled"}
-        assert driver["values"]["replicas"] == 1
-
-    def test_the_last_override_sets_both_bounds(self) -> None:
-        repo = books(AUTOSCALED, **replicas_by_overrides(0, 3))
-        repo.send(demand())
-        spec = release(repo)["spec"]
-        assert spec["values"]["autoscaler"] == {"min": 3, "max": 3, "cpu": 70}
-        assert "ignore" in spec["driftDetection"]
-
-    def test_an_override_that_stops_it_is_a_fault(self) -> None:
-        repo = books(AUTOSCALED, **replicas_by_overrides(3, 0))
+@pytest.mark.parametrize(
+    ("files", "place", "told"),
+    [
+        (STOPPED, "overrides/o0.yaml: replicas: ", "'deny' instead"),
+        (ONLY_REPLICAS, f"{TEMPLATE}:1: ", "'replicas' is undefined"),
+    ],
+    ids=["an override that stops it", "a template that knows only replicas"],
+)
+def test_what_does_not_go_with_an_autoscaler_is_a_fault(
+    files: dict[str, str], place: str, told: str
+) -> None:
+    repo = books(AUTOSCALED, **files)
+    for render in (
+        lambda: repo.send(demand()),
+        lambda: render_trial_demands(repo.state, repo.state.evaluate),
+    ):
         with pytest.raises(InvalidInput) as invalid:
-            repo.send(demand())
-        told = "is 0, but an autoscaler keeps at least one replica; to run none, use 'deny' instead"
-        assert str(invalid.value) == f"overrides/o1.yaml: replicas: {told}"
-        with pytest.raises(InvalidInput) as invalid:
-            render_trial_demands(repo.state, repo.state.evaluate)
-        assert str(invalid.value) == f"overrides/o1.yaml: replicas: {told}"
-
-    def test_a_template_that_knows_only_replicas_is_a_fault(self) -> None:
-        text = ADDITIONS["appdefs/driver/values/driver.yaml.j2"]
-        repo = books(AUTOSCALED, **{TEMPLATE: text})
-        with pytest.raises(InvalidInput) as invalid:
-            render_trial_demands(repo.state, repo.state.evaluate)
-        assert str(invalid.value) == f"{TEMPLATE}:1: 'replicas' is undefined; fix the template"
+            render()
+        assert str(invalid.value).startswith(place)
+        assert told in str(invalid.value)
 
 
-@pytest.mark.parametrize(("divides", "told"), [("false", True), ("true", False)])
-def test_a_warning_says_what_an_override_publishes_twice(divides: str, told: bool) -> None:
+def doubled(**changed: str) -> list[tuple[str, str]]:
+    repo = MemoryRepo(ADDITIONS | changed)
+    repo.send(demand())
+    return [*warnings(override_report(repo.state, NOW))]
+
+
+def test_a_warning_says_what_an_override_publishes_twice() -> None:
     """The override runs two replicas of the driver and of the recorder.
 
     The second replica doubles what the driver publishes, unless the replicas divide the work. The
     recorder publishes nothing, so no warning names it.
     """
-    driver = ADDITIONS[DRIVER] + f"scaling: {{dividesWork: {divides}}}\n"
-    doubled = override({"services": ["*"]}, replicas=2)
-    repo = MemoryRepo({**ADDITIONS, DRIVER: driver, "overrides/two.yaml": doubled})
-    repo.send(demand())
-    assert (
-        list(warnings(override_report(repo.state, NOW)))
-        == [
-            (
-                "overrides/two.yaml",
-                "runs 2 replicas of driver, and each replica publishes every output; run only one, "
-                "or set dividesWork: true in 'scaling' of the service's definition if the program "
-                "divides its work among replicas",
-            )
-        ]
-        * told
-    )
-
-
-def test_a_replica_that_another_override_takes_away_publishes_nothing_twice() -> None:
-    two, one = (override({"services": ["driver"]}, replicas=n, priority=n % 2) for n in (2, 1))
-    repo = MemoryRepo({**ADDITIONS, "overrides/two.yaml": two, "overrides/one.yaml": one})
-    repo.send(demand())
-    assert list(warnings(override_report(repo.state, NOW))) == []
+    two = {"overrides/two.yaml": override({"services": ["*"]}, replicas=2)}
+    ((path, told),) = doubled(**two)
+    assert path == "overrides/two.yaml"
+    assert told.startswith("runs 2 replicas of driver, and each replica publishes every output")
+    divided = ADDITIONS[DRIVER] + "scaling: {dividesWork: true}\n"
+    assert doubled(**two, **{DRIVER: divided}) == []
+    taken_away = override({"services": ["driver"]}, replicas=1, priority=1)
+    assert doubled(**two, **{"overrides/one.yaml": taken_away}) == []

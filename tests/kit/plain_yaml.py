@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -16,3 +17,8 @@ def load(text: str) -> Any:
 
 def dump(data: Any) -> str:
     return str(yaml.dump(data, Dumper=_DUMPER))
+
+
+def beside(test_file: str) -> Any:
+    """Return what the YAML file of the same name beside a test's file says."""
+    return load(Path(test_file).with_suffix(".yaml").read_text())

@@ -1,9 +1,14 @@
-"""Each change updates a node's usage without a recount; the usage never exceeds the capacity."""
+"""Services never use more of a node than it has, and demands that lack only room may wait for it.
+
+Each change updates a node's usage without a recount.
+"""
 
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
+from datetime import timedelta
 from functools import cache
 from random import Random
 from typing import Any
@@ -13,16 +18,16 @@ from demandops.base.errors import Refused
 from demandops.decide.decision import Decision
 from demandops.decide.placement.capacity import whole_usage
 from demandops.decide.state import State
-from demandops.model.config.inventory import Node, amount_of, amount_text
+from demandops.model.config.inventory import amount_of, amount_text
 from demandops.model.config.load import load
-from demandops.model.demand.demand_request import Expire
 from demandops.model.ledger.ledger import ClaimChange
+from demandops.model.ledger.records import in_turn
 from hypothesis import given
-from hypothesis import strategies as st
 
-from tests.kit.chance import examples
+from tests.kit import plain_yaml
+from tests.kit.chance import chances, examples
 from tests.kit.config import state_of
-from tests.kit.memory import MemoryRepo
+from tests.kit.memory import MemoryRepo, ledger_in
 from tests.scenarios.running import configuration
 
 VEHICLES = ("vehicle00", "vehicle01")
@@ -31,7 +36,7 @@ CAPACITY = {"west": 5, "east": 3, "vehicle00": 2}
 
 
 @cache
-def recorders() -> State:
+def recorders(when_full: str = "refuse") -> State:
     """Return a state in which each driver and each replica of a recorder requests 1 cpu."""
     nodes = [
         {"id": id, "type": "vehicle" if id in VEHICLES else "edge", "cluster": "c-its"}
@@ -39,6 +44,7 @@ def recorders() -> State:
         for id in (*VEHICLES, "west", "east")
     ]
     requests = {"cpu": 1}
+    domain = {"name": "all", "namespace": "all", "whenFull": when_full}
     files = configuration(
         ("recorder",),
         {
@@ -46,31 +52,36 @@ def recorders() -> State:
             "appdefs/driver/service.yaml": {"requests": requests},
             "inventory/nodes.yaml": {"nodes": nodes},
             "inventory/brokers.yaml": {"brokers": [{"node": "west", "host": "broker"}]},
-            "policy/access-domains.yaml": {"domains": [{"name": "all", "namespace": "all"}]},
+            "policy/access-domains.yaml": {"domains": [domain]},
         },
     )
     return state_of(load(files))
 
 
-def recorder(random: Random) -> dict[str, Any]:
+def recorder(random: Random, vehicles: Sequence[str]) -> dict[str, Any]:
     """Return a random recorder application with one replica for every two topics."""
-    known = [(vehicle, f"/t{number}") for vehicle in VEHICLES for number in range(3)]
-    topics = random.sample(known, random.randint(1, 5))
+    known = [(vehicle, f"/t{number}") for vehicle in vehicles for number in range(3)]
+    topics = random.sample(known, random.randint(1, min(5, len(known))))
     where = random.choice(({"place": {"role": "edge"}}, {"node": "west"}, {"node": "east"}))
-    return {
-        "id": f"app{random.randrange(4)}",
-        "type": "recorder",
-        "inputs": {"point_cloud": [{"topic": topic, "source": of} for of, topic in topics]},
-    } | where
+    inputs = {"point_cloud": [{"topic": topic, "source": of} for of, topic in topics]}
+    return {"id": f"app{random.randrange(4)}", "type": "recorder", "inputs": inputs} | where
 
 
-def goal(random: Random) -> dict[str, Any]:
+def goal(random: Random, *, alone: bool) -> dict[str, Any]:
+    """Return a random demand; if ``alone``, it can share nothing that would be new on a full node.
+
+    A demand that waits, and fits because another one books what both share, is not tried at once.
+    """
     who = random.choice(VEHICLES)
     made = {"kind": "Demand", "demand": f"{who}-{random.randrange(3)}", "requesters": [who]}
     if random.random() < 0.25:
         return made | {"operation": "release"}
-    apps = {app["id"]: app for app in (recorder(random) for _ in range(random.randint(1, 3)))}
-    return made | {"applications": list(apps.values())}
+    vehicles = VEHICLES[1:] if alone else VEHICLES
+    found = [recorder(random, vehicles) for _ in range(random.randint(1, 3))]
+    apps = {app["id"]: app for app in found}
+    if alone:
+        apps = {id: app | {"id": f"{made['demand']}/{id}"} for id, app in apps.items()}
+    return made | {"applications": list(apps.values()), "priority": random.randrange(2)}
 
 
 def used(repo: MemoryRepo) -> Counter[str]:
@@ -83,23 +94,47 @@ def used(repo: MemoryRepo) -> Counter[str]:
     return found
 
 
+def book_waiting(repo: MemoryRepo) -> list[str]:
+    """Try to book each waiting demand in order; return the ids of those that were booked."""
+    booked = []
+    for one in in_turn(repo.state.ledger.waiting):
+        taken = repo.take(dict(one.goal))
+        assert isinstance(taken, Decision)
+        booked += [one.demand] if taken.outcome == "booked" else []
+    return booked
+
+
+@pytest.mark.parametrize("when_full", ["refuse", "wait"])
 @examples(12)
-@given(st.randoms(use_true_random=False))
-def test_it_is_counted_by_what_changes_and_no_node_gets_more_than_it_has(random: Random) -> None:
-    repo = MemoryRepo(state=recorders())
-    refused = 0
-    for _ in range(8):
-        before = used(repo)
-        demand = goal(random)
-        taken = repo.take(demand)
+@given(chances)
+def test_no_node_gets_more_than_it_has_and_what_waits_does_not_fit_and_is_booked_in_turn(
+    when_full: str, random: Random
+) -> None:
+    repo, sent = MemoryRepo(state=recorders(when_full)), dict[str, dict[str, Any]]()
+    for _ in range(10):
+        repo.now += timedelta(minutes=1)
+        made = goal(random, alone=when_full == "wait")
+        taken = repo.take(made)
+        if isinstance(taken, Refused):
+            codes = {fault.code for fault in taken.faults}
+            assert "operation" not in made or codes == {"not-held"}
+        elif taken.outcome == "waiting":
+            sent[made["demand"]] = made
+        if isinstance(taken, Decision) and taken.frees:
+            book_waiting(repo)
         now = used(repo)
         assert {id: repo.state.usage().of(id, "cpu") / 1000 for id in now} == dict(now)
         assert repo.state.usage().amounts == whole_usage(repo.state).amounts
         assert all(now[id] <= most for id, most in CAPACITY.items())
-        if isinstance(taken, Refused):
-            refused += 1
-            assert "operation" not in demand or {f.code for f in taken.faults} == {"not-held"}
-            assert now == before
+        waiting = in_turn(repo.state.ledger.waiting)
+        assert not waiting or when_full == "wait"
+        for one in waiting:
+            assert one.goal == sent[one.demand]
+            assert not repo.state.ledger.claims_of_demand(one.demand)
+            assert repo.decide(dict(one.goal)).outcome == "waiting"
+        turns = [(-one.priority, one.since) for one in waiting]
+        assert turns == sorted(turns)
+        assert ledger_in(repo.files) == repo.state.ledger
     claims = list(repo.state.ledger)
     random.shuffle(claims)
     half = claims[: len(claims) // 2]
@@ -107,20 +142,7 @@ def test_it_is_counted_by_what_changes_and_no_node_gets_more_than_it_has(random:
     known.usage()
     ledger = known.ledger.without(half)
     edited = known.with_ledger(ledger, [ClaimChange(claim, None) for claim in half])
-    anew = replace(known, ledger=ledger)
-    assert edited.usage().amounts == anew.usage().amounts
-
-
-def test_what_ends_with_its_lease_is_given_back() -> None:
-    repo = MemoryRepo(state=recorders())
-    cloud = {"point_cloud": [{"topic": "/t", "source": "vehicle00"}]}
-    app = {"id": "a", "type": "recorder", "node": "east", "inputs": cloud}
-    goal = {"kind": "Demand", "demand": "d", "requesters": ["v"], "applications": [app]}
-    repo.send(goal | {"lease": "1s"})
-    assert dict(repo.state.usage().amounts) == {("east", "cpu"): 1000, ("vehicle00", "cpu"): 1000}
-    later = repo.now.replace(year=repo.now.year + 1)
-    assert isinstance(repo.take(Expire(id="d", demand="d"), later), Decision)
-    assert dict(repo.state.usage().amounts) == {}
+    assert edited.usage().amounts == replace(known, ledger=ledger).usage().amounts
 
 
 def test_the_bookkeeping_has_what_is_requested_of_nodes_with_a_capacity() -> None:
@@ -136,35 +158,19 @@ def test_the_bookkeeping_has_what_is_requested_of_nodes_with_a_capacity() -> Non
     assert "nodes" not in MemoryRepo().bookkeeping()
 
 
-@pytest.mark.parametrize(
-    ("text", "thousandths", "shown"),
-    [
-        ("2", 2_000, "2"),
-        ("500m", 500, "0.5"),
-        ("1.25", 1_250, "1.25"),
-        ("2k", 2_000_000, "2000"),
-        ("1.5Ki", 1_536_000, "1536"),
-        ("0", 0, "0"),
-    ],
-)
-def test_a_quantity_is_read_as_kubernetes_does(text: str, thousandths: int, shown: str) -> None:
+TABLES = plain_yaml.beside(__file__)
+
+
+@pytest.mark.parametrize(("text", "thousandths", "of_cpu", "of_memory"), TABLES["quantities"])
+def test_a_quantity_is_read_as_kubernetes_does(
+    text: str, thousandths: int, of_cpu: str, of_memory: str
+) -> None:
     assert amount_of(text) == thousandths
-    assert amount_text(thousandths, "cpu") == shown
+    assert amount_text(thousandths, "cpu") == of_cpu
+    assert amount_text(thousandths, "memory") == of_memory
 
 
-def test_memory_is_shown_in_the_largest_unit_that_is_exact() -> None:
-    texts = [amount_text(amount_of(text), "memory") for text in ("1024Mi", "1.5Gi", "1000", "0")]
-    assert texts == ["1Gi", "1536Mi", "1000", "0"]
-
-
-@pytest.mark.parametrize("text", ["", "-1", "1e3", "1 Gi", "0.5m", "1.2345", "many", "1GB"])
+@pytest.mark.parametrize("text", TABLES["invalid"])
 def test_an_invalid_quantity_is_a_fault(text: str) -> None:
     with pytest.raises(ValueError, match=r"is not a quantity|is finer than a thousandth"):
         amount_of(text)
-
-
-def test_a_node_limits_what_it_declares() -> None:
-    plain = Node(id="a", type="edge", cluster="c")
-    node = plain.model_copy(update={"capacity": {"gpu": "2"}})
-    assert [plain.most(name) for name in ("cpu", "gpu")] == [None, None]
-    assert [node.most(name) for name in ("cpu", "memory", "gpu", "fpga")] == [None, None, 2000, 0]

@@ -7,22 +7,28 @@ from __future__ import annotations
 
 import copy
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
 from random import Random
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
+import pytest
 import yaml
+from demandops.base.errors import Refused
+from demandops.decide.placement.relocation import changed_claim_files, following_overrides
 from demandops.decide.planning.planner import TracedPlan, plan
 from demandops.decide.planning.release_keys import ReleaseKey, all_keys
 from demandops.decide.state import rendered_files
-from demandops.model.release import Release, ServiceKey, ServiceRelease
+from demandops.decide.warnings import policy_warnings
+from demandops.model.config.config import Config
+from demandops.model.config.override import Override, OverrideFile, Selector
+from demandops.model.release import ServiceKey, ServiceRelease
 from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import chances, examples
-from tests.kit.config import brokers, skeleton
-from tests.kit.memory import MemoryRepo
+from tests.kit.config import brokers, skeleton, state_of
+from tests.kit.memory import MemoryRepo, ledger_in
 
 ROLES = ("a", "b")
 TYPES = ("one", "two")
@@ -33,20 +39,14 @@ CLUSTER_NODE = "cloud"
 
 
 class Origin(NamedTuple):
-    """What a service can read: the topics of an input role, or the output of a service.
-
-    The ``kind`` of the topics is one of these:
-
-    - ``source``: topics at their sources.
-    - ``topic``: topics at the node of an application, one for each input topic.
-    - ``once``: a single topic for an application, a node or a cluster.
-
-    ``roots`` are the input roles from which the topics are made. They are empty for ``once``.
-    """
+    """What a service can read: the topics of an input role, or the output of a service."""
 
     name: str
     roots: frozenset[str]
+    """The input roles from which the topics are made; none for the kind ``once``."""
     kind: str
+    """``source``: topics at their sources; ``topic``: one for each input topic, at the node of an
+    application; ``once``: one for an application, a node or a cluster."""
 
 
 class Graphs:
@@ -55,29 +55,26 @@ class Graphs:
     def __init__(
         self, random: Random, place: Mapping[str, Any] | None = None, *, each: bool = False
     ) -> None:
-        """Make the definitions.
-
-        ``place`` has fields for the definitions of services with the scope ``application``. If
-        ``each`` is set, some services with the scope ``topic`` get the fields too.
-        """
+        """Add ``place`` to services for an application and, if ``each``, to some for a topic."""
         self.random, self._place, self._places_each = random, dict(place or {}), each
         self.services: dict[str, dict[str, dict[str, Any]]] = {type: {} for type in TYPES}
         self.files: dict[str, str | None] = {**brokers("edge")}
         roles = [Origin(role, frozenset({role}), "source") for role in ROLES]
         self._origins = {type: list(roles) for type in TYPES}
         self._common = list(roles)
-        self._appdefs: dict[str, dict[str, Any]] = {
-            type: {"uses": {}, "services": {}} for type in TYPES
-        }
+        appdefs: dict[str, dict[str, Any]] = {type: {"uses": {}, "services": {}} for type in TYPES}
         for number in range(random.randint(1, 5)):
             if random.random() < 0.5:
-                self._share(f"s{number}")
+                used = self._share(f"s{number}")
+                for type in TYPES:
+                    appdefs[type]["uses"][f"s{number}"] = used[type]
             else:
                 for type in TYPES:
-                    self._own(f"{type[0]}{number}", type)
-        for type, parts in self._appdefs.items():
+                    name = f"{type[0]}{number}"
+                    appdefs[type]["services"][name] = self._own(name, type)
+        for type, parts in appdefs.items():
             if not parts["uses"] and not parts["services"]:
-                self._own(f"{type}-last", type)
+                parts["services"][f"{type}-last"] = self._own(f"{type}-last", type)
             head = {"apiVersion": "demandops/v1", "kind": "ApplicationDefinition", "name": type}
             appdef = head | {"inputs": {role: {} for role in ROLES}} | parts
             self.files[f"appdefs/{type}/appdef.yaml"] = yaml.safe_dump(appdef)
@@ -93,36 +90,20 @@ class Graphs:
             "values": "values/any.j2",
         }  # fmt: skip
 
-    def _readable(
-        self, origins: list[Origin], scope: str, at_source: bool, root: str
-    ) -> list[Origin]:
-        """Return the origins that a service may read in addition to its first origin."""
-        apart = at_source or scope == "cluster"
-        found = [one for one in origins if not (apart and one.kind == "topic")]
-        if scope == "topic":
-            return [one for one in found if not one.roots or root in one.roots]
-        return found
-
-    def _chosen(self, origins: list[Origin], least: int = 0) -> list[Origin]:
-        count = min(len(origins), self.random.randint(least, 2))
-        return self.random.sample(origins, count)
-
-    def _output(self, name: str, scope: str, at_source: bool, roots: set[str]) -> Origin:
-        kind = "source" if at_source else "topic" if scope == "topic" else "once"
-        return Origin(f"{name}.out", frozenset(roots if kind != "once" else ()), kind)
-
     def _add(self, type: str, name: str, scope: str, at_source: bool, read: list[Origin]) -> Origin:
         """Add a service to a type of application; return the service's output as an origin.
 
         With the scope ``topic``, the service has one instance for each topic of the first origin in
         ``read``.
         """
+        roots = set[str]()
         if scope == "topic":
             roots = {self._root(type, read[0])}
-        else:
-            roots = {root for one in read for root in one.roots} if at_source else set()
+        elif at_source:
+            roots = {root for one in read for root in one.roots}
         self.services[type][name] = {"scope": scope, "at_source": at_source, "roots": roots}
-        made = self._output(name, scope, at_source, roots)
+        kind = "source" if at_source else "topic" if scope == "topic" else "once"
+        made = Origin(f"{name}.out", frozenset(roots if kind != "once" else ()), kind)
         self._origins[type].append(made)
         return made
 
@@ -131,40 +112,41 @@ class Graphs:
         return next(iter(self.services[type][name]["roots"])) if "." in origin.name else origin.name
 
     def _first(self, origins: list[Origin], type: str, at_source: bool) -> Origin:
-        """Return a random origin for the first input of a service with the scope ``topic``.
-
-        Such a service has one instance for each topic of its first input.
-        """
-
-        def is_for_each(one: Origin) -> bool:
-            service = self.services[type].get(one.name.partition(".")[0])
-            return service is None or service["scope"] == "topic"
-
-        known = [one for one in origins if is_for_each(one)]
+        """Return a random origin for the first input of a service with the scope ``topic``."""
+        others = {name for name, one in self.services[type].items() if one["scope"] != "topic"}
+        known = [one for one in origins if one.name.partition(".")[0] not in others]
         return self.random.choice([one for one in known if not at_source or one.kind == "source"])
 
-    def _own(self, name: str, type: str) -> None:
-        origins, service = self._origins[type], self._service(name, type)
+    def _readable(self, type: str, scope: str, at_source: bool, first: Origin) -> list[Origin]:
+        """Return the origins that a service may read in addition to its first origin."""
+        apart, root = at_source or scope == "cluster", self._root(type, first)
+        found = [one for one in self._origins[type] if not (apart and one.kind == "topic")]
+        if scope == "topic":
+            return [one for one in found if not one.roots or root in one.roots]
+        return found
+
+    def _chosen(self, origins: list[Origin], least: int) -> list[Origin]:
+        return self.random.sample(origins, min(len(origins), self.random.randint(least, 2)))
+
+    def _own(self, name: str, type: str) -> dict[str, Any]:
+        """Return a definition for a service of one type of application alone."""
+        service = self._service(name, type)
         if self.random.random() < 0.5:
-            read = self._chosen(origins, least=1)
-            service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
-            service |= (
-                copy.deepcopy(self._place) if self._place and self.random.random() < 0.8 else {}
-            )
+            read = self._chosen(self._origins[type], least=1)
+            placed = self._place and self.random.random() < 0.8
             self._add(type, name, "application", False, read)
         else:
             at_source = self.random.random() < 0.5
-            each = self._first(origins, type, at_source)
-            more = self._readable(origins, "topic", at_source, self._root(type, each))
-            read = [each, *self._chosen(more)]
-            service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
+            first = self._first(self._origins[type], type, at_source)
+            read = [first, *self._chosen(self._readable(type, "topic", at_source, first), least=0)]
             service |= {"each": "in0", "placement": "source" if at_source else "application"}
-            if self._places_each and not at_source and self.random.random() < 0.5:
-                service |= copy.deepcopy(self._place)
+            placed = self._places_each and not at_source and self.random.random() < 0.5
             self._add(type, name, "topic", at_source, read)
-        self._appdefs[type]["services"][name] = service
+        service["inputs"] = {f"in{n}": one.name for n, one in enumerate(read)}
+        return service | (copy.deepcopy(self._place) if placed else {})
 
-    def _share(self, name: str) -> None:
+    def _share(self, name: str) -> dict[str, dict[str, str]]:
+        """Define a service for both types; return, by type, what the service reads."""
         scope = self.random.choice(["topic", "topic", "node", "application", "cluster"])
         at_source = scope in ("topic", "node") and self.random.random() < 0.5
         definition = self._service(name, name) | {"scope": scope, "name": name}
@@ -173,20 +155,19 @@ class Graphs:
         definition |= {"placement": "source" if at_source else "application"}
         first = self._first(self._common, TYPES[0], at_source or scope == "cluster")
         count = self.random.randint(0, 1)
-        made = []
+        used, made = dict[str, dict[str, str]](), list[Origin]()
         for type in TYPES:
-            root = self._root(type, first)
-            more = self._readable(self._origins[type], scope, at_source, root)
+            more = self._readable(type, scope, at_source, first)
             read = [first, *(self.random.choice(more) for _ in range(count))]
-            self._appdefs[type]["uses"][name] = {f"in{n}": one.name for n, one in enumerate(read)}
+            used[type] = {f"in{n}": one.name for n, one in enumerate(read)}
             made.append(self._add(type, name, scope, at_source, read))
         if made[0] == made[1]:
             self._common.append(made[0])
         definition["inputs"] = {f"in{n}": {} for n in range(count + 1)}
-        if scope == "topic":
-            definition["each"] = "in0"
+        definition |= {"each": "in0"} if scope == "topic" else {}
         head = {"apiVersion": "demandops/v1", "kind": "ServiceDefinition"}
         self.files[f"appdefs/{name}/service.yaml"] = yaml.safe_dump(head | definition)
+        return used
 
 
 class Demands:
@@ -199,7 +180,7 @@ class Demands:
         self.types = {"x": "one", "y": "one", "z": "two"}
 
     def next(self) -> dict[str, Any]:
-        demand = self.random.choice(["d", "e", "f"])
+        demand = self.random.choice("def")
         head = {"kind": "Demand", "demand": demand, "requesters": [f"of {demand}"]}
         if demand in self.held and self.random.random() < 0.4:
             del self.held[demand]
@@ -226,7 +207,7 @@ class Demands:
         return app | {"deliver": self._deliveries(self.types[id])}
 
     def _deliveries(self, type: str) -> list[dict[str, Any]]:
-        """Return at most one delivery, of an output that only one node makes under its name."""
+        # each output is one that only one node makes under its name
         services = self.graphs.services[type].items()
         names = [name for name, one in services if one["scope"] != "topic" or one["at_source"]]
         chosen = self.random.sample(names, self.random.randint(0, min(1, len(names))))
@@ -234,7 +215,7 @@ class Demands:
 
 
 def instances(
-    graphs: Graphs, app: dict[str, Any], moved: Mapping[str, str] = MappingProxyType({})
+    graphs: Graphs, app: dict[str, Any], moved: Mapping[str, str]
 ) -> Iterator[ServiceKey]:
     """Yield the keys of the services that must run for an application of a demand.
 
@@ -260,10 +241,7 @@ def instances(
 def delivered(
     repo: MemoryRepo, demands: Demands, services: list[ServiceRelease]
 ) -> Iterator[tuple[str, str]]:
-    """Yield the topic and the receiving node of each delivery that the demands hold.
-
-    A demand's delivery has only outputs that are made from the inputs of this demand.
-    """
+    """Yield (topic, receiving node) of each delivery, which has what its demand's inputs make."""
     for app in (app for apps in demands.held.values() for app in apps):
         booked = repo.state.ledger.application(app["id"])
         assert booked is not None
@@ -275,10 +253,22 @@ def delivered(
                     yield one.outputs["out"], delivery["node"]
 
 
-def assert_every_topic_comes_in_one_way(repo: MemoryRepo, demands: Demands) -> None:
-    """Check that each topic that is read arrives in one way, and no other topic is carried."""
-    releases = [plan(repo.state, key) for key in all_keys(repo.state)]
-    services = [one for one in releases if isinstance(one, ServiceRelease)]
+def assert_follows(
+    repo: MemoryRepo, demands: Demands, nodes: Mapping[str, Mapping[str, str]]
+) -> None:
+    """Check that exactly what the demands need runs, and that all files follow from the ledger.
+
+    Each topic that is read arrives in one way, and no other topic is carried. ``nodes`` has the
+    nodes of the services that do not run on their application's node, by application.
+    """
+    releases = {key: plan(repo.state, key) for key in all_keys(repo.state)}
+    services = [one for one in releases.values() if isinstance(one, ServiceRelease)]
+    held = [app for apps in demands.held.values() for app in apps]
+    assert {key for key in releases if isinstance(key, ServiceKey)} == {
+        key for app in held for key in instances(demands.graphs, app, nodes[app["id"]])
+    }
+    assert ledger_in(repo.files) == repo.state.ledger
+    assert in_clusters(repo.files) == in_clusters(rendered_files(repo.state))
     made = {(one.node.id, topic) for one in services for topic in one.outputs.values()}
     for claim in repo.state.ledger:
         if claim.is_on_application:
@@ -310,22 +300,82 @@ def in_clusters(files: Mapping[str, str]) -> dict[str, str]:
     return {path: text for path, text in files.items() if path.startswith("clusters/")}
 
 
-@examples(20)
-@given(chances, st.integers(1, 8))
+def overrides(random: Random, graphs: Graphs) -> Iterator[Override]:
+    """Yield random overrides, each of which moves a service, or all services of an application."""
+    names = sorted({name for services in graphs.services.values() for name in services})
+    for number in range(random.randint(0, 2)):
+        by_service = Selector(services=(random.choice(names),))
+        file = OverrideFile(
+            apiVersion="demandops/v1",
+            kind="Override",
+            reason="by chance",
+            owner="petra",
+            priority=number,
+            select=(random.choice([by_service, by_service, Selector(applications=("x",))]),),
+            node=random.choice(NODES),
+        )
+        yield Override.from_file(f"o{number}", file)
+
+
+def wanted(graphs: Graphs, app: dict[str, Any], active: Iterable[Override]) -> dict[str, Any]:
+    """Return the new node of each service of ``app`` that an override moves; the last wins."""
+    return {
+        name: override.node
+        for override in active
+        for name, service in graphs.services[app["type"]].items()
+        if not service["at_source"] and service["scope"] != "cluster"
+        if name in (override.select[0].services or [name] * (app["id"] == "x"))
+    }
+
+
+def configure(repo: MemoryRepo, config: Config) -> tuple[tuple[str, str], ...]:
+    """Replace the configuration as a generator does.
+
+    Return (file, reason) for each override that cannot move a service.
+    """
+    state = state_of(config, repo.state.ledger)
+    moved = following_overrides(state)
+    for path, text in changed_claim_files(state.ledger, moved.ledger, moved.keys).items():
+        repo.files.pop(path) if text is None else repo.files.update({path: text})
+    repo.state = replace(state, ledger=moved.ledger)
+    for path in in_clusters(repo.files):
+        del repo.files[path]
+    repo.files |= in_clusters(rendered_files(repo.state))
+    return moved.stays
+
+
+@pytest.mark.parametrize("moving", [False, True])
+@examples(16)
+@given(chances, st.integers(1, 7))
 def test_every_topic_that_a_service_reads_comes_in_one_way_and_no_other_is_carried(
-    random: Random, length: int
+    moving: bool, random: Random, length: int
 ) -> None:
+    """If ``moving``, overrides move services back and forth."""
     graphs = Graphs(random)
     demands = Demands(random, graphs)
     repo = MemoryRepo(graphs.files)
-    traced, releases = TracedPlan(repo.config), dict[ReleaseKey, Release | None]()
+    plain, traced, releases = repo.config, TracedPlan(repo.config), dict[ReleaseKey, Any]()
     for _ in range(length):
-        decision = repo.send(demands.next())
-        running = {key for key in all_keys(repo.state) if isinstance(key, ServiceKey)}
-        held = (app for apps in demands.held.values() for app in apps)
-        assert running == {key for app in held for key in instances(graphs, app)}
-        assert_every_topic_comes_in_one_way(repo, demands)
-        releases |= traced.advance(repo.state.ledger, decision.changes.claims)
-        planned = {key: plan(repo.state, key) for key in all_keys(repo.state)}
-        assert {key: one for key, one in releases.items() if one} == planned
-        assert in_clusters(repo.files) == in_clusters(rendered_files(repo.state))
+        before = copy.deepcopy(demands.held), dict(demands.where)
+        taken = repo.take(demands.next())
+        if isinstance(taken, Refused):
+            assert moving and {fault.code for fault in taken.faults} == {"conflict"}
+            demands.held, demands.where = before
+        elif not moving:
+            releases |= traced.advance(repo.state.ledger, taken.changes.claims)
+            planned = {key: plan(repo.state, key) for key in all_keys(repo.state)}
+            assert {key: one for key, one in releases.items() if one} == planned
+        active = {one.name: one for one in overrides(random, graphs)} if moving else {}
+        stays = configure(repo, replace(plain, overrides=active)) if moving else ()
+        told = [(one.file, one.message) for one in policy_warnings(repo.state)]
+        assert {*stays} <= {*told}, "check must tell what stays"
+        apps = [app for apps in demands.held.values() for app in apps]
+        booked = {app["id"]: repo.state.ledger.application(app["id"]) for app in apps}
+        moved = {id: dict(app.moved) for id, app in booked.items() if app}
+        for app in apps:
+            if not any(f"'{app['id']}'" in why for _, why in stays):
+                assert moved[app["id"]] == wanted(graphs, app, active.values())
+        assert_follows(repo, demands, moved)
+    configure(repo, plain)
+    assert not repo.state.ledger.moved_applications()
+    assert_follows(repo, demands, defaultdict(dict))

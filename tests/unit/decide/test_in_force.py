@@ -1,33 +1,25 @@
-"""Under overrides too, the generated files follow from the configuration and the ledger.
-
-Random goals join and shut down. After each goal, the generated files, which changed goal by goal,
-equal the files that are rendered anew from the configuration and the ledger. The bookkeeping lists
-exactly the denied claims as suspended. The claim of an override that keeps a subject is the only
-claim on this subject.
-"""
+"""Under overrides too, the generated files follow from the configuration and the ledger."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from datetime import timedelta
 from typing import Any
 
 import pytest
 import yaml
 from demandops.base.errors import InvalidInput, Refused
-from demandops.base.naming import Subject, SubjectKind
-from demandops.decide.decision import decide
 from demandops.decide.state import rendered_files
 from demandops.model.demand.claim import OVERRIDE_PREFIX
-from demandops.model.demand.demand_request import Expire
 from demandops.views.bookkeeping import bookkeeping
 from hypothesis import given
 from hypothesis import strategies as st
 
+from tests.appdefs.test_scaling import FOLLOWING
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.goals import CLOUD, EGO, STATION_CLOUD, application, connection, goal
-from tests.kit.memory import NOW, MemoryRepo
+from tests.kit.memory import MemoryRepo
 
 HEAD = {"apiVersion": "demandops/v1", "kind": "Override", "reason": "why", "owner": "petra"}
 
@@ -39,23 +31,8 @@ def files(**overrides: Mapping[str, Any]) -> dict[str, str | None]:
     }
 
 
-CROWD = files(
-    denied={"select": [{"requesters": ["eve"]}, {"connections": ["v2/*"]}], "deny": True},
-    off={"select": [{"services": ["object-detection"], "nodes": ["cloud"]}], "deny": True},
-    kept={
-        "select": [{"applications": ["app/a"], "requesters": ["adam"]}, {"connections": ["v1/*"]}],
-        "keep": True,
-    },
-    frozen={"select": [{"applications": ["app/b"]}], "hold": True, "priority": 5},
-    many={"select": [{"requesters": ["ada*"], "services": ["object-*"]}], "replicas": 3},
-    moved={
-        "select": [{"services": ["object-fusion"], "applications": ["app/a"]}],
-        "node": "cloud",
-        "priority": 9,
-    },
-    pinned={"select": [{"nodes": ["edge"]}], "images": {"mqtt-client": {"tag": "old"}}},
-)
-
+TABLES = plain_yaml.beside(__file__)
+CROWD = files(**TABLES["crowd"])
 people = st.lists(
     st.sampled_from(["adam", "ada", "bob", "eve"]), min_size=1, max_size=2, unique=True
 )
@@ -82,7 +59,7 @@ def demands(draw: st.DrawFn) -> tuple[str, Any]:
 @given(st.lists(demands(), max_size=14))
 @examples(25)
 def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> None:
-    books = MemoryRepo(CROWD)
+    books = MemoryRepo(CROWD | FOLLOWING)
     for made in sent:
         before = dict(books.files)
         try:
@@ -110,75 +87,38 @@ def test_what_demands_leave_behind_follows_from_the_books(sent: list[Any]) -> No
         assert "v2/edge" not in entries.connections
 
 
-def _one(**fields: Any) -> MemoryRepo:
-    return MemoryRepo(files(tested=fields))
+def after(books: MemoryRepo, changed: dict[str, str | None]) -> dict[str, str]:
+    """Return the files when the configuration of a repo with releases is changed."""
+    state = replace(MemoryRepo(changed).state, ledger=books.state.ledger)
+    return rendered_files(state, books.files)
 
 
-def test_the_higher_priority_wins_and_patches_of_both_apply() -> None:
-    books = MemoryRepo(
-        files(
-            low={
-                "select": [{"nodes": ["edge"]}],
-                "priority": -1,
-                "values": {"replicas": 7, "tolerations": [{"operator": "Exists"}]},
-            },
-            high={
-                "select": [{"services": ["object-detection"]}],
-                "values": {"replicas": 5, "nodeSelector": None},
-            },
-        )
-    )
+DETECTION = "clusters/c-its/perception/edge/od-edge-vehicle00.yaml"
+HOLD = {"select": [{"services": ["object-detection"]}], "hold": True}
+
+
+@pytest.mark.parametrize(("priority", "changes"), [(1, True), (-1, False)])
+def test_only_an_override_of_higher_priority_than_a_hold_changes_the_held_release(
+    priority: int, changes: bool
+) -> None:
+    books = MemoryRepo()
     books.send(goal([application()]))
-    values = books.objects("HelmRelease")["od-edge-vehicle00"]["spec"]["values"]
-    assert (values["replicas"], values["tolerations"]) == (5, [{"operator": "Exists"}])
-    assert "nodeSelector" not in values
-    fusion = books.objects("HelmRelease")
-    (name,) = [name for name in fusion if name.startswith("of-")]
-    assert fusion[name]["spec"]["values"]["replicas"] == 7
+    more = {"select": [{"nodes": ["edge"]}], "replicas": 4, "priority": priority}
+    held = after(books, files(held=HOLD, more=more))[DETECTION]
+    assert (yaml.safe_load(held) != yaml.safe_load(books.files[DETECTION])) is changes
 
 
-def test_an_override_of_higher_priority_than_a_hold_changes_the_held_release() -> None:
-    def body(text: str) -> str:
-        return "".join(line for line in text.splitlines(True) if not line.startswith("#"))
-
-    hold = {"select": [{"services": ["object-detection"]}], "hold": True}
-    for priority, changed in ((1, True), (-1, False)):
-        books = MemoryRepo({})
-        books.send(goal([application()]))
-        before = dict(books.files)
-        more = {"select": [{"nodes": ["edge"]}], "replicas": 4, "priority": priority}
-        held = MemoryRepo(files(held=hold, more=more))
-        held.state = replace(held.state, ledger=books.state.ledger)
-        after = rendered_files(held.state, before)
-        path = "clusters/c-its/perception/edge/od-edge-vehicle00.yaml"
-        assert (body(after[path]) != body(before[path])) is changed
-
-
-@pytest.mark.parametrize(
-    ("select", "fields"),
-    [
-        ({"applications": ["edge/*"]}, ["apps[0].header.id"]),
-        ({"appdefs": ["object-*"]}, ["apps[0].type"]),
-        ({"nodes": ["edge"], "services": ["object-fusion"]}, ["apps[0].type"]),
-        ({"labels": {"node_id": "edge"}, "applications": ["edge/*"]}, ["apps[0].header.id"]),
-        ({"nodes": ["ed?e"], "appdefs": ["*"]}, ["apps[0].type"]),
-        ({"connections": ["vehicle00/*"]}, ["connections[0].id"]),
-        ({"connections": ["*"], "nodes": ["vehicle00"]}, ["connections[0].id"]),
-        ({"requesters": ["vehicle0?"], "applications": ["*"]}, ["apps[0].header.id"]),
-        ({"nodes": ["edge"]}, ["apps[0].header.node_id", "connections[0].target_node_id"]),
-        ({"labels": {"node_id": "vehicle00"}}, ["connections[0].source_node_id"]),
-    ],
-    ids=str,
-)
+@pytest.mark.parametrize(("select", "fields"), TABLES["denied"], ids=str)
 def test_a_denial_names_the_field_the_override_its_reason_and_its_owner(
     select: dict[str, Any], fields: list[str]
 ) -> None:
-    books = _one(select=[select], deny=True, expires="2090-01-01T00:00:00Z")
-    assert books.faults(goal([application()], [connection()])) == [
-        f"{field}: is denied by overrides/tested.yaml until 2090-01-01T00:00:00Z: why; ask the "
-        "override's owner, petra, or demand something else"
-        for field in fields
-    ]
+    expires = "2090-01-01T00:00:00Z"
+    books = MemoryRepo(files(tested={"select": [select], "deny": True, "expires": expires}))
+    told = (
+        f"is denied by overrides/tested.yaml until {expires}: why; ask the override's owner, petra"
+    )
+    found = books.faults(goal([application()], [connection()]))
+    assert [one.partition(", or")[0] for one in found] == [f"{field}: {told}" for field in fields]
 
 
 def test_a_refusal_names_the_override_that_breaks_the_demand() -> None:
@@ -189,24 +129,7 @@ def test_a_refusal_names_the_override_that_breaks_the_demand() -> None:
         books.send(goal([application()]))
     (found,) = refusal.value.faults
     assert (found.file, found.field) == ("overrides/tested.yaml", "values.replicas")
-    assert found.message.endswith(
-        "; fix the override or appdefs/object-detection-fusion/charts/object-detection"
-    )
-
-
-def test_a_kept_claim_belongs_to_the_owner_with_the_inputs_of_the_last_claim() -> None:
-    books = _one(select=[{"applications": ["edge/*"]}], keep=True)
-    one = goal([application(ego=[EGO])], id="one")
-    two = goal([application(who=["bob"])], id="two")
-    books.send(one)
-    books.send(two)
-    books.send(one | {"shutdown": True})
-    books.send(two | {"shutdown": True})
-    subject = Subject(SubjectKind.APPLICATION, "edge/object_detection_fusion")
-    (claim,) = books.state.ledger.claims_on(subject)
-    assert (claim.demand, claim.request) == ("override:tested", "override:tested")
-    assert (claim.requesters, claim.lease) == (("petra",), None)
-    assert "ego_data" not in claim.application.inputs
+    assert "fix the override or appdefs/" in found.message
 
 
 REGISTRY = """\
@@ -216,55 +139,15 @@ charts:
   object-detection: {oci: "oci://registry.example/charts/object-detection", version: %s}
   object-fusion: {http: "https://charts.example/perception", version: %s}
 """
-CHARTS = "clusters/c-its/perception/_charts"
 
 
-def test_a_held_release_keeps_its_chart_when_the_registry_moves_on() -> None:
-    old, new = REGISTRY % ("1.0.0", "2.0.0"), REGISTRY % ("1.1.0", "2.1.0")
-    books = MemoryRepo({"registry/charts.yaml": old})
+@pytest.mark.parametrize("held", [True, False])
+def test_a_held_release_keeps_its_chart_when_the_registry_moves_on(held: bool) -> None:
+    books = MemoryRepo({"registry/charts.yaml": REGISTRY % ("1.0.0", "2.0.0")})
     books.send(goal([application()]))
-    before = dict(books.files)
-    hold = files(held={"select": [{"services": ["object-detection"]}], "hold": True})
-    for overrides, kept in ((hold, True), ({}, False)):
-        moved = MemoryRepo({"registry/charts.yaml": new, **overrides})
-        state = replace(moved.state, ledger=books.state.ledger)
-        after = rendered_files(state, before)
-        assert (f"{CHARTS}/object-detection-1.0.0.yaml" in after) is kept
-        assert f"{CHARTS}/object-detection-1.1.0.yaml" in after
-        release = after["clusters/c-its/perception/edge/od-edge-vehicle00.yaml"]
-        assert ("object-detection-1.0.0" in release) is kept
-
-
-def test_an_override_keeps_claims_that_end_by_lease_or_by_a_reduced_put() -> None:
-    demand = {
-        "kind": "Demand",
-        "demand": "leased",
-        "requesters": ["vehicle00"],
-        "lease": "1s",
-        "applications": [
-            {
-                "id": name,
-                "type": "object-detection-fusion",
-                "node": "edge",
-                "inputs": {"ego_data": [{"topic": EGO[0], "source": EGO[1]}]},
-            }
-            for name in ("a", "b")
-        ],
-    }
-    books = _one(select=[{"applications": ["a", "b"]}], keep=True)
-    books.send(demand)
-    books.send(demand | {"applications": demand["applications"][:1]})
-    assert _holders(books) == {"a": ["leased"], "b": ["override:tested"]}
-    over = Expire(id="leased", demand="leased")
-    made = decide(books.state, over, NOW + timedelta(minutes=5), books.files.get)
-    books.state = made.state
-    assert _holders(books) == {"a": ["override:tested"], "b": ["override:tested"]}
-    assert made.overrides == ("overrides/tested.yaml",)
-
-
-def _holders(books: MemoryRepo) -> dict[str, list[str]]:
-    found: dict[str, list[str]] = {}
-    for claim in books.state.ledger:
-        if claim.subject.kind is SubjectKind.APPLICATION:
-            found.setdefault(claim.subject.id, []).append(claim.demand)
-    return found
+    newer = {"registry/charts.yaml": REGISTRY % ("1.1.0", "2.1.0")}
+    found = after(books, newer | (files(held=HOLD) if held else {}))
+    charts = "clusters/c-its/perception/_charts/object-detection"
+    assert (f"{charts}-1.0.0.yaml" in found) is held
+    assert f"{charts}-1.1.0.yaml" in found
+    assert ("object-detection-1.0.0" in found[DETECTION]) is held

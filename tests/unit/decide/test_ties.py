@@ -5,14 +5,14 @@ The tests compare random selectors with every possible release.
 
 from __future__ import annotations
 
-from functools import lru_cache
+from functools import lru_cache, partial
 from itertools import product
+from json import dumps
 from typing import Any
 
+import pytest
 from demandops.decide.changeset import trial_releases
 from demandops.decide.planning.overrides import Traits, apply_effects, effects_on, fits
-from demandops.model.config.config import Config
-from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile, Selector, merge_patch
 from demandops.model.config.override_conflicts import (
     contested_effects,
@@ -24,8 +24,10 @@ from demandops.model.release import ServiceRelease
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
-from tests.kit.config import configuration, may_select_same_release
+from tests.kit.config import may_select_same_release
+from tests.kit.memory import MemoryRepo
 
 TEXTS = ["".join(chars) for size in range(7) for chars in product("ab", repeat=size)]
 pattern = st.text("ab*?", min_size=1, max_size=4)
@@ -41,13 +43,9 @@ def test_patterns_overlap_just_where_some_text_fits_both(one: str, other: str) -
     assert patterns_overlap(other, one) is both
 
 
-@lru_cache
-def config() -> Config:
-    return load(configuration())
-
-
+CONFIG = MemoryRepo().config
 IDS = ["a", "b", "ab"]
-REQUESTERS = [("a",), ("b",), ("a", "b")]
+SOME = [("a",), ("b",), ("a", "b")]
 NODES = ["edge", "cloud"]
 SHARED, OWN, APPDEF = "object-detection", "object-fusion", "object-detection-fusion"
 
@@ -55,12 +53,9 @@ SHARED, OWN, APPDEF = "object-detection", "object-fusion", "object-detection-fus
 def _releases() -> list[Traits]:
     """Return the traits of every possible release in a world with few names."""
     found = []
-    for node, who in product(NODES, REQUESTERS):
+    for node, who in product(NODES, SOME):
         found += [Traits((node,), who, (id,), (APPDEF,), service=OWN) for id in IDS]
-        found += [
-            Traits((node,), who, ids, (APPDEF,), service=SHARED)
-            for ids in [("a",), ("b",), ("a", "b")]
-        ]
+        found += [Traits((node,), who, ids, (APPDEF,), service=SHARED) for ids in SOME]
         found += [Traits((node,), who, connections=(id,)) for id in IDS]
     return found
 
@@ -87,35 +82,28 @@ selector = fields.filter(bool).map(Selector.model_validate)
 @given(st.lists(selector, min_size=1, max_size=2), st.lists(selector, min_size=1, max_size=2))
 @examples(60)
 def test_selectors_that_cannot_meet_never_do(one: list[Selector], other: list[Selector]) -> None:
-    if may_select_same_release(one, other, config()):
+    if may_select_same_release(one, other, CONFIG):
         return
-    assert not may_select_same_release(other, one, config())
+    assert not may_select_same_release(other, one, CONFIG)
     for traits in RELEASES:
-        hit = [any(fits(s, traits, config()) for s in side) for side in (one, other)]
+        hit = [any(fits(s, traits, CONFIG) for s in side) for side in (one, other)]
         assert not all(hit), traits
 
 
-def test_selectors_that_differ_in_a_single_valued_trait_never_meet() -> None:
-    apart: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        ({"nodes": ["edge"]}, {"nodes": ["cloud", "v*"]}),
-        ({"services": [SHARED]}, {"services": [OWN]}),
-        ({"services": [OWN]}, {"connections": ["*"]}),
-        ({"labels": {"node_id": "a"}}, {"labels": {"node_id": "b"}}),
-        (
-            {"services": [OWN], "applications": ["a"]},
-            {"services": [OWN], "applications": ["b"]},
-        ),
-        ({"connections": ["a"]}, {"connections": ["b"]}),
-    ]
-    together: list[tuple[dict[str, Any], dict[str, Any]]] = [
-        ({"applications": ["a"]}, {"applications": ["b"]}),  # one shared service may serve both
-        ({"requesters": ["a"]}, {"requesters": ["b"]}),
-        ({"nodes": ["edge"]}, {"services": [OWN]}),
-    ]
-    for expected, pairs in ((False, apart), (True, together)):
-        for pair in pairs:
-            one, other = (Selector.model_validate(fields) for fields in pair)
-            assert may_select_same_release([one], [other], config()) is expected, pair
+@pytest.mark.parametrize(
+    ("pair", "meet"),
+    [
+        (pair, name == "together")
+        for name, pairs in plain_yaml.beside(__file__).items()
+        for pair in pairs
+    ],
+    ids=str,
+)
+def test_selectors_that_differ_in_a_single_valued_trait_never_meet(
+    pair: list[dict[str, Any]], meet: bool
+) -> None:
+    one, other = (Selector.model_validate(fields) for fields in pair)
+    assert may_select_same_release([one], [other], CONFIG) is meet
 
 
 json = st.recursive(
@@ -123,6 +111,7 @@ json = st.recursive(
     lambda inner: st.lists(inner, max_size=2) | st.dictionaries(st.sampled_from("kl"), inner),
     max_leaves=4,
 )
+_text = partial(dumps, sort_keys=True)
 patch = st.fixed_dictionaries({}, optional={"k": json, "l": json})
 
 
@@ -136,13 +125,7 @@ def test_patches_that_commute_give_the_same_in_either_order(
         merge_patch(merge_patch(target, other), one),
     )
     if patches_commute(one, other):
-        assert repr(_sorted(both[0])) == repr(_sorted(both[1]))
-
-
-def _sorted(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _sorted(value[key]) for key in sorted(value)}
-    return [_sorted(item) for item in value] if isinstance(value, list) else value
+        assert _text(both[0]) == _text(both[1])
 
 
 @given(json, json)
@@ -177,7 +160,7 @@ effects = st.fixed_dictionaries(
 
 @lru_cache
 def _release() -> ServiceRelease:
-    (made,) = trial_releases(config()).values()
+    (made,) = trial_releases(CONFIG).values()
     return made[0]
 
 
@@ -202,11 +185,11 @@ def _override(name: str, fields: dict[str, Any]) -> Override:
 
 def _shaped(overrides: list[Override]) -> tuple[Any, ...]:
     release = _release()
-    by = [(one, effects_on(release, one, config())) for one in overrides]
-    shaped = apply_effects(release, [pair for pair in by if pair[1]], config())
+    by = [(one, effects_on(release, one, CONFIG)) for one in overrides]
+    shaped = apply_effects(release, [pair for pair in by if pair[1]], CONFIG)
     assert isinstance(shaped, ServiceRelease)
     values: Any = {}
     for _, patch in shaped.shaping.patches:
         values = merge_patch(values, patch)
-    images = {name: shaped.image(name, config()) for name in release.service.images}
-    return shaped.replicas, shaped.node, shaped.shaping.held, repr(_sorted(values)), images
+    images = {name: shaped.image(name, CONFIG) for name in release.service.images}
+    return shaped.replicas, shaped.node, shaped.shaping.held, _text(values), images

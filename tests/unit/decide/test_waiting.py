@@ -1,51 +1,32 @@
-"""Waiting demands are booked in the order in which they wait, and no demand waits if it fits."""
+"""What ends the waiting of a demand; ``test_capacity`` has who waits, and in which order."""
 
 from __future__ import annotations
 
-from dataclasses import replace
 from datetime import timedelta
-from random import Random
 from typing import Any
 
 import pytest
 import yaml
-from demandops.base.errors import Refused
-from demandops.decide.decision import Decision
 from demandops.decide.restoration import Restoration
 from demandops.model.demand.demand_request import Decommission
 from demandops.model.ledger import records
 from demandops.model.ledger.records import in_turn
-from hypothesis import given
-from hypothesis import strategies as st
+from demandops.views.demand_lists import demands
 
-from tests.kit.chance import chances, examples
-from tests.kit.config import state_of
-from tests.kit.memory import MemoryRepo, ledger_in
-from tests.unit.decide.test_capacity import CAPACITY, recorders, used
+from tests.kit.memory import MemoryRepo
+from tests.unit.decide.test_capacity import book_waiting, recorders
 
 
 def waiting_repo() -> MemoryRepo:
     """Return a repo whose only access domain lets demands wait."""
-    state = recorders()
-    (domain,) = state.config.domains.values()
-    domain = domain.model_copy(update={"when_full": "wait"})
-    config = replace(
-        state.config,
-        domains={domain.name: domain},
-        domain_of=dict.fromkeys(state.config.domain_of, domain),
-    )
-    return MemoryRepo(state=state_of(config, state.ledger))
+    return MemoryRepo(state=recorders("wait"))
 
 
 def put(name: str, topics: int = 1, **more: Any) -> dict[str, Any]:
     """Return a demand for a recorder, which has one replica for every two topics."""
     cloud = [{"topic": f"/{name}/t{number}", "source": "vehicle01"} for number in range(topics)]
-    app = {
-        "id": name,
-        "type": "recorder",
-        "place": {"role": "edge"},
-        "inputs": {"point_cloud": cloud},
-    }
+    app = {"id": name, "type": "recorder", "place": {"role": "edge"}}
+    app |= {"inputs": {"point_cloud": cloud}}
     head = {"kind": "Demand", "demand": name, "requesters": ["v"], "applications": [app]}
     return head | {"connections": []} | more
 
@@ -54,45 +35,8 @@ def release(name: str) -> dict[str, Any]:
     return {"kind": "Demand", "operation": "release", "demand": name, "requesters": ["v"]}
 
 
-def book_waiting(repo: MemoryRepo) -> list[str]:
-    """Try to book each waiting demand in order; return the ids of those that were booked."""
-    booked = []
-    for one in in_turn(repo.state.ledger.waiting):
-        taken = repo.take(dict(one.goal))
-        assert isinstance(taken, Decision)
-        booked += [one.demand] if taken.outcome == "booked" else []
-    return booked
-
-
 def waits(repo: MemoryRepo) -> list[str]:
     return [one.demand for one in in_turn(repo.state.ledger.waiting)]
-
-
-@examples(8)
-@given(chances, st.integers(4, 14))
-def test_what_waits_does_not_fit_and_is_booked_in_turn(random: Random, length: int) -> None:
-    repo, sent = waiting_repo(), dict[str, dict[str, Any]]()
-    for _ in range(length):
-        repo.now += timedelta(minutes=1)
-        name = f"d{random.randrange(6)}"
-        held = bool(repo.state.ledger.claims_of_demand(name))
-        if held or (name in waits(repo) and random.random() < 0.5):
-            taken = repo.take(release(name))
-        else:
-            more = {"priority": random.randrange(2)}
-            sent[name] = put(name, random.choice((1, 3, 5)), **more)
-            taken = repo.take(sent[name])
-        assert isinstance(taken, Decision)
-        if taken.frees:
-            book_waiting(repo)
-        for one in in_turn(repo.state.ledger.waiting):
-            assert one.goal == sent[one.demand]
-            assert not repo.state.ledger.claims_of_demand(one.demand)
-            assert repo.decide(dict(one.goal)).outcome == "waiting"
-        turns = [(-one.priority, one.since) for one in in_turn(repo.state.ledger.waiting)]
-        assert turns == sorted(turns)
-        assert all(used(repo)[id] <= most for id, most in CAPACITY.items())
-        assert ledger_in(repo.files) == repo.state.ledger
 
 
 def full_repo() -> MemoryRepo:
@@ -100,10 +44,17 @@ def full_repo() -> MemoryRepo:
     repo = waiting_repo()
     for number, topics in enumerate((5, 5, 3)):
         repo.send(put(f"full{number}", topics))
+        repo.now += timedelta(minutes=1)
     for name, who in (("a", "v"), ("b", "w")):
         taken = repo.send(put(name) | {"requesters": [who]})
         assert taken.outcome == "waiting" and taken.lease_s is None
     return repo
+
+
+def test_the_list_of_demands_has_those_that_wait() -> None:
+    listed = [(one.name, one.state, len(one.applications)) for one in demands(full_repo().state)]
+    held = [(f"full{number}", "held", 1) for number in range(3)]
+    assert listed == [*held, ("a", "waiting", 0), ("b", "waiting", 0)]
 
 
 def test_a_decommissioned_requester_waits_no_longer() -> None:
@@ -125,14 +76,6 @@ def test_a_rollback_leaves_what_waits() -> None:
     repo.send(Restoration("back", claims=(), drop_newer=True, to="0" * 40))
     assert waits(repo) == ["a", "b"]
     assert book_waiting(repo) == ["a", "b"]
-
-
-def test_a_demand_that_holds_something_does_not_wait_for_more() -> None:
-    repo = full_repo()
-    more = put("full2", 5)
-    with pytest.raises(Refused) as refused:
-        repo.decide(more)
-    assert {fault.code for fault in refused.value.faults} == {"capacity"}
 
 
 @pytest.mark.parametrize(

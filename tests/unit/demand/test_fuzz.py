@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 from unicodedata import category
 
-import yaml
-from demandops.base.errors import Fault, InvalidInput, Refused
+from demandops.base.errors import Fault, Refused
 from demandops.decide.decision import Decision, decide
 from demandops.model.demand import deployment_request_goal
-from demandops.repo.history import commit_message
-from demandops.repo.history.commit_log import parse
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
 from tests.kit.goals import APP, CLOUD, application, connection, goal
 from tests.kit.memory import NOW, MemoryRepo
-from tests.kit.plain_yaml import FAST
 
 TEXT = st.text(max_size=12) | st.sampled_from(
     ["", "edge", "vehicle00", APP, CLOUD[0], "/a", "..", "~", "\\", "\ud800", "a" * 1100, "{{ x }}"]
@@ -82,74 +77,32 @@ def test_the_form_is_judged_alike_with_and_without_a_catalog(data: Any) -> None:
     assert request is not None or faults
 
 
-def goals(text: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
-    """Return a strategy for goals of the right form, whose texts come from the strategy `text`."""
-    topics = st.lists(st.tuples(text, text), max_size=2)
-    apps = st.lists(
-        st.builds(
-            application,
-            text,
-            node=text,
-            who=st.lists(text, max_size=2),
-            ego=topics,
-            clouds=topics,
-            type=st.integers(0, 2),
-        ),
-        max_size=2,
-    )
-    connections = st.lists(
-        st.builds(
-            connection,
-            text,
-            who=st.lists(text, max_size=2),
-            ends=st.tuples(text, text),
-            topics=st.lists(text, max_size=2),
-            targets=st.lists(text, max_size=2),
-            broker=text,
-            type=st.integers(0, 3),
-        ),
-        max_size=2,
-    )
-    make: Callable[..., Any] = goal
-    return st.builds(make, apps, connections, id=text, shutdown=st.booleans())
+TEXTS = st.lists(TEXT, max_size=2)
+TOPICS = st.lists(st.tuples(TEXT, TEXT), max_size=2)
+TYPE = st.integers(0, 3)
+APPLICATIONS = st.builds(
+    application, TEXT, node=TEXT, who=TEXTS, ego=TOPICS, clouds=TOPICS, type=TYPE
+)
+CONNECTIONS = st.builds(
+    connection, TEXT, who=TEXTS, ends=st.tuples(TEXT, TEXT), topics=TEXTS, targets=TEXTS,
+    broker=TEXT, type=TYPE,
+)  # fmt: skip
+GOALS: st.SearchStrategy[Any] = st.builds(
+    goal,
+    st.lists(APPLICATIONS, max_size=2),
+    st.lists(CONNECTIONS, max_size=2),
+    id=TEXT,
+    shutdown=st.booleans(),
+)
 
 
 @examples(70)
 @example(goal([], [connection(ends=("\x7f", "\x7f"), topics=["/a"])]))
-@given(goals(TEXT))
+@given(GOALS)
 def test_a_goal_of_the_right_form_is_decided_or_refused(data: Any) -> None:
     found = outcome(data)
     if isinstance(found, tuple):
         assert_told(found)
-
-
-ID = st.text(min_size=1, max_size=30)
-
-
-@examples(70)
-@given(ID, ID, ID)
-@example("\\", "\\", "\\")
-@example(".", "<>", " ")
-@example("Operation: x", "Request-Id: y", "#")
-@example("a\u00a0b", "a", "a")
-def test_any_id_is_refused_or_booked_rendered_committed_and_released(
-    id: str, who: str, request: str
-) -> None:
-    asked = goal([application(id, who=[who])], [connection(id, who=[who])], id=request)
-    books = MemoryRepo()
-    try:
-        decision = books.send(asked)
-    except InvalidInput as refused:
-        assert isinstance(refused, Refused)
-        assert_told(refused.faults)
-        return
-    for text in books.rendered().values():
-        assert all(isinstance(item, dict) for item in yaml.load_all(text, Loader=FAST))
-    assert commit_message.author(decision, NOW).name
-    text = commit_message.of_decision(decision, "operation", NOW)
-    assert parse(text).trailers["Requester"] == [who]
-    books.send(asked | {"shutdown": True})
-    assert books.rendered() == {}
 
 
 def test_a_name_with_half_a_character_is_refused_wherever_it_stands() -> None:

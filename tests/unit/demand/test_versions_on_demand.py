@@ -1,4 +1,7 @@
-"""The newest of the demanded versions runs; some updates need approval."""
+"""The newest of the demanded versions runs, or each by itself; some updates need approval.
+
+``tests/scenarios`` has stories of it.
+"""
 
 from __future__ import annotations
 
@@ -10,10 +13,12 @@ import pytest
 from demandops.base.errors import InvalidInput, Refused
 from demandops.decide.state import rendered_files, try_configuration
 from demandops.model.config.registry import precedence
+from demandops.model.release import ServiceRelease
 from hypothesis import given
 
+from tests.kit import plain_yaml
 from tests.kit.chance import chances, examples
-from tests.kit.config import edited, override, skeleton, state_of
+from tests.kit.config import edited, skeleton, state_of
 from tests.kit.memory import MemoryRepo, ledger_in, rebuilt
 
 APPDEF = "appdefs/object-detection-fusion/appdef.yaml"
@@ -21,24 +26,16 @@ LISTED = ("0.9.0", "1.0.0", "1.1.0-rc.2", "1.1.0-rc.10", "1.1.0", "1.10.0", "2.0
 """The versions in the registry, oldest first."""
 CHANNELS = {"stable": "1.0.0", "testing": "1.1.0"}
 DEFAULT = "1.0.0"
-NODES = ("edge", "cloud")
 
 
 def config(policy: str, **more: Any) -> dict[str, str]:
     """Return a configuration in which each version pins the images of both services."""
-    pins = {
-        version: {
-            "images": {name: {"tag": version} for name in ("object-detection", "object-fusion")}
-        }
-        for version in LISTED
-    }
+    services = ("object-detection", "object-fusion")
+    pins = {one: {"images": {name: {"tag": one} for name in services}} for one in LISTED}
     entry = {"default": DEFAULT, "channels": CHANNELS, "versions": pins} | more
-    head = {"apiVersion": "demandops/v1", "kind": "Versions"}
-    made = {
-        "registry/versions.yaml": json.dumps(
-            head | {"applications": {"object-detection-fusion": entry}}
-        )
-    }
+    file = {"apiVersion": "demandops/v1", "kind": "Versions"}
+    file |= {"applications": {"object-detection-fusion": entry}}
+    made = {"registry/versions.yaml": json.dumps(file)}
     return made | edited(APPDEF, "inputs:\n", f"versions: {policy}\ninputs:\n")
 
 
@@ -48,96 +45,41 @@ def put(
     inputs = {"point_cloud": [{"topic": cloud, "source": "edge"}]}
     app = {"id": id, "type": "object-detection-fusion", "node": "edge", "inputs": inputs}
     app |= {"version": version} if version else {}
-    return {
-        "kind": "Demand",
-        "demand": demand,
-        "requesters": [f"for-{demand}"],
-        "applications": [app],
-    }
+    head = {"kind": "Demand", "demand": demand, "requesters": [f"for-{demand}"]}
+    return head | {"applications": [app]}
 
 
 def release(demand: str) -> dict[str, Any]:
-    return {
-        "kind": "Demand",
-        "operation": "release",
-        "demand": demand,
-        "requesters": [f"for-{demand}"],
-    }
-
-
-def running(repo: MemoryRepo) -> dict[str, str]:
-    """Return the version of each running service."""
-    return {name: entry["application_version"] for name, entry in repo.books()["services"].items()}
+    return put(demand) | {"operation": "release", "applications": []}
 
 
 ASKS = "application definition 'object-detection-fusion', for "
+CASES = plain_yaml.beside(__file__)
 
 
-EDGE = "application 'edge/a'"
-UPGRADE = f"{ASKS}the upgrade of {EDGE} from version"
-RUNS = f"{EDGE} runs version"
-
-
-@pytest.mark.parametrize(
-    ("policy", "first", "then", "approval", "warning"),
-    [
-        pytest.param("update", "", "1.1.0", "", "", id="an update"),
-        pytest.param("update", "testing", "1.1.0", "", "", id="the same by another name"),
-        pytest.param(
-            "update", "1.1.0", "1.1.0-rc.2",
-            "", f"{RUNS} 1.1.0, which others ask for, not 1.1.0-rc.2", id="an older one",
-        ),
-        pytest.param("update", "2.0.0", "", "", "", id="one that names none takes an upgrade"),
-        pytest.param("upgrade", "", "2.0.0", "", "", id="an upgrade that needs nobody"),
-        pytest.param("update", "", "2.0.0", f"{UPGRADE} 1.0.0 to 2.0.0", "", id="an upgrade"),
-        pytest.param(
-            "update", "0.9.0", "", f"{UPGRADE} 0.9.0 to 1.0.0", "", id="the default is an upgrade"
-        ),
-        pytest.param(
-            "update", "2.0.0", "1.1.0",
-            f"{ASKS}version 1.1.0 of {EDGE}, which runs in version 2.0.0",
-            f"{RUNS} 2.0.0, which others ask for, not 1.1.0", id="an older major version by name",
-        ),
-    ],
-)  # fmt: skip
-def test_what_follows_from_another_version(
-    policy: str, first: str, then: str, approval: str, warning: str
-) -> None:
-    repo = MemoryRepo(config(policy))
-    assert repo.send(put("a", first)).approval == (), "the first demand contradicts nobody"
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
+def test_what_follows_from_another_version(case: dict[str, str]) -> None:
+    repo, then = MemoryRepo(config(case["policy"])), case.get("then", "")
+    first = repo.send(put("a", case.get("first", "")))
+    assert first.approval == (), "the first demand contradicts nobody"
+    before = repo.rendered()
     decision = repo.send(put("b", then))
     assert decision.outcome == "booked"
-    assert decision.approval == ((approval,) if approval else ())
-    assert decision.warnings == ((warning,) if warning else ())
+    assert decision.approval == ((ASKS + case["approval"],) if "approval" in case else ())
+    assert [case["warns"] in text for text in decision.warnings] == [True] * ("warns" in case)
     again = repo.send(put("b", then, cloud="/more"))
     assert again.approval == (), "a booked demand needs no second approval"
     assert repo.send(release("b")).approval == ()
-
-
-def test_an_update_and_its_end_say_what_changes_in_one_commit_each() -> None:
-    repo = MemoryRepo(config("update"))
-    repo.send(put("a"))
-    before = repo.rendered()
-    there = repo.send(put("b", "testing"))
-    assert [change.details for change in there.releases] == [
-        ("- version 1.0.0", f"- image {name} 1.0.0", "+ version 1.1.0", f"+ image {name} 1.1.0")
-        for name in ("object-detection", "object-fusion")
-    ]
-    back = repo.send(release("b"))
-    assert [change.details for change in back.releases] == [
-        ("- version 1.1.0", f"- image {name} 1.1.0", "+ version 1.0.0", f"+ image {name} 1.0.0")
-        for name in ("object-detection", "object-fusion")
-    ]
     assert repo.rendered() == before
 
 
-def test_an_update_reaches_what_only_others_need() -> None:
+def test_an_update_says_what_changes() -> None:
     repo = MemoryRepo(config("update"))
     repo.send(put("a"))
-    repo.send(put("b", "testing", cloud="/more"))
-    assert {*running(repo).values()} == {"1.1.0"}
-    repo.send(release("b"))
-    assert {*running(repo).values()} == {"1.0.0"}
+    assert [change.details for change in repo.send(put("b", "testing")).releases] == [
+        ("- version 1.0.0", f"- image {name} 1.0.0", "+ version 1.1.0", f"+ image {name} 1.1.0")
+        for name in ("object-detection", "object-fusion")
+    ]
 
 
 def test_a_shared_service_follows_the_newest_of_its_applications() -> None:
@@ -146,57 +88,11 @@ def test_a_shared_service_follows_the_newest_of_its_applications() -> None:
     asks = repo.send(put("b", "2.0.0", id="edge/b"))
     what = "object-detection for /points of 'edge'"
     assert asks.approval == (f"{ASKS}the upgrade of {what} from version 1.0.0 to 2.0.0",)
-    names = running(repo)
-    assert sorted(names.values()) == ["1.0.0", "2.0.0", "2.0.0"]
     # a third demand shares the version that already runs
     assert repo.send(put("c", "2.0.0", id="edge/c")).approval == ()
     older = repo.send(put("d", "1.0.0", id="edge/d"))
     assert older.approval == (f"{ASKS}version 1.0.0 of {what}, which runs in version 2.0.0",)
     assert older.warnings == (f"{what} runs version 2.0.0, which others ask for, not 1.0.0",)
-
-
-def test_two_applications_of_one_demand_must_agree_where_versions_are_refused() -> None:
-    repo = MemoryRepo(config("refuse"))
-    goal = put("a", "1.0.0")
-    goal["applications"] += put("a", "1.1.0", id="edge/b")["applications"]
-    what = "version: object-detection for /points of 'edge' would run in version"
-    assert repo.faults(goal) == [
-        f"applications[0].{what} 1.0.0, but is shared with 'edge/b' in version 1.1.0; request "
-        "version 1.1.0",
-        f"applications[1].{what} 1.1.0, but is shared with 'edge/a' in version 1.0.0; request "
-        "version 1.0.0",
-    ]
-
-
-def test_an_override_is_above_the_version() -> None:
-    pinned = override({"services": ["object-detection"]}, images={"object-detection": {"tag": "p"}})
-    repo = MemoryRepo(config("update") | {"overrides/pin.yaml": pinned})
-    repo.send(put("a"))
-    repo.send(put("b", "1.1.0"))
-    tags = {
-        release["spec"]["values"]["image"]["tag"]
-        for release in repo.objects("HelmRelease").values()
-    }
-    assert tags == {"p", "1.1.0"}
-
-
-def test_a_denied_claim_asks_for_nothing() -> None:
-    denied = override({"requesters": ["for-b"]}, deny=True)
-    repo = MemoryRepo(config("update"))
-    repo.send(put("a"))
-    repo.send(put("b", "1.1.0"))
-    state = state_of(
-        MemoryRepo(config("update") | {"overrides/deny.yaml": denied}).config, repo.state.ledger
-    )
-    assert {*running(MemoryRepo(state=state)).values()} == {"1.0.0"}
-    assert {*running(repo).values()} == {"1.1.0"}
-
-
-def test_a_version_that_is_gone_from_the_registry_is_the_default() -> None:
-    repo = MemoryRepo(config("update"))
-    repo.send(put("a", "testing"))
-    state = state_of(MemoryRepo(config("update", channels={})).config, repo.state.ledger)
-    assert {*running(MemoryRepo(state=state)).values()} == {DEFAULT}
 
 
 def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
@@ -207,85 +103,79 @@ def test_the_order_of_versions_is_that_of_semantic_versioning() -> None:
     assert sorted(shuffled, key=precedence) == listed
 
 
-class Walk:
-    """Random demands and releases, with checks of the versions that run."""
+def assert_versions(repo: MemoryRepo, policy: str, asked: dict[str, tuple[str, str, str]]) -> None:
+    """Check that each service runs the newest version of the applications that use it.
 
-    def __init__(self, random: Random, policy: str) -> None:
-        self.random = random
-        self.repo = MemoryRepo(config(policy))
-        self.asked: dict[str, tuple[str, str, str]] = {}
-
-    def step(self) -> None:
-        demand = self.random.choice("abcde")
-        if demand in self.asked and self.random.random() < 0.4:
-            del self.asked[demand]
-            self.repo.send(release(demand))
-        else:
-            wanted = (
-                self.random.choice(["", *LISTED, *CHANNELS]),
-                self.random.choice(["edge/a", "edge/b"]),
-                self.random.choice(["/points", "/more"]),
-            )
-            before = running(self.repo)
-            taken = self.repo.take(put(demand, *wanted))
-            if isinstance(taken, Refused):
-                assert {one.code for one in taken.faults} == {"conflict"}
-                assert running(self.repo) == before
-            else:
-                self.asked[demand] = wanted
-
-    def assert_newest_versions_run(self) -> None:
-        """Check that each service runs the newest version of the applications that use it.
-
-        The version of an application is the newest one that is demanded for it.
-        """
-        newest: dict[str, str] = {}
-        for version, app, _ in self.asked.values():
-            name = CHANNELS.get(version, version or DEFAULT)
-            newest[app] = max(name, newest.get(app, name), key=LISTED.index)
-        for entry in self.repo.books()["services"].values():
-            versions = [newest[app] for app in entry["applications"]]
-            assert entry["application_version"] == max(versions, key=LISTED.index)
-
-    def assert_rendered_from_the_claims(self) -> None:
-        """Check that rendering the claims, in any order, gives the files of the repo."""
-        claims = sorted(self.repo.state.ledger, key=lambda claim: str(claim.key))
-        self.random.shuffle(claims)
-        for ledger in (rebuilt(claims), ledger_in(self.repo.files)):
-            files = rendered_files(state_of(self.repo.config, ledger))
-            assert files == self.repo.below("clusters", "bootstrap")
+    The version of an application is the newest one that is demanded for it. With separate versions,
+    each version except the default has an application of its own.
+    """
+    newest: dict[str, str] = {}
+    for version, app, _ in asked.values():
+        name = CHANNELS.get(version, version or DEFAULT)
+        id = f"{app}@{name}" if policy == "separate" and name != DEFAULT else app
+        newest[id] = max(name, newest.get(id, name), key=LISTED.index)
+    services = [one for one in repo.state.plans.values() if isinstance(one, ServiceRelease)]
+    assert {id for one in services for id in one.applications} == {*newest}
+    for one in services:
+        versions = {newest[id] for id in one.applications}
+        assert one.version.name == max(versions, key=LISTED.index)
+        assert policy != "separate" or len(versions) == 1
+        if one.key.service == "object-fusion":
+            assert {topic.topic for topic in one.inputs["object_list"]} == {
+                topic
+                for other in services
+                if other.key.service == "object-detection"
+                and {*one.applications} <= {*other.applications}
+                for topic in other.outputs.values()
+            }
+    made = [topic for one in services for topic in one.outputs.values()]
+    assert len({*made}) == len(made), "no topic is published twice"
 
 
-@pytest.mark.parametrize("policy", ["refuse", "update", "upgrade"])
+@pytest.mark.parametrize("policy", ["refuse", "update", "upgrade", "separate"])
 @examples(15)
 @given(random=chances)
 def test_what_runs_follows_from_the_claims_whatever_their_order(
     random: Random, policy: str
 ) -> None:
-    walk = Walk(random, policy)
+    repo, asked = MemoryRepo(config(policy)), dict[str, tuple[str, str, str]]()
+    empty = dict(repo.files)
     for _ in range(12):
-        walk.step()
-        walk.assert_newest_versions_run()
-    walk.assert_rendered_from_the_claims()
+        demand = random.choice("abcde")
+        if demand in asked and random.random() < 0.4:
+            del asked[demand]
+            repo.send(release(demand))
+        else:
+            version = random.choice(["", *LISTED, *CHANNELS])
+            wanted = (version, random.choice(["edge/a", "edge/b"]), random.choice(["/p", "/q"]))
+            taken = repo.take(put(demand, *wanted))
+            if isinstance(taken, Refused):
+                assert policy == "refuse"
+                assert {one.code for one in taken.faults} == {"conflict"}
+            else:
+                asked[demand] = wanted
+        assert_versions(repo, policy, asked)
+    claims = sorted(repo.state.ledger, key=lambda claim: str(claim.key))
+    random.shuffle(claims)
+    for ledger in (rebuilt(claims), ledger_in(repo.files)):
+        files = rendered_files(state_of(repo.config, ledger))
+        assert files == repo.below("clusters", "bootstrap")
+    for demand in asked:
+        repo.send(release(demand))
+    assert repo.files == empty
 
 
 def test_each_listed_version_is_rendered_before_anybody_asks_for_it() -> None:
     folder = "appdefs/object-detection-fusion/charts/next"
+    next = f"    channels: {{next: {{folder: {folder}, version: 9.0.0}}}}\n"
     chart = {
         f"{folder}/Chart.yaml": "apiVersion: v2\nname: object-fusion\nversion: 9.0.0\n",
         f"{folder}/values.schema.json": json.dumps({"required": ["missing"]}),
+        "registry/charts.yaml": skeleton()["registry/charts.yaml"] + next,
     }
-    last = "    version: 0.1.0\n"
-    text = skeleton()["registry/charts.yaml"]
-    assert text.endswith(last)
-    chart["registry/charts.yaml"] = (
-        f"{text}    channels: {{next: {{folder: {folder}, version: 9.0.0}}}}\n"
-    )
     newest = {"1.0.0": {}, "3.0.0": {"charts": {"object-fusion": "9.0.0"}}}
-    state = MemoryRepo(config("update", versions=newest, channels={}) | chart).state
     with pytest.raises(InvalidInput) as invalid:
-        try_configuration(state)
-    template = "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
-    assert [str(found) for found in invalid.value.faults] == [
-        f'{template}: values: "missing" is a required property; fix the template or {folder}'
-    ]
+        try_configuration(MemoryRepo(config("update", versions=newest, channels={}) | chart).state)
+    (found,) = invalid.value.faults
+    assert found.file == "appdefs/object-detection-fusion/values/object-fusion.yaml.j2"
+    assert '"missing" is a required property' in found.message

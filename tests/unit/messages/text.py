@@ -17,7 +17,6 @@ from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS
 from tests.unit.connections import test_connection_types as of_connections
 from tests.unit.decide import test_override_mistakes as of_overrides
 from tests.unit.demand import test_refused as of_goals
-from tests.unit.demand import wrong_types as of_form
 from tests.unit.model import test_config_mistakes as of_config
 
 FILE = Path(__file__).with_name("messages.txt")
@@ -42,7 +41,7 @@ def text() -> str:
             (name, _refusal(routes(asked), before=before))
             for name, (before, asked) in of_connections.REFUSED.items()
         ),
-        "the form of goals": ((name, _refusal(goal)) for name, goal in of_form.WRONG.items()),
+        "the form of goals": ((name, _refusal(goal)) for name, goal in of_goals.WRONG.items()),
     }
     lines = ["Written by `make golden`. Words of pydantic and libyaml are replaced by …", ""]
     for title, cases in sections.items():
