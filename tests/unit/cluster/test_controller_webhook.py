@@ -1,15 +1,14 @@
-"""Real HTTP calls to webhooks are signed; openssl verifies the signatures."""
+"""Real HTTP calls to the webhooks of Flux and Argo CD, and their signatures."""
 
 from __future__ import annotations
 
-import json
-import subprocess
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
-from demandops.cluster import clusters_file, reconcile_trigger
-from demandops.cluster.reconcile_trigger import ReconcileTrigger
+from demandops.cluster.clusters_file import ClusterAccess, NoAccess
+from demandops.cluster.reconcile_trigger import ReconcileTrigger, signature, web_address
 
 from tests.kit.generator import wait_until
 from tests.kit.golden import start
@@ -34,22 +33,16 @@ def secret_file(tmp_path: Path) -> Path:
     return file
 
 
-def by_openssl(body: bytes) -> str:
-    command = ["openssl", "dgst", "-sha256", "-hmac", SECRET]
-    told = subprocess.run(command, input=body, capture_output=True, check=True).stdout.decode()
-    return f"sha256={told.split()[-1]}"
-
-
 def test_the_signature_is_the_one_that_github_documents() -> None:
     """Flux and Argo CD use GitHub's scheme; the values come from GitHub's documentation."""
     documented = "757107ea0eb2509fc211221cce984b8a37570b6d7586c22c46f4379c8b043e17"
-    assert reconcile_trigger.signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
+    assert signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
 
 
 def test_a_receiver_of_flux_is_called_with_a_signature(hook: Server, secret_file: Path) -> None:
-    trigger("experiment", clusters_file.ClusterAccess(receiver=hook.url, secret_file=secret_file))
+    trigger("experiment", ClusterAccess(receiver=hook.url, secret_file=secret_file))
     call = hook.calls[0]
-    assert call.headers["X-Signature"] == by_openssl(call.body)
+    assert call.headers["X-Signature"] == signature(SECRET.encode(), call.body)
 
 
 def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file: Path) -> None:
@@ -59,29 +52,17 @@ def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file:
         "clusters/other/perception/edge/b.yaml",
         "ledger/applications/aa/b/c.yaml",
     ]
-    reached = clusters_file.ClusterAccess(webhook=hook.url, secret_file=secret_file)
+    reached = ClusterAccess(webhook=hook.url, secret_file=secret_file)
     trigger("argocd-experiment", reached, changed)
-    headers, body = hook.calls[0].headers, hook.calls[0].body
-    assert headers["X-Hub-Signature-256"] == by_openssl(body)
+    headers, event = hook.calls[0].headers, hook.calls[0].json()
+    assert headers["X-Hub-Signature-256"] == signature(SECRET.encode(), hook.calls[0].body)
     assert (headers["X-GitHub-Event"], headers["Content-Type"]) == ("push", "application/json")
-    event = json.loads(body)
     assert event["ref"] == "refs/heads/main" and event["after"] == "b" * 40
-    (commit,) = event["commits"]
-    # the event names a file of the domain's folder, but none of the ledger and other clusters
-    assert commit["modified"] == [
-        *changed[:1],
-        "clusters/c-its/perception/_domain.yaml",
-        changed[1],
-    ]
-
-
-def test_where_nothing_is_known_of_what_changed_argo_cd_looks_at_all(
-    hook: Server, secret_file: Path
-) -> None:
-    trigger(
-        "argocd-experiment", clusters_file.ClusterAccess(webhook=hook.url, secret_file=secret_file)
-    )
-    assert hook.calls[0].json()["commits"] == []
+    # a file of the domain's folder is named, but none of the ledger and of other clusters
+    own = "clusters/c-its/perception/_domain.yaml"
+    assert event["commits"][0]["modified"] == [changed[0], own, changed[1]]
+    trigger("argocd-experiment", reached)  # nothing is known of what changed
+    assert hook.calls[-1].json()["commits"] == []
 
 
 def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
@@ -94,7 +75,7 @@ def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
         return f"{len(asked)}", []
 
     state, _ = start("argocd-experiment")
-    reached = clusters_file.ClusterAccess(webhook=hook.url, secret_file=secret_file)
+    reached = ClusterAccess(webhook=hook.url, secret_file=secret_file)
     waker = ReconcileTrigger({"c-its": reached}, changed)
     try:
         hook.answer = lambda call: Answer(503)
@@ -114,7 +95,7 @@ def test_a_refused_webhook_is_logged_and_no_redirection_followed(
     hook: Server, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
 ) -> None:
     hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})
-    trigger("experiment", clusters_file.ClusterAccess(receiver=hook.url, secret_file=secret_file))
+    trigger("experiment", ClusterAccess(receiver=hook.url, secret_file=secret_file))
     assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
     assert len(hook.calls) in (1, 2)  # the close may cause a second call
     assert SECRET not in caplog.text and "/hook" not in caplog.text
@@ -127,7 +108,7 @@ def test_a_refused_webhook_is_logged_and_no_redirection_followed(
 def test_the_other_controller_s_webhook_is_not_called(
     hook: Server, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
 ) -> None:
-    trigger(case, clusters_file.ClusterAccess.model_validate({other: hook.url}))
+    trigger(case, ClusterAccess.model_validate({other: hook.url}))
     assert hook.calls == []
     assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
 
@@ -139,14 +120,11 @@ def test_the_other_controller_s_webhook_is_not_called(
         ("https://me:pass@git.example:8443/fleet/repo", "https://git.example/fleet/repo"),
         ("ssh://git@git.example:22/fleet/repo.git", "https://git.example/fleet/repo"),
         ("git@git.example:fleet/repo.git", "https://git.example/fleet/repo"),
+        ("file:///srv/fleet.git", None),
     ],
 )
-def test_a_repository_is_named_by_the_page_that_a_forge_would_name(repo: str, page: str) -> None:
-    assert reconcile_trigger.web_address(repo) == page
-
-
-def test_a_repository_without_a_host_cannot_be_named() -> None:
-    with pytest.raises(
-        clusters_file.NoAccess, match=r"names no host, but .*; write https://HOST/PATH or "
-    ):
-        reconcile_trigger.web_address("file:///srv/fleet.git")
+def test_a_repository_is_named_by_the_page_that_a_forge_would_name(
+    repo: str, page: str | None
+) -> None:
+    with pytest.raises(NoAccess, match="names no host") if page is None else nullcontext():
+        assert web_address(repo) == page

@@ -53,55 +53,42 @@ def test_a_file_names_each_cluster_and_how_it_is_reached(tmp_path: Path) -> None
     assert (clusters["a"].kubeconfig, clusters["b"].receiver) == (Path("/x"), "https://h/hook/1")
 
 
-SIGNED = "clusters: {a: {receiver: 'http://h/hook', secret_file: SECRET}}\n"
-NO_FILE = "cannot be read: No such file or directory"
-FILL = "write the secret into this file"
-OPEN = "SECRET is open to everybody on this machine; run chmod o= on it"
+SIGNED = "{receiver: 'http://h/hook', secret_file: SECRET}"
+SECRET_FILE = "clusters.a.secret_file"  # noqa: S105 - a field
 
 
 @pytest.mark.parametrize(
-    ("text", "secret", "mode", "message"),
+    ("access", "secret", "mode", "field", "told"),
     [
-        (None, None, 0, f"{NO_FILE}; check the path"),
-        ("clusters: {a: {}}\n", None, 0, "clusters.a: needs a kubeconfig, a receiver or a webhook"),
-        ("", None, 0, "clusters: is missing; add it"),
-        (SIGNED, None, 0,
-         f"clusters.a.secret_file: SECRET {NO_FILE}; {FILL}, and make it readable"),
-        (SIGNED, "", 0o600, f"clusters.a.secret_file: SECRET is empty; {FILL}"),
-        (SIGNED, " \r\n", 0o600, f"clusters.a.secret_file: SECRET is empty; {FILL}"),
-        (SIGNED, "x", 0o644, f"clusters.a.secret_file: {OPEN}"),
-        ('clusters: {a: {receiver: "http://h/hook", secret_file: "/\\0"}}\n', None, 0,
-         f"clusters.a.secret_file: /\\x00 cannot be read: embedded null byte; {FILL}, "
-         "and make it readable"),
-        ("clusters: {a: {kubeconfig: /k, secret_file: /s}}\n", None, 0,
-         "clusters.a: has a secret_file but no URL; add a receiver or a webhook"),
+        ("{}", None, 0, "clusters.a", "needs a kubeconfig, a receiver or a webhook"),
+        ("{kubeconfig: /k, secret_file: /s}", None, 0, "clusters.a", "but no URL; add a receiver"),
+        (SIGNED, None, 0, SECRET_FILE, "cannot be read: No such file"),
+        (SIGNED, "", 0o600, SECRET_FILE, "is empty; write the secret"),
+        (SIGNED, " \r\n", 0o600, SECRET_FILE, "is empty; write the secret"),
+        (SIGNED, "x", 0o644, SECRET_FILE, "is open to everybody on this machine; run chmod o="),
+        (r'{receiver: "http://h/hook", secret_file: "/\0"}', None, 0, SECRET_FILE,
+         r"/\x00 cannot be read: embedded null byte"),
     ],
 )  # fmt: skip
 def test_a_file_that_cannot_be_used_is_told_with_field_and_remedy(
-    tmp_path: Path, text: str | None, secret: str | None, mode: int, message: str
+    tmp_path: Path, access: str, secret: str | None, mode: int, field: str, told: str
 ) -> None:
     file, secret_file = tmp_path / "clusters.yaml", tmp_path / "secret"
-    if text is not None:
-        file.write_text(HEAD + text.replace("SECRET", str(secret_file)))
+    access = access.replace("SECRET", str(secret_file))
+    file.write_text(f"{HEAD}clusters: {{a: {access}}}\n")
     if secret is not None:
         secret_file.write_text(secret)
         secret_file.chmod(mode)
     with pytest.raises(InvalidInput) as caught:
         clusters_file.read(file)
-    place = f"{file}:3" if message.startswith("clusters.") else file
-    assert str(caught.value) == f"{place}: {message.replace('SECRET', str(secret_file))}"
+    (fault,) = caught.value.faults
+    assert (fault.file, fault.line, fault.field) == (str(file), 3, field)
+    assert told in fault.message
 
 
-@pytest.fixture
-def receiver() -> Iterator[tuple[str, list[str]]]:
-    heard: list[str] = []
-
-    def answer(call: Call) -> Answer:
-        heard.append(call.path)
-        return Answer()
-
-    with serving(answer) as server:
-        yield f"{server.url}/hook/abc", heard
+def test_a_file_that_is_not_there_is_told(tmp_path: Path) -> None:
+    with pytest.raises(InvalidInput, match="cannot be read: No such file"):
+        clusters_file.read(tmp_path / "clusters.yaml")
 
 
 @pytest.fixture
@@ -117,23 +104,19 @@ def reached(api: KubeApi, folder: Path) -> clusters_file.ClusterAccess:
 @pytest.mark.parametrize(
     ("case", "path", "annotation"),
     [
-        (
-            "experiment",
-            "/apis/source.toolkit.fluxcd.io/v1/namespaces/perception/gitrepositories/demandops",
-            REQUESTED_AT,
-        ),
-        (
-            "argocd-experiment",
-            "/apis/argoproj.io/v1alpha1/namespaces/argocd/applications/demandops-perception",
-            "argocd.argoproj.io/refresh",
-        ),
+        ("experiment",
+         "source.toolkit.fluxcd.io/v1/namespaces/perception/gitrepositories/demandops",
+         REQUESTED_AT),
+        ("argocd-experiment",
+         "argoproj.io/v1alpha1/namespaces/argocd/applications/demandops-perception",
+         "argocd.argoproj.io/refresh"),
     ],
-)
+)  # fmt: skip
 def test_the_object_that_fetches_is_annotated(
     api: KubeApi, tmp_path: Path, case: str, path: str, annotation: str
 ) -> None:
     trigger(case, reached(api, tmp_path))
-    assert {asked for asked, _ in api.patches} == {path}
+    assert {asked for asked, _ in api.patches} == {f"/apis/{path}"}
     assert annotation in api.patches[0][1]["metadata"]["annotations"]
 
 
@@ -220,24 +203,18 @@ def test_a_push_during_the_last_call_is_told_at_the_end_too() -> None:
     assert calls == 2
 
 
-def test_without_a_push_nobody_is_woken(receiver: tuple[str, list[str]]) -> None:
-    url, heard = receiver
-    reached = clusters_file.ClusterAccess(receiver=url)
-    ReconcileTrigger({"c-its": reached}, lambda since: ("", None)).close()
-    assert heard == []
-
-
 def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody(
-    receiver: tuple[str, list[str]], caplog: pytest.LogCaptureFixture
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    url, heard = receiver
     state, _ = start("experiment")
     away = clusters_file.ClusterAccess(receiver="http://127.0.0.1:1/hook/secret")
-    clusters = {"away": away, "here": clusters_file.ClusterAccess(receiver=url)}
-    waker = ReconcileTrigger(clusters, lambda since: ("", None))
-    waker(state.config)
-    waker.close()
-    assert heard
+    with serving() as server:
+        here = clusters_file.ClusterAccess(receiver=f"{server.url}/hook/abc")
+        waker = ReconcileTrigger({"away": away, "here": here}, lambda since: ("", None))
+        assert server.calls == [], "without a push nobody is woken"
+        waker(state.config)
+        waker.close()
+        assert server.calls
     assert "cluster 'away' was not woken ([Errno 111] Connection refused; check that" in caplog.text
     assert "secret" not in caplog.text
 
