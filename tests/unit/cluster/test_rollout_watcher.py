@@ -40,13 +40,10 @@ def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: P
 
 def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
     status = RolloutWatcher({"w": ClusterAccess(receiver="https://h/hook")}, Letters())
-    try:
-        assert status.why_unreachable(
-            [ClusterDomain("w", "d", "n"), ClusterDomain("x", "d", "n")]
-        ) == ("no access to cluster w, x")
-        assert status.why_unreachable([]) == ""
-    finally:
-        status.close()
+    asked = [ClusterDomain("w", "d", "n"), ClusterDomain("x", "d", "n")]
+    assert status.why_unreachable(asked) == "no access to cluster w, x"
+    assert status.why_unreachable([]) == ""
+    status.close()
 
 
 def test_closing_answers_the_rollouts_that_are_still_followed(tmp_path: Path) -> None:

@@ -10,6 +10,8 @@ from demandops.detect.observations import Key
 from tests.kit.detection import at, demand, file_of, rule
 
 NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
+LEVELS = {"start": 2, "stop": 1}
+POSITIONS = [{"node": "n", "x": "{x}"}]
 REQUEST = {
     "id": "station/perception",
     "connections": [{"id": "{entity}/edge", "requester_ids": ["{entity}", "station"]}],
@@ -18,15 +20,8 @@ RULES = [
     rule("joins", near=NEAR, deploymentRequest=REQUEST, entities=["car*"]),
     rule("puts", near=NEAR, entities=["bus*"]),
     rule("pair", together={"source": "cars", "start": 5, "stop": 8}),
-    rule(
-        "full",
-        count={"source": "cars", "point": {"x": 0, "y": 0}, "radius": 9, "start": 2, "stop": 1},
-    ),
-    rule(
-        "there",
-        near=NEAR,
-        demand=demand(demand="at/{entity}", positions=[{"node": "n", "x": "{x}"}]),
-    ),
+    rule("full", count={"source": "cars", "point": {"x": 0, "y": 0}, "radius": 9, **LEVELS}),
+    rule("there", near=NEAR, demand=demand(demand="at/{entity}", positions=POSITIONS)),
 ]
 
 
@@ -71,11 +66,8 @@ def test_the_booked_demands_of_rules_are_told_from_all_others() -> None:
         ("full", ()): "full",
         ("there", ("car9",)): "at/car9",
     }
-    assert booked["there", ("car9",)].ended().data == {
-        "demand": "at/car9",
-        "requesters": ["car9"],
-        "operation": "release",
-    }
+    released = {"demand": "at/car9", "requesters": ["car9"], "operation": "release"}
+    assert booked["there", ("car9",)].ended().data == released
     assert booked_events(file_of(*RULES), {"services": {}}) == {}
 
 
@@ -98,22 +90,14 @@ def test_events_last_if_the_rules_are_replaced_by_the_same() -> None:
 
 
 def test_the_demands_of_a_rule_that_is_gone_or_for_others_end() -> None:
-    assert changes(started(rule("a", near=NEAR))) == {("a", ("car1",)): None}
-    others = rule("a", near=NEAR, entities=["bus*"])
-    assert changes(started(rule("a", near=NEAR)), others) == {("a", ("car1",)): None}
+    for rules in ([], [rule("a", near=NEAR, entities=["bus*"])]):
+        assert changes(started(rule("a", near=NEAR)), *rules) == {("a", ("car1",)): None}
 
 
 def test_a_changed_demand_is_wanted_with_the_values_of_the_events_start() -> None:
-    positions = [{"node": "n", "x": "{x}"}]
-    detector = started(rule("a", near=NEAR))
-    changed = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=positions))
-    assert changes(detector, changed) == {
-        ("a", ("car1",)): {
-            "demand": "car1",
-            "requesters": ["car1"],
-            "positions": [{"node": "n", "x": 80}],
-        }
-    }
+    changed = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=POSITIONS))
+    wanted = {"demand": "car1", "requesters": ["car1"], "positions": [{"node": "n", "x": 80}]}
+    assert changes(started(rule("a", near=NEAR)), changed) == {("a", ("car1",)): wanted}
 
 
 def test_an_entity_that_does_not_come_back_after_a_restart_is_gone() -> None:

@@ -22,11 +22,11 @@ def reader(type_name: str = "a_msgs/msg/A", **fields: Any) -> MessageReader:
     return MessageReader(rule_file.read(text, "rules.yaml"), "all")
 
 
-def message(x: object = 1, y: object = 2, **more: Any) -> Message:
+def message(x: object = 1, **more: Any) -> Message:
     """Return a message that has the position fields of all known types."""
-    point = Message(position=Message(x=x, y=y))
-    pose = Message(position=Message(x=x, y=y), pose=point)
-    state = Message(continuous_state=[x, y])
+    point = Message(position=Message(x=x, y=2))
+    pose = Message(position=Message(x=x, y=2), pose=point)
+    state = Message(continuous_state=[x, 2])
     return Message(pose=pose, state=state, engine=Message(heat=[20, 95]), **more)
 
 
@@ -46,23 +46,19 @@ def test_a_field_may_name_the_entity_of_a_topic_that_many_share() -> None:
 
 
 @pytest.mark.parametrize(
-    ("x", "why"),
+    ("sent", "why"),
     [
-        (float("nan"), "nan is not a finite number"),
-        (float("-inf"), "-inf is not a finite number"),
-        ("here", "'here' is not a number"),
-        (1e10, "the position is more than 1e+09 m from the origin"),
+        (message(float("nan")), "nan is not a finite number"),
+        (message(float("-inf")), "-inf is not a finite number"),
+        (message("here"), "'here' is not a number"),
+        (message(1e10), "the position is more than 1e+09 m from the origin"),
+        (Message(engine=Message(heat=[1])), "the message has no field "),
     ],
 )
-def test_a_position_of_no_use_is_left_out(x: object, why: str) -> None:
+def test_a_message_of_no_use_is_left_out(sent: Message, why: str) -> None:
     with pytest.raises(Unreadable) as caught:
-        reader("geometry_msgs/msg/PoseStamped").observation(message(x), "car", 7)
-    assert str(caught.value) == why
-
-
-def test_a_message_that_lacks_a_field_is_left_out() -> None:
-    with pytest.raises(Unreadable, match=r"the message has no field engine.heat\[1\]"):
-        reader().observation(Message(engine=Message(heat=[1])), "car", 7)
+        reader("geometry_msgs/msg/PoseStamped").observation(sent, "car", 7)
+    assert str(caught.value).startswith(why)
 
 
 @pytest.mark.parametrize(
