@@ -5,6 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ def confine(code: str, *arguments: str, seconds: int = 60) -> subprocess.Complet
     return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
 
 
+Ran = Callable[[str], Report]
 FETCH = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=5)"
 
 
@@ -34,13 +36,7 @@ def test_it_reaches_no_network_where_the_kernel_lets_us_say_so() -> None:
 
 
 @pytest.mark.parametrize(
-    "code",
-    [
-        "while True: pass",
-        "x = b'x' * (8 << 30)",
-        "open('big', 'wb').truncate(1 << 40)",
-    ],
-    ids=["time", "memory", "file"],
+    "code", ["while True: pass", "x = b'x' * (8 << 30)", "open('big', 'wb').truncate(1 << 40)"]
 )
 def test_it_has_only_so_much(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -54,7 +50,7 @@ def test_a_program_that_cannot_run_is_told() -> None:
 
 
 @pytest.fixture
-def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
+def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ran:
     """Return a function that runs a program in place of helm and returns the report."""
 
     def run(code: str) -> Report:
@@ -70,41 +66,31 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
 
 
 def test_helm_knows_nothing_of_the_environment(
-    ran: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ran: Ran, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert callable(ran)
     for name in ("TOKEN", "HELM_PLUGINS", "HELM_REGISTRY_CONFIG", "XDG_CONFIG_HOME", "LD_PRELOAD_"):
         monkeypatch.setenv(name, "hunter2")
     report = ran("for name in os.environ: print('---\\nkind:', name, os.environ[name])")
-    assert {kind for _, kind in report.kinds} - {"LC_CTYPE", "_DEMANDOPS_PROCESS"} == {
-        "PATH",
-        "HOME",
-        "TMPDIR",
-        "KUBECONFIG",
-        "HELM_PLUGINS",
-    }
+    known = {kind for _, kind in report.kinds} - {"LC_CTYPE", "_DEMANDOPS_PROCESS"}
+    assert known == {"PATH", "HOME", "TMPDIR", "KUBECONFIG", "HELM_PLUGINS"}
     assert report.ended
     assert [*tmp_path.joinpath("home").iterdir()]  # what it writes lands there
 
 
-def test_output_without_end_is_a_fault(ran: object) -> None:
-    assert callable(ran)
+def test_output_without_end_is_a_fault(ran: Ran) -> None:
     report = ran("while True: print('a' * 1000000)")
     assert not report.ended
-    (fault,) = report.faults
-    assert fault.file == "chart"
+    assert [fault.file for fault in report.faults] == ["chart"]
 
 
-def test_a_program_that_loops_is_a_fault(ran: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert callable(ran)
+def test_a_program_that_loops_is_a_fault(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(helm_runs, "_CPU_SECONDS", 1)
     report = ran("while True: pass")
     assert not report.ended
     assert report.faults
 
 
-def test_a_message_of_any_length_is_parsed_soon(ran: object) -> None:
-    assert callable(ran)
+def test_a_message_of_any_length_is_parsed_soon(ran: Ran) -> None:
     report = ran("sys.exit('Error: ' + 'templates/' * 5_000_000)")
     assert report.ended
     assert len(report.faults[0].message) < 1_000

@@ -22,14 +22,14 @@ class History:
         self.repo = pygit2.init_repository(str(folder), bare=True, initial_head="main")
         self.made: list[pygit2.Oid] = []
 
-    def commit(self, text: str | None, *parents: int) -> pygit2.Oid:
-        """Commit a tree with ``text`` at `PATH`, or without a file there if ``text`` is None.
+    def commit(self, text: str | None, *parents: int, path: str = PATH) -> pygit2.Oid:
+        """Commit a tree with ``text`` at a path, or without a file there if ``text`` is None.
 
         ``parents`` are the numbers of earlier commits.
         """
         number = len(self.made)
         who = pygit2.Signature("a", "a@example.org", 1_770_000_000 + 60 * number, 0)
-        files = {"other": str(number)} | ({PATH: text} if text is not None else {})
+        files = {"other": str(number)} | ({path: text} if text is not None else {})
         tree = write_tree(self.repo, None, files)
         above = [self.made[parent] for parent in parents]
         made = self.repo.create_commit(None, who, who, f"{number}\n", tree, above)
@@ -37,9 +37,8 @@ class History:
         return made
 
     def by_git(self, path: str) -> set[str]:
-        return set(
-            git(self.repo.path, "log", "--format=%H", str(self.made[-1]), "--", path).split()
-        )
+        tip = str(self.made[-1])
+        return {*git(self.repo.path, "log", "--format=%H", tip, "--", path).split()}
 
     def ours(self, path: str) -> list[str]:
         return [t.entry.commit for t in commit_log.changes_to(self.repo, self.made[-1], path)]
@@ -95,12 +94,6 @@ def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
     assert commit_log.release_path(history.repo, gone, "q") is None
     assert commit_log.release_path(history.repo, gone, "*") is None
     assert commit_log.stopped_release_names(history.repo, gone) == {"r"}
-
-
-def test_a_removed_chart_is_no_stopped_release(tmp_path: Path) -> None:
-    repo = pygit2.init_repository(str(tmp_path / "r.git"), bare=True, initial_head="main")
-    who = pygit2.Signature("a", "a@example.org", 1_770_000_000, 0)
-    charts = write_tree(repo, None, {"clusters/c/d/_charts/detection-0.1.0.yaml": "a", "x": "x"})
-    first = repo.create_commit(None, who, who, "a\n", charts, [])
-    gone = repo.create_commit(None, who, who, "b\n", write_tree(repo, None, {"x": "x"}), [first])
-    assert commit_log.stopped_release_names(repo, gone) == set()
+    history.commit("a", 1, path="clusters/c/d/_charts/detection-0.1.0.yaml")
+    without_chart = history.commit(None, 2)
+    assert commit_log.stopped_release_names(history.repo, without_chart) == {"r"}

@@ -34,17 +34,13 @@ from tests.kit.repo import git
         ("", {}),
         ("\n\n\n", {}),
         ('Revert "Join x"\n\nThis reverts commit 1234.\n', {}),
+        ("Join x\n\nOperation: join\n(cherry picked from commit 12ab)\n", {}),
     ],
 )
 def test_trailers_are_the_last_paragraph_if_it_holds_nothing_else(
     text: str, wanted: dict[str, list[str]]
 ) -> None:
     assert parse(text).trailers == wanted
-
-
-def test_a_commit_that_a_person_picked_is_not_taken_for_the_generators() -> None:
-    text = "Join x\n\nOperation: join\nRender-Version: 1\n(cherry picked from commit 12ab)\n"
-    assert parse(text).trailers == {}
 
 
 IDS = st.text(visible, min_size=1, max_size=60).filter(lambda text: not id_problem(text))
@@ -84,21 +80,19 @@ def _commit(repo: pygit2.Repository, operation: str, *parents: pygit2.Oid) -> py
 def test_operations_that_arrived_after_a_commit_are_found_and_no_others(
     repo: pygit2.Repository,
 ) -> None:
-    def found(tip: pygit2.Oid, base: str) -> dict[str, str]:
-        return {name: a.commit for name, a in operations_since(repo, tip, base).items()}
-
     first = _commit(repo, "op-1")
     second = _commit(repo, "op-2", first)
-    person = _commit(repo, "", second)
-    third = _commit(repo, "op-3", person)
-    assert found(third, str(first)) == {"op-2": str(second), "op-3": str(third)}
-    assert found(third, str(third)) == {}
-    everything = {"op-1": str(first), "op-2": str(second), "op-3": str(third)}
-    assert found(third, "") == everything, "without a base, all operations must be found"
-    assert found(third, "0" * 40) == everything
-    assert found(third, "no commit") == everything
+    tip = _commit(repo, "op-3", _commit(repo, "", second))
     beside = _commit(repo, "op-9", first)
-    assert found(third, str(beside)) == everything, "a base on another branch must count as none"
+
+    def found(base: object) -> dict[str, str]:
+        return {name: a.commit for name, a in operations_since(repo, tip, str(base)).items()}
+
+    assert found(first) == {"op-2": str(second), "op-3": str(tip)}
+    assert found(tip) == {}
+    everything = {"op-1": str(first), "op-2": str(second), "op-3": str(tip)}
+    for none in ("", "0" * 40, "no commit", beside):  # `beside` is on another branch
+        assert found(none) == everything
 
 
 def test_the_newest_commit_of_the_generator_is_found_behind_those_of_people(

@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
-from tests.kit.repo import git, write_tree
+from tests.kit.repo import git
 
 Files = dict[str, str]
 
@@ -136,12 +136,6 @@ def test_differences_between_trees_list_exactly_the_changed_files(
         assert len(told) == len(paths)
         for path, blob in told:
             assert (_text(repo, blob) if blob else None) == after.get(path)
-
-
-def test_a_change_rewrites_only_the_folders_on_its_way(repo: pygit2.Repository) -> None:
-    base = lay(repo, {f"{top}/{n}": "x" for top in "abc" for n in range(3)})
-    made = repo[write_tree(repo, base, {"b/1": "y"})].peel(pygit2.Tree)
-    assert [made[name].id == base[name].id for name in "abc"] == [True, False, True]
 
 
 def test_bytes_that_are_no_text_show_instead_of_stopping(repo: pygit2.Repository) -> None:
