@@ -31,13 +31,8 @@ def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew()
 def test_a_batch_takes_no_more_demands_than_are_evaluated_during_one_push() -> None:
     pace = Backoff(200, REAL)
     assert pace.max_demands == 200
-    pace.overtaken(100, evaluating_s=0.1, pushing_s=0.2)
-    assert pace.max_demands == 100
-    pace.overtaken(100, evaluating_s=1.0, pushing_s=0.2)
-    assert pace.max_demands == 20
-    pace.overtaken(2, evaluating_s=100.0, pushing_s=0.2)
-    assert pace.max_demands == 1
-    pace.overtaken(1, evaluating_s=0.0, pushing_s=0.2)
-    assert pace.max_demands == 1
+    for demands, evaluating_s, most in ((100, 0.1, 100), (100, 1.0, 20), (2, 100.0, 1), (1, 0, 1)):
+        pace.overtaken(demands, evaluating_s=evaluating_s, pushing_s=0.2)
+        assert pace.max_demands == most
     pace.published()
     assert pace.max_demands == 200

@@ -20,17 +20,12 @@ from tests.kit.memory import rebuilt
 
 def leased(*terms: tuple[str, int, int]) -> Ledger:
     """Return a ledger with a claim for each (demand, lease seconds, slack), booked at `START`."""
-    return rebuilt(
-        Claim(
-            Connection(f"{number}", MQTT, "vehicle00", "edge", "", (Route("/a", "/a"),)),
-            demand,
-            demand,
-            ("a",),
-            START,
-            Lease(seconds, slack, START + timedelta(seconds=seconds)),
-        )
-        for number, (demand, seconds, slack) in enumerate(terms)
-    )
+    claims = []
+    for number, (demand, seconds, slack) in enumerate(terms):
+        link = Connection(f"{number}", MQTT, "vehicle00", "edge", "", (Route("/a", "/a"),))
+        lease = Lease(seconds, slack, START + timedelta(seconds=seconds))
+        claims.append(Claim(link, demand, demand, ("a",), START, lease))
+    return rebuilt(claims)
 
 
 @pytest.fixture
@@ -49,24 +44,16 @@ def ended(clock: LeaseExpiry, ledger: Ledger) -> list[str]:
 
 @pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
 def test_it_is_set_forward_and_a_full_term_is_granted(
-    clocks: Clock,
-    clock: LeaseExpiry,
-    steps: list[int],
-    caplog: pytest.LogCaptureFixture,
+    clocks: Clock, clock: LeaseExpiry, steps: list[int], caplog: pytest.LogCaptureFixture
 ) -> None:
     ledger = leased(("short", 60, 5), ("long", 600, 5))
     for step in steps:
         clocks.set_by(step)
         assert ended(clock, ledger) == []
     assert "the clock jumped forward by 3600 s, so leases get their full term" in caplog.text
-    clocks.pass_(65)
-    assert ended(clock, ledger) == []
-    clocks.pass_(1)
-    assert ended(clock, ledger) == ["short"]
-    clocks.pass_(539)
-    assert ended(clock, ledger) == ["short"]
-    clocks.pass_(1)
-    assert ended(clock, ledger) == ["short", "long"]
+    for seconds, over in ((65, []), (1, ["short"]), (539, ["short"]), (1, ["short", "long"])):
+        clocks.pass_(seconds)
+        assert ended(clock, ledger) == over
 
 
 def test_a_step_that_nobody_looked_at_is_noticed_later(clocks: Clock, clock: LeaseExpiry) -> None:
@@ -98,9 +85,7 @@ def test_it_looks_again_when_the_first_lease_ends(clocks: Clock, clock: LeaseExp
     clocks.pass_(29.5)
     assert clock.seconds_until_due(ledger, 60.0) == 1.0
     clocks.pass_(100)
-    assert clock.seconds_until_due(ledger, 60.0) == 1.0, (
-        "a claim that cannot be released must not keep the clock busy"
-    )
+    assert clock.seconds_until_due(ledger, 60.0) == 1.0, "it must not keep the clock busy"
     assert clock.seconds_until_due(Ledger(), 60.0) == 60.0
     assert clock.seconds_until_due(leased(("b", 86_400, 0)), 60.0) == 60.0
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from datetime import datetime, timedelta, timezone
+from itertools import count
 
-from demandops.model.config.config import Config
 from demandops.model.config.load import load
 from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Demanded, Join
@@ -15,32 +15,22 @@ from tests.kit.config import configuration, edited
 START = datetime(2026, 3, 1, 12, 0, tzinfo=timezone.utc)
 
 
-def limited(most: int) -> Config:
-    quotas = f"    quotas: {{demandsPerMinute: {most}}}\n    namespace:"
-    return load(configuration(edited("policy/access-domains.yaml", "    namespace:", quotas)))
-
-
-def request(requester: str) -> Join:
-    app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
-    return Join("one", (Demanded(app, (requester,), "applications[0].{}".format),))
-
-
 class Sending:
     """Sends demands to a rate limit of two a minute."""
 
     def __init__(self) -> None:
         self.throttle = RateLimit()
-        self._config = limited(2)
-        self._count = 0
+        quotas = "    quotas: {demandsPerMinute: 2}\n    namespace:"
+        policy = edited("policy/access-domains.yaml", "    namespace:", quotas)
+        self._config = load(configuration(policy))
+        self._names = map(str, count())
 
     def send(self, requester: str, at_s: float, operation: str = "") -> bool:
         """Send a demand; return whether the limit allowed it."""
-        self._count += 1
-        moment = START + timedelta(seconds=at_s)
-        faults = self.throttle.faults(
-            request(requester), self._config, operation or f"op-{self._count}", moment
-        )
-        return not list(faults)
+        app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
+        request = Join("one", (Demanded(app, (requester,), "applications[0].{}".format),))
+        moment, name = START + timedelta(seconds=at_s), operation or next(self._names)
+        return not list(self.throttle.faults(request, self._config, name, moment))
 
 
 def test_a_hand_in_that_is_judged_again_counts_once() -> None:

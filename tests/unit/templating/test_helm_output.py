@@ -7,33 +7,22 @@ from demandops.repo.pull_request.helm import parsed_error, parsed_kinds, parsed_
 
 
 @pytest.mark.parametrize(
-    ("err", "file", "line", "said"),
+    ("err", "file", "line"),
     [
-        (
-            "Error: parse error at (camera/templates/service.yaml:7): unclosed action\n\n"
-            "Use --debug flag to render out invalid YAML\n",
-            "camera/templates/service.yaml",
-            7,
-            "parse error at (camera/templates/service.yaml:7): unclosed action",
-        ),
-        (
-            "Error: execution error at (camera/charts/ros-service/templates/_names.tpl:31:4): no",
-            "camera/charts/ros-service/templates/_names.tpl",
-            31,
-            "execution error at (camera/charts/ros-service/templates/_names.tpl:31:4): no",
-        ),
-        (
-            "level=WARN msg=x\nError: cannot load values.yaml: error converting YAML to JSON",
-            "camera",
-            None,
-            "cannot load values.yaml: error converting YAML to JSON",
-        ),
+        ("parse error at (camera/templates/service.yaml:7): unclosed action",
+         "camera/templates/service.yaml", 7),
+        ("execution error at (camera/charts/ros-service/templates/_names.tpl:31:4): no",
+         "camera/charts/ros-service/templates/_names.tpl", 31),
+        ("cannot load values.yaml: error converting YAML to JSON", "camera", None),
+        # a line number that a template made up
+        (f"camera/templates/x.yaml:{'9' * 5000}: made up", "camera/templates/x.yaml", None),
     ],
-)
-def test_an_error_names_template_and_line(err: str, file: str, line: int | None, said: str) -> None:
-    fault = parsed_error(err, "camera")
+)  # fmt: skip
+def test_an_error_names_template_and_line(err: str, file: str, line: int | None) -> None:
+    fault = parsed_error(f"level=WARN msg=x\nError: {err}\n\nUse --debug flag\n", "camera")
     assert (fault.file, fault.line) == (file, line)
-    assert fault.message == f"helm says '{said}'; fix the chart or its values"
+    assert fault.message.startswith(f"helm says '{err[:40]}")
+    assert "--debug" not in fault.message
 
 
 def test_the_kinds_of_objects_are_read() -> None:
@@ -58,12 +47,4 @@ def test_lint_gives_errors_and_warnings_and_no_advice() -> None:
     )
     (warning,), (error,) = found.warnings, found.faults
     assert warning.file == "camera/templates/hpa.yaml"
-    assert error.message == (
-        "helm says 'values.yaml: - at '/replicas': got string, want integer - at '/image': missing "
-        "property 'tag''; fix the chart or its values"
-    )
-
-
-def test_a_line_number_that_a_template_made_up_is_not_one() -> None:
-    err = f"Error: camera/templates/x.yaml:{'9' * 5000}: made up"
-    assert parsed_error(err, "camera").line is None
+    assert "'/replicas': got string, want integer - at '/image': missing prop" in error.message
