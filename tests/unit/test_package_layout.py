@@ -8,7 +8,6 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
-import pytest
 from demandops.cli import main
 
 if sys.version_info >= (3, 11):
@@ -21,13 +20,7 @@ PACKAGES = (ROOT / "generator" / "demandops", ROOT / "ros_bridge" / "demandops_r
 MODULES = sorted(path for package in PACKAGES for path in package.rglob("*.py"))
 MOST_MODULES = 12
 
-SAME_NAME = {
-    "__init__": "every package has one",
-}
-"""The module names that may occur more than once, with the reason."""
-
 COMMANDS = PACKAGES[0] / "cli"
-"""The folder of the commands; its modules may have the names of modules in other folders."""
 
 
 def dotted(path: Path) -> str:
@@ -41,33 +34,20 @@ def setuptools() -> dict[str, Any]:
 
 def test_the_wheel_has_every_package() -> None:
     packages = {dotted(path.parent) for path in MODULES if path.name == "__init__.py"}
-    data = {name for name in setuptools()["package-dir"] if "._data." in name}
-    listed = setuptools()["packages"]
-    assert len(listed) == len(set(listed))
-    assert set(listed) == packages | data
-
-
-def test_every_folder_with_modules_is_a_package() -> None:
-    assert [path for path in MODULES if not path.with_name("__init__.py").exists()] == []
-
-
-def test_data_packages_are_folders_of_the_repository() -> None:
-    folders = setuptools()["package-dir"].values()
-    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
+    assert packages == {dotted(path.parent) for path in MODULES}
+    folders, listed = setuptools()["package-dir"], setuptools()["packages"]
+    assert sorted(listed) == sorted(packages | {name for name in folders if "._data." in name})
+    assert [folder for folder in folders.values() if not (ROOT / folder).is_dir()] == []
 
 
 def test_a_module_name_occurs_once() -> None:
+    """A command may have the name of a module elsewhere."""
     by_name: defaultdict[str, list[str]] = defaultdict(list)
     for path in MODULES:
         is_command = path.is_relative_to(COMMANDS) and path.stem in main.COMMANDS
-        if path.stem not in SAME_NAME and not is_command:
+        if path.stem != "__init__" and not is_command:
             by_name[path.stem].append(dotted(path))
     assert {name: paths for name, paths in by_name.items() if len(paths) > 1} == {}
-
-
-@pytest.mark.parametrize("name", sorted(SAME_NAME))
-def test_an_allowed_name_still_occurs_more_than_once(name: str) -> None:
-    assert sum(path.stem == name for path in MODULES) > 1
 
 
 def test_only_the_runtime_reads_a_clock_or_starts_threads() -> None:

@@ -16,43 +16,37 @@ from tests.unit.test_package_layout import setuptools
 PACKAGE = Path(__file__).parents[2] / "ros_bridge" / "ros_package"
 
 
-def test_the_launch_file_takes_the_arguments_of_the_reference_s() -> None:
-    launch = ElementTree.parse(PACKAGE / "launch" / "demandops.launch.xml").getroot()  # noqa: S314
-    arguments = [each.get("name") for each in launch.findall("arg")]
-    assert arguments == ["name", "namespace", "params", "log_level", "args"]
-    assert all(each.get("description") for each in launch.findall("arg"))
-    (node,) = launch.findall("node")
-    assert (node.get("pkg"), node.get("exec")) == ("demandops_ros", "serve")
-    used = re.findall(r"\$\(var (\w+)\)", ElementTree.tostring(node, "unicode"))
-    assert sorted(used) == sorted(arguments)
-    # the values of the file come last, so they take precedence
-    assert [sorted(each.keys()) for each in node.findall("param")] == [["name", "value"], ["from"]]
-
-
-def test_the_parameter_file_has_the_defaults() -> None:
-    parameters = pytest.importorskip("demandops_ros.node_parameters")
-    data: dict[str, Any] = yaml.safe_load((PACKAGE / "config" / "params.yaml").read_text())
-    named = data["/**"]["ros__parameters"]
-    assert named == {name: parameters.DEFAULTS[name] for name in named}
-    assert set(parameters.DEFAULTS) - set(named) == {"state_repo", "fetch_interval", "log_level"}
-
-
-def test_the_launch_file_of_the_detector_uses_all_its_arguments() -> None:
-    launch = ElementTree.parse(PACKAGE / "launch" / "detector.launch.xml").getroot()  # noqa: S314
+@pytest.mark.parametrize(("name", "program"), [("demandops", "serve"), ("detector", "detect")])
+def test_a_launch_file_uses_all_its_arguments(name: str, program: str) -> None:
+    launch = ElementTree.parse(PACKAGE / "launch" / f"{name}.launch.xml").getroot()  # noqa: S314
     arguments = [each.get("name") for each in launch.findall("arg")]
     assert all(each.get("description") for each in launch.findall("arg"))
     (node,) = launch.findall("node")
-    assert (node.get("pkg"), node.get("exec")) == ("demandops_ros", "detect")
+    assert (node.get("pkg"), node.get("exec")) == ("demandops_ros", program)
     used = re.findall(r"\$\(var (\w+)\)", ElementTree.tostring(node, "unicode"))
-    assert sorted(used) == sorted(arguments)
+    assert sorted(used) == sorted(filter(None, arguments))
+    if name == "demandops":  # as the reference's
+        assert arguments == ["name", "namespace", "params", "log_level", "args"]
+        # the values of the file come last, so they take precedence
+        given = [sorted(each.keys()) for each in node.findall("param")]
+        assert given == [["name", "value"], ["from"]]
 
 
-def test_the_parameter_file_of_the_detector_has_the_defaults() -> None:
-    parameters = pytest.importorskip("demandops_ros.detector.detect_command").PARAMETERS
-    data = yaml.safe_load((PACKAGE / "config" / "detector_params.yaml").read_text())
-    named = data["/**"]["ros__parameters"]
-    assert named == {name: parameters[name][0] for name in named}
-    assert set(parameters) - set(named) == {"rules", "log_level"}
+def test_the_parameter_files_have_the_defaults() -> None:
+    node = pytest.importorskip("demandops_ros.node_parameters").DEFAULTS
+    command = pytest.importorskip("demandops_ros.detector.detect_command")
+    detector = {name: default for name, (default, *_) in command.PARAMETERS.items()}
+    for file, defaults, left_out in (
+        ("params", node, {"state_repo", "fetch_interval", "log_level"}),
+        (
+            "detector_params",
+            {name: one[0] for name, one in detector.items()},
+            {"rules", "log_level"},
+        ),
+    ):
+        data: dict[str, Any] = yaml.safe_load((PACKAGE / "config" / f"{file}.yaml").read_text())
+        named = data["/**"]["ros__parameters"]
+        assert named == {name: defaults[name] for name in defaults.keys() - left_out}
 
 
 def test_the_package_has_the_version_and_the_needs_of_the_code() -> None:
