@@ -36,14 +36,9 @@ def test_the_parameter_files_have_the_defaults() -> None:
     node = pytest.importorskip("demandops_ros.node_parameters").DEFAULTS
     command = pytest.importorskip("demandops_ros.detector.detect_command")
     detector = {name: default for name, (default, *_) in command.PARAMETERS.items()}
-    for file, defaults, left_out in (
-        ("params", node, {"state_repo", "fetch_interval", "log_level"}),
-        (
-            "detector_params",
-            {name: one[0] for name, one in detector.items()},
-            {"rules", "log_level"},
-        ),
-    ):
+    of_node = (node, {"state_repo", "fetch_interval", "log_level"})
+    of_detector = (detector, {"rules", "log_level"})
+    for file, (defaults, left_out) in {"params": of_node, "detector_params": of_detector}.items():
         data: dict[str, Any] = yaml.safe_load((PACKAGE / "config" / f"{file}.yaml").read_text())
         named = data["/**"]["ros__parameters"]
         assert named == {name: defaults[name] for name in defaults.keys() - left_out}
