@@ -23,50 +23,38 @@ test "$1" = indextargets
 }
 
 
-@pytest.fixture
-def called(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    folder = tmp_path / "bin"
-    folder.mkdir()
+LINES = Path("/etc/os-release").read_text().splitlines()
+RELEASE = dict(line.split("=", 1) for line in LINES if "=" in line)["VERSION_CODENAME"]
+MIRROR = "http://mirror.invalid"
+
+
+@pytest.mark.parametrize("has_sources", [True, False])
+def test_it_has_the_release_and_the_sources_of_the_machine(
+    tmp_path: Path, has_sources: bool
+) -> None:
+    root, called, sources = (tmp_path / name for name in ("root", "called", "sources"))
+    if has_sources:
+        sources.write_text(
+            f"{RELEASE}-security {MIRROR}/security main\n"
+            f"{RELEASE} {MIRROR}/packages main\n"
+            f"{RELEASE} {MIRROR}/packages contrib\n"
+            f"other {MIRROR}/other main\n"
+        )
     for name, text in STAND_INS.items():
-        (folder / name).write_text(f"#!/bin/sh\n{text}\n")
-        (folder / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{folder}:{os.environ['PATH']}")
-    monkeypatch.setenv("SOURCES", str(tmp_path / "sources"))
-    monkeypatch.setenv("CALLED", str(tmp_path / "called"))
-    return tmp_path / "called"
-
-
-def run(root: Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        ["sh", str(SCRIPT), str(root)], capture_output=True, text=True, check=False
-    )
-
-
-def release() -> str:
-    lines = Path("/etc/os-release").read_text().splitlines()
-    return dict(line.split("=", 1) for line in lines if "=" in line)["VERSION_CODENAME"]
-
-
-def test_it_has_the_release_and_the_sources_of_the_machine(called: Path, tmp_path: Path) -> None:
-    mirror, name = "http://mirror.invalid", release()
-    (tmp_path / "sources").write_text(
-        f"{name}-security {mirror}/security main\n"
-        f"{name} {mirror}/packages main\n"
-        f"{name} {mirror}/packages contrib\n"
-        f"other {mirror}/other main\n"
-    )
-    root = tmp_path / "root"
-    done = run(root)
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    environment |= {"SOURCES": str(sources), "CALLED": str(called)}
+    command = ["sh", str(SCRIPT), str(root)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if not has_sources:
+        assert (done.returncode, called.exists()) == (1, False)
+        assert f"apt has no source of {RELEASE}" in done.stderr
+        return
     assert done.returncode == 0, done.stderr
-    assert called.read_text() == f"--variant=minbase {name} {root} {mirror}/packages\n"
+    assert called.read_text() == f"--variant=minbase {RELEASE} {root} {MIRROR}/packages\n"
     assert (root / "etc/apt/sources.list").read_text().splitlines() == [
-        f"deb {mirror}/packages {name} contrib",
-        f"deb {mirror}/packages {name} main",
-        f"deb {mirror}/security {name}-security main",
+        f"deb {MIRROR}/packages {RELEASE} contrib",
+        f"deb {MIRROR}/packages {RELEASE} main",
+        f"deb {MIRROR}/security {RELEASE}-security main",
     ]
-
-
-def test_a_machine_without_sources_is_told(called: Path, tmp_path: Path) -> None:
-    done = run(tmp_path / "root")
-    assert (done.returncode, called.exists()) == (1, False)
-    assert f"apt has no source of {release()}" in done.stderr

@@ -19,23 +19,20 @@ ROOT = Path(__file__).parents[2]
 NAME = f"demandops-{demandops.__version__}"
 
 
+def release(script: Path, *args: str) -> subprocess.CompletedProcess[str]:
+    env = os.environ | {"PYTHON": sys.executable}
+    return subprocess.run([script, *args], env=env, capture_output=True, text=True, check=False)
+
+
 def test_everything_has_the_same_version() -> None:
-    manifests = (
-        "ros_bridge/ros_package/package.xml",
-        "ros_bridge/interfaces/demandops_interfaces/package.xml",
-    )
     chart = yaml.safe_load(ROOT.joinpath("deploy/chart/Chart.yaml").read_text())
-    found = {path: _version(path) for path in manifests} | {
-        "the chart": chart["version"],
-        "the chart's app": chart["appVersion"],
-    }
-    assert set(found.values()) == {demandops.__version__}, found
-    assert f'\nversion = "{demandops.__version__}"\n' in ROOT.joinpath("pyproject.toml").read_text()
-
-
-def _version(manifest: str) -> str | None:
-    found = re.search("<version>(.*)</version>", ROOT.joinpath(manifest).read_text())
-    return found and found[1]
+    assert chart["version"] == chart["appVersion"] == demandops.__version__
+    for path, line in {
+        "ros_bridge/ros_package/package.xml": "<version>{}</version>",
+        "ros_bridge/interfaces/demandops_interfaces/package.xml": "<version>{}</version>",
+        "pyproject.toml": '\nversion = "{}"\n',
+    }.items():
+        assert line.format(demandops.__version__) in ROOT.joinpath(path).read_text(), path
 
 
 def test_each_change_that_no_release_has_told_has_a_group() -> None:
@@ -61,13 +58,7 @@ def test_no_release_leaves_a_change_untold(tmp_path: Path, section: str, told: s
     script = shutil.copy(ROOT / "deploy" / "release", tmp_path / "deploy")
     (tmp_path / "CHANGELOG.md").write_text(f"# Changelog\n\n{section}\n")
     (tmp_path / "changelog.d" / "odd-names.audit.md").write_text("Odd names are refused.\n")
-    done = subprocess.run(
-        [script],
-        env=os.environ | {"PYTHON": sys.executable},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = release(script)
     assert (done.returncode, done.stdout) == (1, ""), done
     assert told in done.stderr
 
@@ -75,20 +66,13 @@ def test_no_release_leaves_a_change_untold(tmp_path: Path, section: str, told: s
 @pytest.mark.slow
 @pytest.mark.limit(600)
 def test_a_release_is_built_and_tried_in_an_empty_environment(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [str(ROOT / "deploy" / "release"), str(tmp_path)],
-        env=os.environ | {"PYTHON": sys.executable},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = release(ROOT / "deploy" / "release", str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert "release: a state repo, a check of it, a demand\nrelease: ready: " in done.stdout
     assert zipfile.is_zipfile(tmp_path / f"{NAME}-py3-none-any.whl")
     with tarfile.open(tmp_path / f"{NAME}.tar.gz") as sdist:
         assert f"{NAME}/pyproject.toml" in sdist.getnames()
     with tarfile.open(tmp_path / f"{NAME}-docs.tar.gz") as docs:
-        assert {f"{NAME}-docs/index.html", f"{NAME}-docs/generated/commands.html"} <= set(
-            docs.getnames()
-        )
+        pages = {f"{NAME}-docs/{page}.html" for page in ("index", "generated/commands")}
+        assert pages <= {*docs.getnames()}
     subprocess.run(["sha256sum", "--check", "--quiet", f"{NAME}.sha256"], cwd=tmp_path, check=True)
