@@ -6,13 +6,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops_ros import DemandClient
 
 from tests.kit import sync
 from tests.kit.generator import wait_until
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import POLICY, GitRepo, init, read, tip
+from tests.kit.repo import GitRepo, init, read, tip
 from tests.kit.ros import Client, Serve, Served, Servers, reserved
 from tests.kit.warm_commands import WarmCommands
 
@@ -67,16 +66,12 @@ def client(ros_domain: int) -> Iterator[Client]:
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A node that serves many tests; each test uses ids of its own.
 
-    The node's state repo has the recorder as a further type of application, and a policy rule that
-    names the requesters.
+    The node's state repo has the recorder as a further type of application.
     """
     folder = tmp_path_factory.mktemp("shared")
     bare = init(folder / "state.git")
     sync.force_in(bare, False)
-    policy = yaml.safe_load(read(bare, POLICY))
-    rule = {"name": "known", "requesters": ["vehicle*", "station*", "r*"]}
-    policy["domains"][0] |= {"rules": [rule]}
-    changed = GitRepo(bare).commit(_recorder(bare) | {POLICY: yaml.safe_dump(policy)})
+    changed = GitRepo(bare).commit(_recorder(bare))
     with reserved() as domain:
         servers = Servers(folder, domain, DEMANDOPS_DATA_HOME=str(folder / "home"))
         served = servers.start(str(bare))
