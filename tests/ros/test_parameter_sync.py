@@ -105,11 +105,7 @@ def read_by_the_fusion(client: Client) -> set[str]:
 
 
 def test_a_node_follows_without_a_restart_and_after_one(
-    cluster: Cluster,
-    start_fusion: StartFusion,
-    servers: Servers,
-    client: Client,
-    tmp_path: Path,
+    cluster: Cluster, start_fusion: StartFusion, servers: Servers, client: Client, tmp_path: Path
 ) -> None:
     cluster.hold("/a", "/b")
     fusion = start_fusion()

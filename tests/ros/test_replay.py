@@ -163,9 +163,7 @@ def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
     )
 
 
-def test_a_damaged_end_of_a_bag_is_told_without_a_count(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_a_damaged_end_of_a_bag_is_told_without_a_count(capfd: pytest.CaptureFixture[str]) -> None:
     file = rule_file.read(RULES.read_text(), str(RULES))
     lost = {(REST_OF_BAG, "cannot be read: damaged"): 1, ("/a", "cannot be decoded"): 2}
     show(Replay("bag", file, (0.0, 1.0), ["/a"], left_out=lost), "json")

@@ -86,10 +86,7 @@ def test_an_answer_that_drips_is_cut_off() -> None:
     ):
         call(url, timeout=0.3)
     chunks = b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n", *[b"1\r\ny\r\n"] * 3
-    with (
-        speaking(*chunks, b"0\r\n\r\n", pause=0.2) as url,
-        pytest.raises(NoAnswer, match=late),
-    ):
+    with speaking(*chunks, b"0\r\n\r\n", pause=0.2) as url, pytest.raises(NoAnswer, match=late):
         call(url, timeout=0.3)
 
 

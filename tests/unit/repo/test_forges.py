@@ -61,8 +61,7 @@ def open_one(made: Forge) -> PullRequest:
 
 
 @pytest.mark.parametrize(
-    ("name", "state"),
-    [("new", "open"), ("there", "open"), ("lost", "open"), ("closed", "closed")],
+    ("name", "state"), [("new", "open"), ("there", "open"), ("lost", "open"), ("closed", "closed")]
 )
 def test_a_request_is_opened_once_whatever_happened_before(
     kind: str, name: str, state: str, token: Path
