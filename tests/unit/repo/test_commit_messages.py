@@ -2,23 +2,18 @@
 
 from __future__ import annotations
 
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pygit2
 import pytest
 from demandops.base.errors import fault
-from demandops.base.naming import id_problem
 from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
 from demandops.model.demand.demand_request import Decommission
-from demandops.repo.history import commit_log, commit_message
-from demandops.repo.history.commit_log import compose
+from demandops.repo.history import commit_message
 
 from tests.kit import goals
-from tests.kit.repo import git, write_tree
 from tests.unit.decide.test_waiting import put, release, waiting_repo
 from tests.unit.repo.conftest import NOW, Desk
 
@@ -69,43 +64,6 @@ def listing() -> str:
 
 def test_messages_are_those_of_the_file() -> None:
     assert listing() == FILE.read_text(), f"run python -m {__name__} and review the diff"
-
-
-# ---- authors ----
-
-NASTY = [
-    *("<script>", "Ada <ada@example.org>", ">", "<>", ".", ". . .", ",", ";:,.", "'", '"', "\\"),
-    *("\\\\", '"\\\'"', "-", "--author=x", "#1", "日本 電気", "Ωμέγα", "🚗🚙", "e\u0301", "\u00e9"),
-    *("x" * 300, "ü" * 300, "🚗" * 300, "a, b", "key: value"),
-    *("Requester: somebody else", "(cherry picked from commit 12ab)", "---", "diff --git a/x b/x"),
-    *("%H", "$(touch /tmp/x)", "{{ 7 * 7 }}", "station00/a b", "vehicle_00", "Signed-off-by"),
-    *("a  b", "%(trailers)"),
-]
-
-
-def test_commits_in_the_name_of_nasty_requesters_are_sound_and_read_back_exactly(
-    desk: Any, repo: pygit2.Repository
-) -> None:
-    tree = write_tree(repo, None, {"f": "x"})
-    parents = list[pygit2.Oid]()
-    committer = commit_message.generator_signature(desk.now)
-    for name in NASTY:
-        assert id_problem(name) == "", name
-        decision = desk.join(name)
-        text = commit_message.of_decision(decision, "op-1", desk.now)
-        who = commit_message.author(decision, desk.now)
-        parents = [repo.create_commit(None, who, committer, text, tree, parents)]
-        assert who.name.strip() and len(who.name) <= 200
-        entry = commit_log.entry_of(repo[parents[0]].peel(pygit2.Commit))
-        assert entry.trailers["Requester"] == [name]
-    repo.references.create("refs/heads/main", parents[0])
-    command = ["git", "-C", repo.path, "fsck", "--strict", "--no-dangling", "--no-progress"]
-    fsck = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert (fsck.returncode, fsck.stdout, fsck.stderr) == (0, "", "")
-    form = "--format=%(trailers:key=Requester,valueonly)%x1e"
-    read_back = git(repo.path, "log", "--reverse", form).split("\n\x1e\n")
-    lines = [compose([], [("Requester", name)]).strip() for name in NASTY]
-    assert [f"Requester: {name}".removesuffix("\n\x1e") for name in read_back] == lines
 
 
 @pytest.mark.parametrize(
