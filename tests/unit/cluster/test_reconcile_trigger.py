@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
+from dataclasses import replace
+from math import inf
 from pathlib import Path
 from threading import Event, Timer
 
@@ -11,17 +12,15 @@ import pytest
 from demandops.base.errors import InvalidInput
 from demandops.cluster import clusters_file, reconcile_trigger
 from demandops.cluster.health import REQUESTED_AT
-from demandops.cluster.reconcile_trigger import ReconcileTrigger
+from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake
 
-from tests.kit.clock import Clock
 from tests.kit.generator import wait_until
 from tests.kit.golden import start
 from tests.kit.http import Answer, Call, kubeconfig, serving
 from tests.kit.kube_api import KubeApi, kube_api
 from tests.kit.limits import PATIENCE_S
 
-_LONG_ENOUGH_S = 0.2
-"""After a wait of this length, the trigger's thread has seen what the test did before."""
+SOURCED = {"sourceRef": {"name": "demandops"}}
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 
 
@@ -120,75 +119,44 @@ def test_the_object_that_fetches_is_annotated(
     assert annotation in api.patches[0][1]["metadata"]["annotations"]
 
 
-def fetch(api: KubeApi, commit: str) -> None:
-    """Have the API report that Flux has handled the last request and fetched ``commit``."""
+def fetch_and_apply(api: KubeApi, commit: str) -> None:
+    """Have the API report that Flux has handled the last request, and applied ``commit``."""
     asked = api.patches[-1][1]["metadata"]["annotations"] if api.patches else {}
     artifact = {"revision": f"main@sha1:{commit}"}
     status = {"lastHandledReconcileAt": asked.get(REQUESTED_AT, ""), "artifact": artifact}
     api.put("gitrepositories", "perception", "demandops", status, metadata={"annotations": asked})
-
-
-def apply(api: KubeApi, commit: str) -> None:
     ready = {"type": "Ready", "status": "True"}
     status = {"lastAttemptedRevision": f"main@sha1:{commit}", "conditions": [ready]}
-    spec = {"sourceRef": {"name": "demandops"}}
-    api.put("kustomizations", "perception", "perception", status, spec=spec)
+    api.put("kustomizations", "perception", "perception", status, spec=SOURCED)
 
 
-@pytest.mark.nightly  # waits to see that nothing happens
-@pytest.mark.parametrize("step", ["asked", "fetched", "applied"])
-def test_flux_is_woken_again_only_when_it_is_idle_or_after_a_minute(
-    api: KubeApi, tmp_path: Path, step: str
+def test_flux_is_woken_again_a_second_after_it_became_idle_or_after_a_minute() -> None:
+    busy = _Wake("c-its", (), pushed=100.0, idle_from=inf)
+    assert busy.due == 160
+    assert replace(busy, idle_from=130.0).due == 131
+    assert replace(busy, idle_from=130.0, next_try=140.0).due == 140, "a failed call waits"
+    assert replace(busy, pushed=None).due == inf, "without a push nobody is woken"
+
+
+def test_a_push_waits_until_flux_is_idle_which_the_end_does_not_miss(
+    api: KubeApi, tmp_path: Path
 ) -> None:
     state, _ = start("experiment")
-    clock = Clock()
-    fetch(api, "a")
-    apply(api, "a")
-    waker = ReconcileTrigger({"c-its": reached(api, tmp_path)}, lambda since: ("", None), clock)
-    waker(state.config)
-    wait_until(lambda: len(api.patches) == 1, "the first call")
-    if step != "asked":
-        fetch(api, "b")
-    time.sleep(_LONG_ENOUGH_S)
-    waker(state.config)
-    time.sleep(_LONG_ENOUGH_S)
-    clock.pass_(30)
-    waker(state.config)
-    time.sleep(_LONG_ENOUGH_S)
-    assert len(api.patches) == 1  # half a minute later Flux is still busy with the first fetch
-    if step == "applied":
-        apply(api, "b")
-        time.sleep(_LONG_ENOUGH_S)
-        assert len(api.patches) == 1  # Flux has just become idle
-        clock.pass_(1)
-    else:
-        clock.pass_(30)
-    waker(state.config)
-    wait_until(lambda: len(api.patches) == 2, "the second call")
-    waker.close()
-
-
-def test_a_last_push_is_told_at_the_end_once_flux_is_idle(api: KubeApi, tmp_path: Path) -> None:
-    state, _ = start("experiment")
-    fetch(api, "a")
-    apply(api, "a")
+    fetch_and_apply(api, "a")
     waker = ReconcileTrigger({"c-its": reached(api, tmp_path)}, lambda since: ("", None))
     waker(state.config)
     wait_until(lambda: len(api.patches) == 1, "the first call")
     waker(state.config)
-    fetch(api, "b")
-    apply(api, "b")
+    fetch_and_apply(api, "b")
     waker.close()
     assert len(api.patches) == 2
 
 
 def test_a_push_during_the_last_call_is_told_at_the_end_too() -> None:
     state, _ = start("experiment")
-    is_closing, calls = Event(), 0
+    is_closing = Event()
 
     def answer(call: Call) -> Answer:
-        nonlocal calls
-        calls += 1
         is_closing.wait(PATIENCE_S)
         return Answer()
 
@@ -196,11 +164,11 @@ def test_a_push_during_the_last_call_is_told_at_the_end_too() -> None:
         reached = clusters_file.ClusterAccess(receiver=f"{server.url}/hook/abc")
         waker = ReconcileTrigger({"c-its": reached}, lambda since: ("", None))
         waker(state.config)
-        wait_until(lambda: calls == 1, "the first call")
+        wait_until(lambda: len(server.calls) == 1, "the first call")
         waker(state.config)
-        Timer(_LONG_ENOUGH_S, is_closing.set).start()
+        Timer(0.2, is_closing.set).start()
         waker.close()
-    assert calls == 2
+        assert len(server.calls) == 2
 
 
 def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody(
@@ -221,10 +189,9 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
 
 def test_an_odd_object_keeps_no_cluster_from_being_woken(api: KubeApi, tmp_path: Path) -> None:
     state, _ = start("experiment")
-    fetch(api, "a")
-    spec = {"sourceRef": {"name": "demandops"}}
+    fetch_and_apply(api, "a")
     odd = {"lastAttemptedRevision": "main@sha1:a", "conditions": [None]}
-    api.put("kustomizations", "perception", "perception", odd, spec=spec)
+    api.put("kustomizations", "perception", "perception", odd, spec=SOURCED)
     waker = ReconcileTrigger({"c-its": reached(api, tmp_path)}, lambda since: ("", None))
     waker(state.config)
     wait_until(lambda: len(api.patches) == 1, "the call")
