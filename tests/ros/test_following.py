@@ -100,11 +100,17 @@ def test_another_node_that_serves_the_same_action_is_noticed(
     server.destroy()
     caller.wait(lambda: heard.is_at(ACTIONS, DiagnosticStatus.OK))
     caller.wait(lambda: len(told()) == 2)
-    assert told() == [
-        f"/test_client serves {DEFAULT_ACTION_NAME} too, so a client may get its answer from "
-        "another node, or no answer; give each node an action name of its own",
-        f"no other node serves {DEFAULT_ACTION_NAME} any more",
-    ]
+    another, gone = told()
+    assert another.startswith(f"/test_client serves {DEFAULT_ACTION_NAME} too, so a client may get")
+    assert gone == f"no other node serves {DEFAULT_ACTION_NAME} any more"
+
+
+def address_in(served: Served, before: str) -> str:
+    """Return the address that follows ``before`` in the log."""
+    served.wait_for(before)
+    found = re.search(rf"{before}(http://127.0.0.1:[0-9]+/\w*)", served.log.read_text())
+    assert found is not None
+    return found[1]
 
 
 def test_a_push_that_the_webhook_reports_is_followed_at_once(
@@ -117,12 +123,8 @@ def test_a_push_that_the_webhook_reports_is_followed_at_once(
     assert client.call(connection(1)).status == "succeeded"
     brokers = read(bare, "inventory/brokers.yaml")
     GitRepo(bare).commit({"inventory/brokers.yaml": brokers.replace("broker-edge", "broker-moved")})
-    client.wait(lambda: "listening for pushes at " in served.log.read_text())
-    found = re.search(
-        r"listening for pushes at (http://127.0.0.1:[0-9]+/push)", served.log.read_text()
-    )
-    assert found is not None
-    with urllib.request.urlopen(found[1], data=b"{}", timeout=PATIENCE_S) as answer:  # noqa: S310
+    url = address_in(served, "listening for pushes at ")
+    with urllib.request.urlopen(url, data=b"{}", timeout=PATIENCE_S) as answer:  # noqa: S310
         assert answer.status == 202
     follow = "A person DemandOps generator"
     client.wait(lambda: git(bare, "log", "-1", "--format=%an %cn", "main") == follow)
@@ -134,12 +136,10 @@ def test_the_node_shows_its_state_repo_on_a_page(serve: Serve, client: Client, b
     args = ["--web", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
     served = serve(f"file://{bare}", *args)
     client.ready()
-    client.wait(lambda: "the page of the state repo is at " in served.log.read_text())
-    found = re.search(r"state repo is at (http://127.0.0.1:[0-9]+/)", served.log.read_text())
-    assert found is not None
+    url = address_in(served, "the page of the state repo is at ")
 
     def shown(view: str) -> str:
-        with urllib.request.urlopen(f"{found[1]}{view}", timeout=PATIENCE_S) as answer:  # noqa: S310
+        with urllib.request.urlopen(f"{url}{view}", timeout=PATIENCE_S) as answer:  # noqa: S310
             return str(answer.read().decode())
 
     assert "Nothing is demanded" in shown("")

@@ -152,16 +152,10 @@ def test_a_file_that_gives_a_node_nothing_is_refused(text: str, message: str) ->
     assert str(refused.value) == message
 
 
-def test_a_kubeconfig_that_is_none_is_refused(servers: Servers, tmp_path: Path) -> None:
+def test_what_cannot_be_used_is_refused_at_the_start(servers: Servers, tmp_path: Path) -> None:
     (tmp_path / "kubeconfig").write_text("kind: Config")
-    refused = start_sync(servers, tmp_path)
-    assert refused.process.wait(PATIENCE_S) == 1
-    refused.wait_for(
-        f"error: {tmp_path}/kubeconfig: --kubeconfig: cannot be used: Invalid kube-con"
-    )
-
-
-def test_a_parameter_that_is_not_set_is_named(servers: Servers) -> None:
-    refused = servers.run("", "parameter-sync")
-    assert refused.process.wait(PATIENCE_S) == 2
-    refused.wait_for("parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE")
+    no_access, no_name = start_sync(servers, tmp_path), servers.run("", "parameter-sync")
+    assert no_access.process.wait(PATIENCE_S) == 1
+    no_access.wait_for(f"{tmp_path}/kubeconfig: --kubeconfig: cannot be used: Invalid kube-con")
+    assert no_name.process.wait(PATIENCE_S) == 2
+    no_name.wait_for("parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE")

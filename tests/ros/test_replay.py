@@ -88,13 +88,10 @@ def test_a_bag_gives_the_demands_of_a_plain_script(
 ) -> None:
     poses, plot = driven(seed), tmp_path / "plot.svg"
     record(tmp_path / "bag", poses, plugin)
-    ran = demandops(
-        "detect", RULES, "--replay", tmp_path / "bag", "--plot", plot, "--output", "json"
-    )
+    options = ("--replay", tmp_path / "bag", "--plot", plot, "--output", "json")
+    ran = demandops("detect", RULES, *options)
     assert ran.code == 0
-    assert ran.err == (
-        "warning: /vehicles/tram/pose is not read, because its type is std_msgs/msg/String\n"
-    )
+    assert ran.err.startswith("warning: /vehicles/tram/pose is not read, because its type is std_")
     data = ran.json()
     told = [(one["second"], one["entities"][0], one["change"]) for one in data["events"]]
     expected = plainly(poses)
@@ -144,23 +141,20 @@ def test_a_bag_is_read_with_the_message_definitions_that_it_contains(
 def test_a_bag_that_is_unreadable_or_lacks_the_topics_of_the_rules_is_refused(
     demandops: Run, tmp_path: Path
 ) -> None:
-    ran = demandops("detect", RULES, "--replay", tmp_path)
-    assert ran.code == 1
-    assert ran.err.startswith(f"error: {tmp_path}: is not a bag that can be read: ")
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(b"\x89MCAP0\r\n\x01" + b"\xff" * 40)
-    ran = demandops("detect", RULES, "--replay", broken)
-    assert ran.code == 1
-    assert ran.err.startswith(f"error: {broken}: is not a bag that can be read: ")
+    for bag in (tmp_path, broken):
+        ran = demandops("detect", RULES, "--replay", bag)
+        assert ran.code == 1
+        assert ran.err.startswith(f"error: {bag}: is not a bag that can be read: ")
     record(tmp_path / "bag", [(0.0, "vehicle00", 0.0, 0.0)], StoragePlugin.MCAP)
     rules = tmp_path / "rules.yaml"
     rules.write_text(RULES.read_text().replace("/vehicles/{", "/cars/{"))
     ran = demandops("detect", rules, "--replay", tmp_path / "bag", "--output", "json")
     (fault,) = json.loads(ran.out)["faults"]
-    assert fault["message"].startswith(
-        "has no topic that the rules read: /cars/{entity}/pose (geometry_msgs/msg/PoseStamped); "
-        "it has /vehicles/tram/pose (std_msgs/msg/String), "
-    )
+    lacks, _, has = fault["message"].partition("; it has ")
+    assert lacks.endswith(f"no topic that the rules read: /cars/{{entity}}/pose ({POSE})")
+    assert has.startswith("/vehicles/tram/pose (std_msgs/msg/String), ")
 
 
 def test_a_damaged_end_of_a_bag_is_told_without_a_count(capfd: pytest.CaptureFixture[str]) -> None:
