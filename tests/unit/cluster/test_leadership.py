@@ -36,15 +36,12 @@ The Lease ends after 15 s, and the standbys poll it every 2 s.
 class Server:
     """A stand-in for an API server with one Lease.
 
-    ``trouble`` returns ``before`` or ``after`` if the next call fails before or after its effect,
-    or an empty text if it does not fail. ``takes`` returns how many seconds the next call takes.
-    If a process leads after a call, the age of the Lease is appended to ``ages``.
+    ``trouble`` tells whether the next call fails ``before`` or ``after`` its effect; ``takes`` is
+    how many seconds it takes. ``ages`` has the ages of the Lease while a process leads.
     """
 
     turns: Turns
-    lease: dict[str, Any] = field(
-        default_factory=lambda: {"metadata": {"name": "generator", "resourceVersion": "1"}}
-    )
+    lease: dict[str, Any]
     trouble: Callable[[], str] = lambda: ""
     takes: Callable[[], float] = lambda: 0
     api: Any = None
@@ -62,23 +59,19 @@ class Server:
 
     def answer(self, call: Call) -> Answer:
         assert call.path == PATH
-        answer = self._answer(call, self.trouble())
+        trouble = self.trouble()
+        answer = Answer.json({"reason": "away"}, 503) if trouble == "before" else self._do(call)
         self.turns.pass_(self.takes())
         self.ages += [self.age for process in self.processes if process.leads]
-        return answer
+        return Answer.json({"reason": "away"}, 503) if trouble == "after" else answer
 
-    def _answer(self, call: Call, trouble: str) -> Answer:
-        if trouble == "before":
-            return Answer.json({"reason": "away"}, 503)
+    def _do(self, call: Call) -> Answer:
         if call.method == "PUT":
-            given = call.json()
-            version = self.lease["metadata"]["resourceVersion"]
+            given, version = call.json(), self.lease["metadata"]["resourceVersion"]
             if given["metadata"]["resourceVersion"] != version:
                 return Answer.json({"reason": "Conflict"}, 409)
             given["metadata"]["resourceVersion"] = str(int(version) + 1)
             self.lease, self.renewed_at = given, self.turns.monotonic()
-        if trouble == "after":
-            return Answer.json({"reason": "away"}, 503)
         return Answer.json(copy.deepcopy(self.lease))
 
 
@@ -120,7 +113,7 @@ def seed() -> int:
 
 @pytest.fixture
 def server(tmp_path: Path, seed: int) -> Iterator[Server]:
-    made = Server(Turns(seed))
+    made = Server(Turns(seed), {"metadata": {"name": "generator", "resourceVersion": "1"}})
     with serving(made.answer) as running:
         reached = config.new_client_from_config(str(kubeconfig(tmp_path, running.url)))
         made.api = client.CustomObjectsApi(reached)

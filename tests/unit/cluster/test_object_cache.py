@@ -46,16 +46,15 @@ def store(api: Api) -> ObjectCache:
 
 def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
     read = store(api)
+    assert read.pods("perception", "mqtt-edge") == [], "of a Deployment that is not known"
     read.read_once([OVER, CHILDREN])
     over, children = api.asked
     assert over.endswith(
         "/namespaces/argocd/applications?fieldSelector=metadata.name%3Ddemandops-perception"
     )
     assert children.endswith("/namespaces/perception/applications")
-    assert set(read.objects()) == {
-        ("Application", "argocd", "one"),
-        ("Application", "perception", "one"),
-    }
+    found = {("Application", namespace, "one") for namespace in ("argocd", "perception")}
+    assert set(read.objects()) == found
 
 
 def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
@@ -65,11 +64,6 @@ def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
     assert read.why_unknown([OVER]) == "applications in argocd: Forbidden"
     assert read.why_unknown([CHILDREN]) == ""
     assert read.why_unknown([DEPLOYMENTS]) == "some objects have not been read yet"
-
-
-def test_a_deployment_that_is_not_known_has_no_pods(api: Api) -> None:
-    assert store(api).pods("perception", "mqtt-edge") == []
-    assert api.asked == []
 
 
 def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:

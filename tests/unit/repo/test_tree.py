@@ -8,7 +8,7 @@ import os
 import subprocess
 import tempfile
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -29,50 +29,40 @@ PATHS = st.lists(NAMES, min_size=1, max_size=4).map("/".join)
 TEXTS = st.sampled_from(["", "x", "x\n", "ü{{ y }}\n"])
 
 
-def _without_conflict(paths: set[str], path: str) -> bool:
-    """Return whether a tree with the files ``paths`` can also have a file ``path``."""
-    return not any(o.startswith(f"{path}/") or path.startswith(f"{o}/") for o in paths - {path})
+def fits(path: str, paths: Iterable[str]) -> bool:
+    """Return whether one tree can have files at a path and at others."""
+    others = {*paths} - {path}
+    return not any(one.startswith(f"{path}/") or path.startswith(f"{one}/") for one in others)
 
 
 @st.composite
 def file_trees(draw: st.DrawFn) -> Files:
     files: Files = {}
     for path, text in draw(st.dictionaries(PATHS, TEXTS, max_size=8)).items():
-        if _without_conflict(set(files), path):
+        if fits(path, files):
             files[path] = text
     return files
 
 
 @st.composite
 def changes(draw: st.DrawFn, files: Files) -> dict[str, str | None]:
-    """Return random changes: files to remove (None), and new texts of files.
-
-    Some of the files to remove do not exist. The files with new texts fit into one tree.
-    """
+    """Return random changes: files to remove (None), also such that do not exist, and new texts."""
     known = st.sampled_from(sorted(files)) if files else PATHS
-    removed = draw(st.lists(known | PATHS, max_size=4))
-    made: dict[str, str | None] = {
-        path: None for path in removed if not any(file.startswith(f"{path}/") for file in files)
-    }
+    made: dict[str, str | None] = {}
+    for path in draw(st.lists(known | PATHS, max_size=4)):
+        if not any(file.startswith(f"{path}/") for file in files):
+            made[path] = None
     for path, text in draw(st.lists(st.tuples(known | PATHS, TEXTS), max_size=5)):
-        if _without_conflict({p for p, t in made.items() if t is not None}, path):
+        if fits(path, (other for other, new in made.items() if new is not None)):
             made[path] = text
-    order = draw(st.permutations(sorted(made)))
-    return {path: made[path] for path in order}
+    return {path: made[path] for path in draw(st.permutations(sorted(made)))}
 
 
 def changed(files: Files, change: Mapping[str, str | None]) -> Files:
-    """Return the files after a change, by the model.
-
-    First, files are removed. Then each new text replaces the files that conflict with its path.
-    """
-    after = {path: text for path, text in files.items() if change.get(path, text) is not None}
-    for path, text in change.items():
-        if text is None:
-            continue
-        after = {known: t for known, t in after.items() if _without_conflict({known}, path)}
-        after[path] = text
-    return after
+    """Return the files after a change; a new text replaces the files that conflict with it."""
+    after = {path: text for path, text in files.items() if path not in change}
+    new = {path: text for path, text in change.items() if text is not None}
+    return {path: text for path, text in after.items() if fits(path, new)} | new
 
 
 @contextmanager
