@@ -1,4 +1,4 @@
-"""The node over real ROS 2: feedback, results, refusals, load, cancel, shutdown."""
+"""The node over real ROS 2: feedback, results, refusals, load, cancel, approval, shutdown."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ from examples.experiment import paper
 from tests.kit.goals import experiment
 from tests.kit.goals import link as connection
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import git, hook, tip
-from tests.kit.ros import Client, Serve, Served
+from tests.kit.repo import Person, git, hook, tip
+from tests.kit.ros import Client, Sent, Serve, Served
 
 
 def held_remote(bare: Path) -> str:
@@ -308,3 +308,39 @@ def test_action_name_state_repo_and_log_level_are_ros_parameters_and_commits_are
     assert "\ngpgsig " in git(bare, "cat-file", "commit", "main")
     assert served.stop() == 0
     assert served.log.read_text() == ""
+
+
+def branch_of(client: Client, sent: Sent) -> str:
+    """Wait until a goal's feedback names the branch of its proposal; return the branch."""
+
+    def lines() -> list[str]:
+        return [line for line in sent.feedback if line.startswith("awaiting approval: ")]
+
+    client.wait(lambda: bool(lines()))
+    return lines()[0].split()[2]
+
+
+def test_a_goal_stays_open_until_a_person_has_decided(
+    serve: Serve, client: Client, person: Person
+) -> None:
+    bare = person.bare
+    person.policy(approval="required")
+    served = serve(str(bare))
+    client.ready()
+    approved, denied, gone = (client.send(connection(number)) for number in (1, 2, 3))
+    yes, no, away = (branch_of(client, sent) for sent in (approved, denied, gone))
+    assert not any(sent.answered for sent in (approved, denied, gone))
+    assert client.cancel(gone)
+    client.wait(lambda: gone.answered)
+    assert gone.status == "cancelled"
+    git(bare, "branch", "--delete", "--force", no)
+    client.wait(lambda: denied.answered)
+    assert denied.status == "aborted"
+    assert denied.message == f"turned-down: was turned down: {no} is gone and was not merged"
+    commit = git(bare, "rev-parse", yes)
+    git(bare, "update-ref", "refs/heads/main", f"refs/heads/{yes}")
+    client.wait(lambda: approved.answered)
+    assert (approved.status, approved.message) == ("succeeded", f"booked: {commit}")
+    assert list(served.bookkeeping()["connections"]) == ["c1"]
+    client.wait(lambda: git(bare, "for-each-ref", "refs/heads/demand") == "")
+    assert away != yes

@@ -11,8 +11,10 @@ from inspect import cleandoc
 from pathlib import Path
 
 import click
+import demandops
 import pytest
 from demandops.cli import main
+from demandops.cli.views.log import OPERATIONS
 
 PRINT_THIRD_PARTY = """
 import sys
@@ -116,3 +118,12 @@ def test_a_path_that_cannot_be_written_is_no_fault_of_the_program(
     (tmp_path / "file").touch()
     assert main.run(["schema", "--write", str(tmp_path / "file" / "folder")]) == 1
     assert capsys.readouterr().err.startswith(f"error: {tmp_path}/file/folder: Not a directory; ")
+
+
+WRITTEN = re.compile(r'^    operation = "([a-z-]+)"|\("Operation", "([a-z-]+)"\)', re.MULTILINE)
+
+
+def test_every_operation_can_be_asked_for() -> None:
+    texts = (path.read_text() for path in Path(demandops.__file__).parent.rglob("*.py"))
+    written = {one or other for text in texts for one, other in WRITTEN.findall(text)}
+    assert written | {"by-hand"} == {*OPERATIONS}

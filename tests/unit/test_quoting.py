@@ -9,13 +9,17 @@ import sys
 import unicodedata
 from typing import Any
 
+import pytest
 from demandops.base import quoting
-from demandops.base.errors import Fault, InvalidInput, StateRepoError, fault
+from demandops.base.errors import MOST_FAULTS, Fault, InvalidInput, StateRepoError, fault
 from demandops.base.quoting import is_visible, json_escaped, one_line
+from demandops.base.strict_yaml import located_in
 from demandops.cli import output
 from demandops.cli.json_output import print_json, show
 from demandops.cli.repo import check
 from demandops.cli.table import Column, Table
+from demandops.model.config.base_model import parse_file
+from demandops.model.ledger.records import _KeptReplicasFile
 from demandops.repo.load import last_valid_config
 from hypothesis import given
 from hypothesis import strategies as st
@@ -95,3 +99,16 @@ def test_the_problem_report_quotes_and_finds_its_problems_again() -> None:
     assert text and all(is_visible(line) for line in text.split("\n"))
     again = last_valid_config.with_origins(found, last_valid_config.read(text), lambda path: None)
     assert again == first
+
+
+def test_faults_that_are_passed_on_are_still_counted_right() -> None:
+    found = InvalidInput(Fault("invalid", f"a{n}", "is wrong") for n in range(MOST_FAULTS + 900))
+    with pytest.raises(InvalidInput) as raised, located_in("a: 1\n"):
+        raise found
+    *listed, last = raised.value.faults
+    assert (len(listed), last.message) == (MOST_FAULTS, "has 900 more faults")
+
+
+def test_a_file_that_is_no_mapping_is_told_the_format_of_its_own_kind() -> None:
+    with pytest.raises(InvalidInput, match=r"starts with apiVersion: demandops\.ledger/v2"):
+        parse_file(_KeptReplicasFile, "[]", "ledger/replicas/a.yaml")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import replace
 from math import inf
 from pathlib import Path
@@ -11,12 +12,13 @@ from threading import Event, Timer
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops.cluster import clusters_file, reconcile_trigger
+from demandops.cluster.clusters_file import ClusterAccess, NoAccess
 from demandops.cluster.health import REQUESTED_AT
-from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake
+from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake, signature, web_address
 
 from tests.kit.generator import wait_until
 from tests.kit.golden import start
-from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.http import Answer, Call, Server, kubeconfig, serving
 from tests.kit.kube_api import KubeApi, kube_api
 from tests.kit.limits import PATIENCE_S
 
@@ -30,9 +32,7 @@ def _patient(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reconcile_trigger, "_TIMEOUT_S", PATIENCE_S)
 
 
-def trigger(
-    case: str, reached: clusters_file.ClusterAccess, changed: list[str] | None = None
-) -> None:
+def trigger(case: str, reached: ClusterAccess, changed: list[str] | None = None) -> None:
     """Run the trigger once for the configuration of a golden case.
 
     ``changed`` lists the paths that have changed, as after a push.
@@ -96,8 +96,8 @@ def api() -> Iterator[KubeApi]:
         yield server
 
 
-def reached(api: KubeApi, folder: Path) -> clusters_file.ClusterAccess:
-    return clusters_file.ClusterAccess(kubeconfig=kubeconfig(folder, api.url))
+def reached(api: KubeApi, folder: Path) -> ClusterAccess:
+    return ClusterAccess(kubeconfig=kubeconfig(folder, api.url))
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_a_push_during_the_last_call_is_told_at_the_end_too() -> None:
         return Answer()
 
     with serving(answer) as server:
-        reached = clusters_file.ClusterAccess(receiver=f"{server.url}/hook/abc")
+        reached = ClusterAccess(receiver=f"{server.url}/hook/abc")
         waker = ReconcileTrigger({"c-its": reached}, lambda since: ("", None))
         waker(state.config)
         wait_until(lambda: len(server.calls) == 1, "the first call")
@@ -175,9 +175,9 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     state, _ = start("experiment")
-    away = clusters_file.ClusterAccess(receiver="http://127.0.0.1:1/hook/secret")
+    away = ClusterAccess(receiver="http://127.0.0.1:1/hook/secret")
     with serving() as server:
-        here = clusters_file.ClusterAccess(receiver=f"{server.url}/hook/abc")
+        here = ClusterAccess(receiver=f"{server.url}/hook/abc")
         waker = ReconcileTrigger({"away": away, "here": here}, lambda since: ("", None))
         assert server.calls == [], "without a push nobody is woken"
         waker(state.config)
@@ -196,3 +196,118 @@ def test_an_odd_object_keeps_no_cluster_from_being_woken(api: KubeApi, tmp_path:
     waker(state.config)
     wait_until(lambda: len(api.patches) == 1, "the call")
     waker.close()
+
+
+SECRET = "It's a Secret to Everybody"  # noqa: S105 - of an example
+
+
+@pytest.fixture
+def hook() -> Iterator[Server]:
+    with serving() as server:
+        server.url += "/hook"
+        yield server
+
+
+@pytest.fixture
+def secret_file(tmp_path: Path) -> Path:
+    file = tmp_path / "secret"
+    file.write_text(f"{SECRET}\n")
+    file.chmod(0o640)
+    return file
+
+
+def test_the_signature_is_the_one_that_github_documents() -> None:
+    """Flux and Argo CD use GitHub's scheme; the values come from GitHub's documentation."""
+    documented = "757107ea0eb2509fc211221cce984b8a37570b6d7586c22c46f4379c8b043e17"
+    assert signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
+
+
+def test_a_receiver_of_flux_is_called_with_a_signature(hook: Server, secret_file: Path) -> None:
+    trigger("experiment", ClusterAccess(receiver=hook.url, secret_file=secret_file))
+    call = hook.calls[0]
+    assert call.headers["X-Signature"] == signature(SECRET.encode(), call.body)
+
+
+def test_argo_cd_is_told_of_a_push_as_github_tells_it(hook: Server, secret_file: Path) -> None:
+    changed = [
+        "appdefs/x/charts/x/Chart.yaml",
+        "clusters/c-its/perception/edge/a.yaml",
+        "clusters/other/perception/edge/b.yaml",
+        "ledger/applications/aa/b/c.yaml",
+    ]
+    reached = ClusterAccess(webhook=hook.url, secret_file=secret_file)
+    trigger("argocd-experiment", reached, changed)
+    headers, event = hook.calls[0].headers, hook.calls[0].json()
+    assert headers["X-Hub-Signature-256"] == signature(SECRET.encode(), hook.calls[0].body)
+    assert (headers["X-GitHub-Event"], headers["Content-Type"]) == ("push", "application/json")
+    assert event["ref"] == "refs/heads/main" and event["after"] == "b" * 40
+    # a file of the domain's folder is named, but none of the ledger and of other clusters
+    own = "clusters/c-its/perception/_domain.yaml"
+    assert event["commits"][0]["modified"] == [changed[0], own, changed[1]]
+    trigger("argocd-experiment", reached)  # nothing is known of what changed
+    assert hook.calls[-1].json()["commits"] == []
+
+
+def test_what_changed_is_asked_for_since_the_last_call_that_was_taken(
+    hook: Server, secret_file: Path
+) -> None:
+    asked: list[str] = []
+
+    def changed(since: str) -> tuple[str, list[str]]:
+        asked.append(since)
+        return f"{len(asked)}", []
+
+    state, _ = start("argocd-experiment")
+    reached = ClusterAccess(webhook=hook.url, secret_file=secret_file)
+    waker = ReconcileTrigger({"c-its": reached}, changed)
+    try:
+        hook.answer = lambda call: Answer(503)
+        waker(state.config)
+        wait_until(lambda: len(hook.calls) >= 1, "call 1")
+        hook.answer = lambda call: Answer()
+        wait_until(lambda: len(hook.calls) >= 2, "call 2")
+        waker(state.config)
+        wait_until(lambda: len(hook.calls) >= 3, "call 3")
+    finally:
+        waker.close()
+    assert asked[:3] == ["", "", "2"]
+
+
+@pytest.mark.parametrize("status", [302, 307, 400])
+def test_a_refused_webhook_is_logged_and_no_redirection_followed(
+    hook: Server, secret_file: Path, caplog: pytest.LogCaptureFixture, status: int
+) -> None:
+    hook.answer = lambda call: Answer(status, headers={"Location": "/elsewhere"})
+    trigger("experiment", ClusterAccess(receiver=hook.url, secret_file=secret_file))
+    assert f"cluster 'c-its' was not woken (it answered {status})" in caplog.text
+    assert len(hook.calls) in (1, 2)  # the close may cause a second call
+    assert SECRET not in caplog.text and "/hook" not in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("case", "other", "needs"),
+    [("experiment", "webhook", "receiver"), ("argocd-experiment", "receiver", "webhook")],
+)
+def test_the_other_controller_s_webhook_is_not_called(
+    hook: Server, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
+) -> None:
+    trigger(case, ClusterAccess.model_validate({other: hook.url}))
+    assert hook.calls == []
+    assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("repo", "page"),
+    [
+        ("https://git.example/fleet/repo.git", "https://git.example/fleet/repo"),
+        ("https://me:pass@git.example:8443/fleet/repo", "https://git.example/fleet/repo"),
+        ("ssh://git@git.example:22/fleet/repo.git", "https://git.example/fleet/repo"),
+        ("git@git.example:fleet/repo.git", "https://git.example/fleet/repo"),
+        ("file:///srv/fleet.git", None),
+    ],
+)
+def test_a_repository_is_named_by_the_page_that_a_forge_would_name(
+    repo: str, page: str | None
+) -> None:
+    with pytest.raises(NoAccess, match="names no host") if page is None else nullcontext():
+        assert web_address(repo) == page

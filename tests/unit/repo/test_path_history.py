@@ -9,6 +9,7 @@ import pygit2
 import pytest
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log
+from pygit2 import Oid
 
 from tests.kit.repo import git, write_tree
 
@@ -97,3 +98,21 @@ def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
     history.commit("a", 1, path="clusters/c/d/_charts/detection-0.1.0.yaml")
     without_chart = history.commit(None, 2)
     assert commit_log.stopped_release_names(history.repo, without_chart) == {"r"}
+
+
+def test_a_clock_that_was_set_back_hides_no_commit_and_shows_no_known_one(tmp_path: Path) -> None:
+    repo = pygit2.init_repository(str(tmp_path), bare=True)
+    tree = repo.TreeBuilder().write()
+
+    def commit(seconds: int, *parents: Oid) -> Oid:
+        who = pygit2.Signature("someone", "someone@example.org", seconds)
+        return repo.create_commit(None, who, who, f"at {seconds}", tree, list(parents))
+
+    first = until = commit(1000)
+    # after second 1030 the clock is set back to 10
+    for second in (*range(1001, 1031), *range(10, 40)):
+        until = commit(second, until)
+    branch = commit(5000, first)
+    merge = commit(5001, until, branch)
+    found = {one.id for one, _ in commit_log.commits(repo, str(merge), str(until))}
+    assert found == {merge, branch}

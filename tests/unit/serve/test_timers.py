@@ -1,16 +1,62 @@
-"""The times at which the state repo is polled; most tests use a clock that they move themselves."""
+"""Pauses between tries, times of polls, and the number of demands in a minute."""
 
 from __future__ import annotations
 
 import logging
+from datetime import datetime, timedelta, timezone
+from itertools import count
 
 import pytest
 from demandops.base.runtime import REAL
-from demandops.serve.timing.timers import PollTimer, parse_interval
+from demandops.model.config.load import load
+from demandops.model.demand.claim import Application
+from demandops.model.demand.demand_request import Demanded, Join
+from demandops.serve.timing.timers import (
+    FIRST_PAUSE_S,
+    LONGEST_AWAY_S,
+    LONGEST_TURN_S,
+    Backoff,
+    PollTimer,
+    RateLimit,
+    parse_interval,
+)
 from demandops.serve.worker import RemoteMonitor
 
 from tests.kit.clock import Clock
+from tests.kit.config import configuration, edited
 from tests.kit.memory import NOW
+
+
+def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
+    pace = Backoff(200, REAL)
+    away = [pace.unreachable() for _ in range(20)]
+    assert max(away) <= LONGEST_AWAY_S
+    assert min(away[-5:]) >= LONGEST_AWAY_S / 2
+    turns = [pace.overtaken(10, 0.1, 1.0) for _ in range(20)]
+    assert max(turns) <= LONGEST_TURN_S
+    assert min(turns[-5:]) >= LONGEST_TURN_S / 2
+
+
+def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew() -> None:
+    pace = Backoff(200, REAL)
+    for _ in range(10):
+        pace.unreachable()
+    pace.overtaken(10, 0.1, 1.0)
+    assert pace.unreachable() <= FIRST_PAUSE_S
+    for _ in range(10):
+        pace.overtaken(10, 0.1, 1.0)
+    pace.published()
+    assert pace.overtaken(10, 0.1, 1.0) <= FIRST_PAUSE_S
+
+
+def test_a_batch_takes_no_more_demands_than_are_evaluated_during_one_push() -> None:
+    pace = Backoff(200, REAL)
+    assert pace.max_demands == 200
+    for demands, evaluating_s, most in ((100, 0.1, 100), (100, 1.0, 20), (2, 100.0, 1), (1, 0, 1)):
+        pace.overtaken(demands, evaluating_s=evaluating_s, pushing_s=0.2)
+        assert pace.max_demands == most
+    pace.published()
+    assert pace.max_demands == 200
 
 
 @pytest.fixture
@@ -108,3 +154,46 @@ def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) ->
     assert (remote.status.push_denied, remote.status.unreachable) == ("takes no push: frozen", "")
     remote.record_reached(pushed=True)
     assert remote.status.push_denied == ""
+
+
+START = datetime(2026, 3, 1, 12, 0, tzinfo=timezone.utc)
+
+
+class Sending:
+    """Sends demands to a rate limit of two a minute."""
+
+    def __init__(self) -> None:
+        self.throttle = RateLimit()
+        quotas = "    quotas: {demandsPerMinute: 2}\n    namespace:"
+        policy = edited("policy/access-domains.yaml", "    namespace:", quotas)
+        self._config = load(configuration(policy))
+        self._names = map(str, count())
+
+    def send(self, requester: str, at_s: float, operation: str = "") -> bool:
+        """Send a demand; return whether the limit allowed it."""
+        app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
+        request = Join("one", (Demanded(app, (requester,), "applications[0].{}".format),))
+        moment, name = START + timedelta(seconds=at_s), operation or next(self._names)
+        return not list(self.throttle.faults(request, self._config, name, moment))
+
+
+def test_a_hand_in_that_is_judged_again_counts_once() -> None:
+    sending = Sending()
+    assert [sending.send("vehicle00", 0, "same") for _ in range(5)] == [True] * 5
+    assert sending.send("vehicle00", 1)
+    assert not sending.send("vehicle00", 2)
+
+
+def test_who_sends_no_more_is_forgotten() -> None:
+    sending = Sending()
+    for number in range(500):
+        assert sending.send(f"vehicle{number}", number)
+    assert len(sending.throttle._seen) <= 62
+    assert sending.send("vehicle499", 499.5)
+    assert not sending.send("vehicle499", 499.6)
+
+
+def test_a_clock_that_is_set_back_does_not_shut_anybody_out() -> None:
+    sending = Sending()
+    assert [sending.send("vehicle00", at) for at in (5000, 5001)] == [True, True]
+    assert sending.send("vehicle00", 0)
