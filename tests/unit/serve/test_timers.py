@@ -1,16 +1,21 @@
-"""Pauses between tries, times of polls, and the number of demands in a minute."""
+"""Pauses between tries, times of polls, demands in a minute, and which leases have ended."""
 
 from __future__ import annotations
 
 import logging
-from datetime import datetime, timedelta, timezone
+from dataclasses import replace
+from datetime import timedelta
 from itertools import count
 
 import pytest
 from demandops.base.runtime import REAL
+from demandops.connections.connection import Connection, Route
+from demandops.connections.mqtt import MQTT
 from demandops.model.config.load import load
-from demandops.model.demand.claim import Application
+from demandops.model.demand.claim import Application, Claim, Lease
 from demandops.model.demand.demand_request import Demanded, Join
+from demandops.model.ledger.ledger import Ledger
+from demandops.serve.timing.expiry import LeaseExpiry
 from demandops.serve.timing.timers import (
     FIRST_PAUSE_S,
     LONGEST_AWAY_S,
@@ -24,7 +29,7 @@ from demandops.serve.worker import RemoteMonitor
 
 from tests.kit.clock import Clock
 from tests.kit.config import configuration, edited
-from tests.kit.memory import NOW
+from tests.kit.memory import NOW, rebuilt
 
 
 def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
@@ -156,9 +161,6 @@ def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) ->
     assert remote.status.push_denied == ""
 
 
-START = datetime(2026, 3, 1, 12, 0, tzinfo=timezone.utc)
-
-
 class Sending:
     """Sends demands to a rate limit of two a minute."""
 
@@ -173,7 +175,7 @@ class Sending:
         """Send a demand; return whether the limit allowed it."""
         app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
         request = Join("one", (Demanded(app, (requester,), "applications[0].{}".format),))
-        moment, name = START + timedelta(seconds=at_s), operation or next(self._names)
+        moment, name = NOW + timedelta(seconds=at_s), operation or next(self._names)
         return not list(self.throttle.faults(request, self._config, name, moment))
 
 
@@ -197,3 +199,79 @@ def test_a_clock_that_is_set_back_does_not_shut_anybody_out() -> None:
     sending = Sending()
     assert [sending.send("vehicle00", at) for at in (5000, 5001)] == [True, True]
     assert sending.send("vehicle00", 0)
+
+
+def leased(*terms: tuple[str, int, int]) -> Ledger:
+    """Return a ledger with a claim for each (demand, lease seconds, slack), booked at `NOW`."""
+    claims = []
+    for number, (demand, seconds, slack) in enumerate(terms):
+        link = Connection(f"{number}", MQTT, "vehicle00", "edge", "", (Route("/a", "/a"),))
+        lease = Lease(seconds, slack, NOW + timedelta(seconds=seconds))
+        claims.append(Claim(link, demand, demand, ("a",), NOW, lease))
+    return rebuilt(claims)
+
+
+@pytest.fixture
+def expiry(clock: Clock) -> LeaseExpiry:
+    return LeaseExpiry(clock)
+
+
+def ended(expiry: LeaseExpiry, ledger: Ledger) -> list[str]:
+    return [claim.demand for claim in expiry.ended_claims(ledger)[1]]
+
+
+@pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
+def test_it_is_set_forward_and_a_full_term_is_granted(
+    clock: Clock, expiry: LeaseExpiry, steps: list[int], caplog: pytest.LogCaptureFixture
+) -> None:
+    ledger = leased(("short", 60, 5), ("long", 600, 5))
+    for step in steps:
+        clock.set_by(step)
+        assert ended(expiry, ledger) == []
+    assert "the clock jumped forward by 3600 s, so leases get their full term" in caplog.text
+    for seconds, over in ((65, []), (1, ["short"]), (539, ["short"]), (1, ["short", "long"])):
+        clock.pass_(seconds)
+        assert ended(expiry, ledger) == over
+
+
+def test_a_step_that_nobody_looked_at_is_noticed_later(clock: Clock, expiry: LeaseExpiry) -> None:
+    ledger = leased(("a", 60, 0))
+    clock.pass_(50)
+    clock.set_by(3600)
+    clock.pass_(50)
+    assert ended(expiry, ledger) == []
+    clock.pass_(61)
+    assert ended(expiry, ledger) == ["a"]
+
+
+def test_small_adjustments_of_the_clock_count_as_no_step(
+    clock: Clock, expiry: LeaseExpiry, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    ledger = leased(("a", 60, 0))
+    for _ in range(31):
+        clock.pass_(1)
+        clock.set_by(1)
+        expiry.seconds_until_due(ledger, 60.0)
+    assert ended(expiry, ledger) == ["a"]
+    assert caplog.text == ""
+
+
+def test_it_looks_again_when_the_first_lease_ends(clock: Clock, expiry: LeaseExpiry) -> None:
+    ledger = leased(("a", 20, 10), ("b", 600, 0))
+    assert expiry.seconds_until_due(ledger, 60.0) == pytest.approx(30.01)
+    clock.pass_(29.5)
+    assert expiry.seconds_until_due(ledger, 60.0) == 1.0
+    clock.pass_(100)
+    assert expiry.seconds_until_due(ledger, 60.0) == 1.0, "it must not keep the clock busy"
+    assert expiry.seconds_until_due(Ledger(), 60.0) == 60.0
+    assert expiry.seconds_until_due(leased(("b", 86_400, 0)), 60.0) == 60.0
+
+
+def test_an_end_that_moves_within_its_minute_is_seen(expiry: LeaseExpiry) -> None:
+    ledger = leased(("a", 50, 0), ("b", 55, 0))
+    assert expiry.seconds_until_due(ledger, 60) == pytest.approx(50, abs=0.1)
+    (claim,) = ledger.claims_of_demand("b")
+    sooner = replace(claim, lease=Lease(20, 0, NOW + timedelta(seconds=20)))
+    ledger = ledger.replace(claim.key, sooner)
+    assert expiry.seconds_until_due(ledger, 60) == pytest.approx(20, abs=0.1)
