@@ -14,8 +14,11 @@ from types import ModuleType
 
 import pytest
 
+from tests.kit import plain_yaml
+
 INTERFACES = Path(__file__).resolve().parents[2] / "ros_bridge" / "interfaces"
 BUILD = INTERFACES / "build.py"
+TOOLS = plain_yaml.load(Path(__file__).with_name("tools.yaml").read_text())
 OURS = "application_manager_interfaces"
 
 
@@ -212,17 +215,7 @@ def test_missing_wheels_are_named(script: ModuleType, capsys: pytest.CaptureFixt
     assert told.endswith(" -m pip install catkin-pkg ros-ament-cmake 'ros-rclpy[fastrtps]'\n")
 
 
-@pytest.mark.parametrize(
-    ("absent", "compiler", "named", "package"),
-    [
-        ("bin/cmake", "", "cmake", "cmake"),
-        ("bin/cc", "", "a C compiler", "build-essential"),
-        ("bin/c++", "", "a C++ compiler", "build-essential"),
-        ("bin/ninja", "", "make or ninja", "build-essential"),
-        ("prefix/include/Python.h", "", "Python's headers", "python3-dev"),
-        ("", "icx -m64", "a C compiler", "build-essential"),
-    ],
-)
+@pytest.mark.parametrize(("absent", "compiler", "named", "package"), TOOLS["missing"])
 def test_each_missing_tool_is_named(
     absent: str, compiler: str, named: str, package: str, script: ModuleType, tmp_path: Path
 ) -> None:

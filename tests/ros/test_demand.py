@@ -22,12 +22,14 @@ from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 
+from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.generator import wait_until
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import POLICY, GitRepo, git, tip
 from tests.kit.ros import Served
 
+REFUSED = plain_yaml.load(Path(__file__).with_name("refused.yaml").read_text())
 POINTS = "/vehicles/vehicle00/drivers/lidar/pointcloud"
 RECORDER: dict[str, Any] = {
     "id": "edge/record",
@@ -87,17 +89,7 @@ def test_a_third_type_of_application_is_demanded_with_yaml_alone(
     assert stages == [s for s in ("admitted", "booked", "committed", "pushed") if s in stages]
 
 
-@pytest.mark.parametrize(
-    ("fields", "told"),
-    [
-        ({"type": "recoder"}, "applications[0].type: 'recoder' is not a known application type"),
-        ({"node": "egde"}, "applications[0].node: 'egde' is not in inventory/nodes.yaml"),
-        ({"node": "", "place": {"role": "egde"}}, "applications[0].place: no node has the role "),
-        ({"node": "", "place": {"properties": ["memoryGiB>=8"]}}, "no node has the property 'mem"),
-        ({"deliver": [{"output": "driver.bag", "node": "edge"}]}, "applications[0].deliver[0].out"),
-        ({"services": {"recorder": ""}}, "applications[0].services.recorder: "),
-    ],
-)
+@pytest.mark.parametrize(("fields", "told"), REFUSED["fields"])
 def test_every_field_is_in_the_message_and_named_in_a_refusal(
     shared: Served, vehicle: DemandClient, before: str, fields: dict[str, Any], told: str
 ) -> None:

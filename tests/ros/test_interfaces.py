@@ -13,6 +13,9 @@ from application_manager_interfaces.msg import Application, Connection
 from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.messages import demand_goal_from_data, fill_message
 
+from tests.kit import plain_yaml
+
+REFUSED = plain_yaml.load(Path(__file__).with_name("refused.yaml").read_text())
 OURS = "application_manager_interfaces"
 
 # The hash of the reference's action with all its messages and their fields; a client of the
@@ -41,19 +44,7 @@ def test_the_bookkeeping_is_a_service() -> None:
     assert GetBookkeeping.Response.get_fields_and_field_types() == {"ok": "boolean", **texts}
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"demand": 5},
-        {"priority": 2**31},
-        {"lease": 2**31},
-        {"requesters": [1]},
-        {"applications": [{"id": 3}]},
-        {"applications": [{"inputs": {"points": [{"topic": 1}]}}]},
-        {"connections": [{"topics": [{"qos": -1}]}]},
-        {"positions": [{"x": "far"}]},
-    ],
-)
+@pytest.mark.parametrize("wrong", REFUSED["demands"])
 def test_a_value_that_a_demand_cannot_carry_is_refused_before_it_is_sent(
     wrong: dict[str, Any],
 ) -> None:

@@ -16,12 +16,14 @@ from demandops.cluster.clusters_file import ClusterAccess, NoAccess
 from demandops.cluster.health import REQUESTED_AT
 from demandops.cluster.reconcile_trigger import ReconcileTrigger, _Wake, signature, web_address
 
+from tests.kit import plain_yaml
 from tests.kit.generator import wait_until
 from tests.kit.golden import start
 from tests.kit.http import Answer, Call, Server, kubeconfig, serving
 from tests.kit.kube_api import KubeApi, kube_api
 from tests.kit.limits import PATIENCE_S
 
+TABLES = plain_yaml.load(Path(__file__).with_name("clusters.yaml").read_text())
 SOURCED = {"sourceRef": {"name": "demandops"}}
 HEAD = "apiVersion: demandops/v1\nkind: ClusterAccess\n"
 
@@ -56,19 +58,7 @@ SIGNED = "{receiver: 'http://h/hook', secret_file: SECRET}"
 SECRET_FILE = "clusters.a.secret_file"  # noqa: S105 - a field
 
 
-@pytest.mark.parametrize(
-    ("access", "secret", "mode", "field", "told"),
-    [
-        ("{}", None, 0, "clusters.a", "needs a kubeconfig, a receiver or a webhook"),
-        ("{kubeconfig: /k, secret_file: /s}", None, 0, "clusters.a", "but no URL; add a receiver"),
-        (SIGNED, None, 0, SECRET_FILE, "cannot be read: No such file"),
-        (SIGNED, "", 0o600, SECRET_FILE, "is empty; write the secret"),
-        (SIGNED, " \r\n", 0o600, SECRET_FILE, "is empty; write the secret"),
-        (SIGNED, "x", 0o644, SECRET_FILE, "is open to everybody on this machine; run chmod o="),
-        (r'{receiver: "http://h/hook", secret_file: "/\0"}', None, 0, SECRET_FILE,
-         r"/\x00 cannot be read: embedded null byte"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("access", "secret", "mode", "field", "told"), TABLES["mistakes"])
 def test_a_file_that_cannot_be_used_is_told_with_field_and_remedy(
     tmp_path: Path, access: str, secret: str | None, mode: int, field: str, told: str
 ) -> None:
@@ -296,16 +286,7 @@ def test_the_other_controller_s_webhook_is_not_called(
     assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("repo", "page"),
-    [
-        ("https://git.example/fleet/repo.git", "https://git.example/fleet/repo"),
-        ("https://me:pass@git.example:8443/fleet/repo", "https://git.example/fleet/repo"),
-        ("ssh://git@git.example:22/fleet/repo.git", "https://git.example/fleet/repo"),
-        ("git@git.example:fleet/repo.git", "https://git.example/fleet/repo"),
-        ("file:///srv/fleet.git", None),
-    ],
-)
+@pytest.mark.parametrize(("repo", "page"), TABLES["pages"])
 def test_a_repository_is_named_by_the_page_that_a_forge_would_name(
     repo: str, page: str | None
 ) -> None:

@@ -14,11 +14,13 @@ from demandops.model.config.repo_settings import Proposals
 from demandops.repo.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
 from demandops.serve.approvals.forge_worker import ForgeWorker
 
+from tests.kit import plain_yaml
 from tests.kit.config import configuration
 from tests.kit.http import Answer, Call, Server, serving
 from tests.kit.turns import Turns
 from tests.unit.repo.replaying import TOKEN, replaying
 
+TABLES = plain_yaml.load(Path(__file__).with_name("forges.yaml").read_text())
 BRANCH = "demand/one-0123456789ab"
 LINKS = {
     "github": "https://github.com/its/state/pull/7",
@@ -189,15 +191,7 @@ def test_while_a_forge_is_away_no_requester_waits_for_the_calls_of_others(token:
         assert told == [("demand/x", 1), ("demand/y", 1)]
 
 
-@pytest.mark.parametrize(
-    ("kind", "url", "address"),
-    [
-        ("github", "https://github.com/its/state", "https://api.github.com"),
-        ("github", "https://ghe.example.org/its/state.git", "https://ghe.example.org/api/v3"),
-        ("gitea", "https://git.example.org/its/state", "https://git.example.org/api/v1"),
-        ("gitea", "https://example.org:3000/git/its/state/", "https://example.org:3000/git/api/v1"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "url", "address"), TABLES["addresses"])
 def test_the_apis_address_follows_from_the_projects(
     kind: str, url: str, address: str, token: Path
 ) -> None:
@@ -211,19 +205,7 @@ def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
     assert forge_for(Proposals.model_validate({"forge": forge}), None) is None
 
 
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [
-        ("{forge: github}", "proposals: 'forge: github' needs 'url', the project's address"),
-        ("{forge: github, url: 'https://github.com/its'}", "needs 'url', the project's address"),
-        ("{forge: gitea, url: 'http://x.org/a/b'}", "is not an address that a token may be sent"),
-        ("{forge: gitea, url: 'https://me:secret@x.org/a/b'}", "proposals.url: "),
-        ("{forge: none, api: 'https://x.org/a'}", "api: is not used with 'forge: none'"),
-        ("{forge: gitea, url: 'https://x.org/a/b', labels: [x]}", "are used only with 'forge: git"),
-        ('{forge: gitlab, labels: ["a\\nb"]}', "proposals.labels[0]: "),
-        ("{forge: bitbucket}", "proposals.forge: "),
-    ],
-)
+@pytest.mark.parametrize(("section", "message"), TABLES["sections"])
 def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> None:
     config = configuration()
     config["demandops.yaml"] += f"\nproposals: {section}\n"

@@ -105,22 +105,7 @@ METADATA = f"appdefs/{APPDEF.name}/charts/object-detection/Chart.yaml"
 LIBRARY = "file://../../../charts/ros-service"
 
 
-@pytest.mark.parametrize(
-    ("path", "old", "new", "field", "told"),
-    [
-        (METADATA, LIBRARY, "file://../ros-service", "dependencies[0].repository",
-         "ros-service/Chart.yaml' does not exist; correct the path, which is relative"),
-        (METADATA, LIBRARY, "file://../../../../other/ros-service", "dependencies[0].repository",
-         "that folder is not in appdefs/; correct the path"),
-        (METADATA, "ros-service\n    version: 1.0.0", "ros-service\n    version: 0.2.0",
-         "dependencies[0].version", "requires 0.2.0, but the library in appdefs/charts/ros-serv"),
-        ("registry/charts.yaml", "folder: appdefs/object-detection-fusion/charts",
-         "folder: charts", "charts.object-detection.folder",
-         "is not in appdefs/; move the chart there"),
-        (METADATA, "\nversion: 0.1.0", "\n", "charts.object-detection.version",
-         f"is 0.1.0, but {METADATA} has no version; add it there"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("path", "old", "new", "field", "told"), CHANGES["misfits"])
 def test_a_chart_that_does_not_fit_library_or_registry_is_a_fault(
     path: str, old: str, new: str, field: str, told: str
 ) -> None:
