@@ -44,23 +44,7 @@ def test_a_build_folder_inside_the_sources_is_refused() -> None:
     assert "is inside the sources; choose another\n" in told
 
 
-# A fake CMake that records its calls and builds nothing
-
-FAKE_CMAKE = """#!/bin/sh
-PATH=/usr/bin:/bin
-set -e
-stage=$1
-case $1 in --*) ;; *) stage=configure ;; esac
-echo "$stage" >> '{prefix}/calls'
-echo "as $1"
-if [ -e "{prefix}/fail$1" ]; then echo "no space left" >&2; exit 1; fi
-if [ "$1" = --install ]; then
-  library={prefix}/lib/lib$(basename "$2")__typesupport.so
-  mkdir -p '{prefix}/lib' "$2"
-  touch "$library"
-  printf %s "$library" > "$2/install_manifest.txt"
-fi
-"""
+FAKE_CMAKE = Path(__file__).with_name("fake-cmake.sh").read_text()
 
 
 @pytest.fixture
@@ -85,7 +69,7 @@ def script(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
     tools.mkdir()
     for tool in ("cmake", "ninja", "cc", "c++"):
-        (tools / tool).write_text(FAKE_CMAKE.format(prefix=prefix))
+        (tools / tool).write_text(FAKE_CMAKE.replace("PREFIX", str(prefix)))
         (tools / tool).chmod(0o755)
     monkeypatch.setenv("PATH", str(tools))
     monkeypatch.delenv("CC", raising=False)

@@ -12,37 +12,14 @@ from demandops.model.config.load import load
 from demandops_ros import node_parameters
 from rcl_interfaces.srv import DescribeParameters
 
+from tests.kit import plain_yaml
 from tests.kit.config import configuration
 from tests.kit.goals import application
 from tests.kit.ros import Client, Serve
 
-FILE = """
-application_manager:
-  ros__parameters:
-    cluster_config: config/cluster_config.yml
-    deployment_action_name: /fleet/deployment_request
-    namespace: NAMESPACE
-    k3d_image_registry: "k3d-registry.localhost:41671"
-    connections:
-      communication_broker_nodes: [cloud, edge]
-      communication_broker_params:
-        cloud: {host: service-mqtt-broker-cloud, port: 1883}
-        edge: {host: service-mqtt-broker-edge, port: PORT}
-"""
-OLDER = """
-application_manager:
-  ros__parameters:
-    namespace: perception
-    deployment_action_name: /fleet/deployment_request
-    helm_release_tag: appmanager
-    url_application_registry: https://example.org/charts
-    applications: {event_detector_database: {database: {name: mongodb, port: 27017}}}
-    connections:
-      init_comm_topics: [/vehicles/vehicle00/pose]
-      communication_broker: {host: broker, port: 1883}
-"""
+FILES = plain_yaml.load(Path(__file__).with_name("parameters.yaml").read_text())
+EXPERIMENT = FILES["of the experiment"]
 PAGE = Path(__file__).parents[2] / "docs" / "migration.md"
-REPLACED = {"cluster_config": "give --clusters", "k3d_image_registry": "set the field 'registry'"}
 
 
 @pytest.fixture
@@ -70,42 +47,20 @@ def told(folder: Path, text: str, **files: str) -> list[str]:
     return list(node_parameters.warnings(values, load(configuration(files))))
 
 
-def file_of(namespace: str = "perception", port: int = 1993) -> str:
-    return FILE.replace("NAMESPACE", namespace).replace("PORT", str(port))
-
-
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        (file_of(), REPLACED),
-        (file_of("default", 1994), {
-            "cluster_config": "give --clusters",
-            "namespace": "'default' is not a namespace in policy/access-domains.yaml",
-            "k3d_image_registry": "set the field 'registry'",
-            "connections.communication_broker_params.edge.host":
-                "node 'edge' at service-mqtt-broker-edge:1994 is not in inventory/brokers.yaml",
-        }),
-        (OLDER, {
-            "helm_release_tag": "the GitOps controller removes releases",
-            "url_application_registry": "registry/charts.yaml names",
-            "applications": "are in the application definitions, appdefs/",
-            "connections.communication_broker.host": "broker:1883 is not in inventory/brokers.yaml",
-            "connections.init_comm_topics": "add /vehicles/vehicle00/pose to the field 'bridged'",
-        }),
-    ],
-    ids=["of the experiment", "that the state repo lacks", "older"],
-)  # fmt: skip
+@pytest.mark.parametrize("name", FILES)
 def test_parameters_of_the_reference_are_told_if_they_are_not_used(
-    ros: None, tmp_path: Path, text: str, expected: dict[str, str]
+    ros: None, tmp_path: Path, name: str
 ) -> None:
-    assert_warned(told(tmp_path, text), expected)
+    assert_warned(told(tmp_path, FILES[name]["text"]), FILES[name]["unused"])
 
 
 def test_the_page_names_the_images_as_the_registry_has_them(ros: None, tmp_path: Path) -> None:
     block = r"```yaml\n(# registry/images.yaml\n.*?)```"
     (images,) = re.findall(block, PAGE.read_text(), re.DOTALL)
     files = {"registry/images.yaml": images}
-    assert_warned(told(tmp_path, file_of(), **files), {"cluster_config": "give --clusters"})
+    assert_warned(
+        told(tmp_path, EXPERIMENT["text"], **files), {"cluster_config": "give --clusters"}
+    )
     # the names in object_detection_fusion_app.py and mqtt_connection.py of application_manager
     services = ("point_cloud_object_detection", "object_fusion", "k8s_configmap_watcher")
     assert {image.reference() for image in load(configuration(files)).images.values()} == {
@@ -134,7 +89,7 @@ def test_the_parameter_file_of_the_package_leaves_options_alone() -> None:
 
 def test_a_node_starts_with_the_file(tmp_path: Path, serve: Serve, ros_domain: int) -> None:
     file = tmp_path / "params.yml"
-    file.write_text(file_of())
+    file.write_text(EXPERIMENT["text"])
     args = ["--ros-args", "-r", "__node:=demandops", "--params-file", str(file)]
     served = serve(None, *args, "-p", "answer_timeout:=7.5")
     client = Client(ros_domain, "/fleet/deployment_request")
@@ -156,4 +111,4 @@ def test_a_node_starts_with_the_file(tmp_path: Path, serve: Serve, ros_domain: i
     assert (limits.from_value, limits.to_value) == (0.001, 86_400.0)
     log = served.log.read_text().splitlines()
     warned = [line.removeprefix("warning: ") for line in log if line.startswith("warning: ")]
-    assert_warned(warned, REPLACED)
+    assert_warned(warned, EXPERIMENT["unused"])

@@ -42,27 +42,13 @@ def _failing(scenario: str) -> str:
     return str(error.value)
 
 
-PUT = """
-must: show that it can fail
-steps:
-- send:
-    kind: Demand
-    demand: d
-    lease: 10m
-    requesters: [vehicle00]
-    applications:
-    - {id: edge/fusion, type: object-detection-fusion, node: edge,
-       inputs: {ego_data: [{topic: /ego, source: vehicle00}]}}
-"""
-
-
 @pytest.mark.parametrize(("claimed", "told"), WRONG["wrong"])
 def test_a_scenario_fails_where_something_else_comes_out(claimed: str, told: str) -> None:
-    assert told in _failing(f"{PUT}  {claimed}\n")
+    assert told in _failing(f"{WRONG['put']}  {claimed}\n")
 
 
 def test_a_refusal_must_be_the_one_that_is_expected() -> None:
-    bad = PUT.replace("node: edge", "node: egde")
+    bad = WRONG["put"].replace("node: edge", "node: egde")
     fault = "code: unknown-node, field: 'applications[0].node'"
     running.run(running.read(f"{bad}  refused: [{{{fault}, says: [edge]}}]\n", "scenario.yaml"))
     for claimed in (
