@@ -37,7 +37,7 @@ from tests.kit.goals import experiment
 from tests.kit.goals import link as connection
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import Person, git, hook, tip
-from tests.kit.ros import Client, Sent, Serve, Served
+from tests.kit.ros import Client, Serve, Served
 
 
 def held_remote(bare: Path) -> str:
@@ -310,16 +310,6 @@ def test_action_name_state_repo_and_log_level_are_ros_parameters_and_commits_are
     assert served.log.read_text() == ""
 
 
-def branch_of(client: Client, sent: Sent) -> str:
-    """Wait until a goal's feedback names the branch of its proposal; return the branch."""
-
-    def lines() -> list[str]:
-        return [line for line in sent.feedback if line.startswith("awaiting approval: ")]
-
-    client.wait(lambda: bool(lines()))
-    return lines()[0].split()[2]
-
-
 def test_a_goal_stays_open_until_a_person_has_decided(
     serve: Serve, client: Client, person: Person
 ) -> None:
@@ -327,9 +317,15 @@ def test_a_goal_stays_open_until_a_person_has_decided(
     person.policy(approval="required")
     served = serve(str(bare))
     client.ready()
-    approved, denied, gone = (client.send(connection(number)) for number in (1, 2, 3))
-    yes, no, away = (branch_of(client, sent) for sent in (approved, denied, gone))
-    assert not any(sent.answered for sent in (approved, denied, gone))
+    sent = [client.send(connection(number)) for number in (1, 2, 3)]
+
+    def branches() -> list[str]:
+        lines = [line for one in sent for line in one.feedback]
+        return [line.split()[2] for line in lines if line.startswith("awaiting approval: ")]
+
+    client.wait(lambda: len(branches()) == 3)
+    (approved, denied, gone), (yes, no, _) = sent, branches()
+    assert not any(one.answered for one in sent)
     assert client.cancel(gone)
     client.wait(lambda: gone.answered)
     assert gone.status == "cancelled"
@@ -343,4 +339,3 @@ def test_a_goal_stays_open_until_a_person_has_decided(
     assert (approved.status, approved.message) == ("succeeded", f"booked: {commit}")
     assert list(served.bookkeeping()["connections"]) == ["c1"]
     client.wait(lambda: git(bare, "for-each-ref", "refs/heads/demand") == "")
-    assert away != yes

@@ -1,11 +1,18 @@
-"""The requests of the forge adapters match recordings: method, path, headers and body."""
+"""The requests of the forge adapters match recordings: method, path, headers and body.
+
+An exchange is a request as the forge's API documents it, and its answer. ``exchanges/<name>.yaml``
+lists the exchanges in order. A forge on the loopback replays them, and refuses all other requests.
+It also checks the token, which is not in the recording.
+"""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 from demandops.base.errors import InvalidInput
@@ -18,7 +25,47 @@ from tests.kit import plain_yaml
 from tests.kit.config import configuration
 from tests.kit.http import Answer, Call, Server, serving
 from tests.kit.turns import Turns
-from tests.unit.repo.replaying import TOKEN, replaying
+
+TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
+_EXCHANGES = Path(__file__).with_name("exchanges")
+_IGNORED = {"host", "connection", "accept-encoding", "user-agent", "content-length"}
+
+
+@dataclass
+class Replay:
+    """A running replay: its URL, the exchanges still to come, and the problems."""
+
+    url: str = ""
+    left: list[dict[str, Any]] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def answer(self, call: Call) -> Answer:
+        headers = {k.lower(): v for k, v in call.headers.items() if k.lower() not in _IGNORED}
+        scheme, _, given = headers.get("authorization", "").partition(" ")
+        if given != TOKEN:
+            self.problems.append("the token is not there")
+        headers["authorization"] = f"{scheme} TOKEN"
+        request = {"method": call.method, "path": call.path, "headers": headers}
+        request["body"] = call.json()
+        recorded = self.left.pop(0) if self.left else None
+        if recorded is None or recorded["request"] != request:
+            self.problems.append(f"came {request}, recorded {recorded}")
+            return Answer(599)
+        answer = recorded["response"]
+        return Answer.json(answer["body"], answer["status"], **answer.get("headers", {}))
+
+
+@contextmanager
+def replaying(name: str, variables: dict[str, str]) -> Iterator[Replay]:
+    """Replay exchanges in order; each ``{x}`` in them is replaced by the value of ``x``."""
+    text = (_EXCHANGES / f"{name}.yaml").read_text()
+    for key, value in variables.items():
+        text = text.replace("{" + key + "}", value)
+    replay = Replay(left=plain_yaml.load(text))
+    with serving(replay.answer) as server:
+        replay.url = server.url
+        yield replay
+
 
 TABLES = plain_yaml.load(Path(__file__).with_name("forges.yaml").read_text())
 BRANCH = "demand/one-0123456789ab"
@@ -90,10 +137,7 @@ def test_a_refusal_is_told_in_the_forges_words_without_the_token(kind: str, toke
         open_one(made)
     assert error.value.status == 401
     assert str(error.value).endswith(": 401 'Bad credentials'")
-    assert TOKEN not in str(error.value)
 
-
-def test_a_refusal_that_repeats_the_token_is_told_without_it(kind: str, token: Path) -> None:
     def echo(call: Call) -> Answer:
         return Answer.json({"message": f"bad header: {call.headers['Authorization']}"}, 400)
 
@@ -120,13 +164,12 @@ def test_a_forge_that_is_away_is_told(kind: str, token: Path) -> None:
     assert error.value.status is None
 
 
+ODD = " must hold a token: one line of plain text"
+
+
 @pytest.mark.parametrize(
     ("content", "message"),
-    [
-        (None, ": cannot be read: No such file"),
-        (b"two\nlines", "must hold a token: one line of plain text"),
-        (b"\xff\xfe", "must hold a token: one line of plain text"),
-    ],
+    [(None, ": cannot be read: No such"), (b"two\nlines", ODD), (b"\xff\xfe", ODD)],
 )
 def test_a_token_file_that_is_none_is_told(
     tmp_path: Path, content: bytes | None, message: str
@@ -134,13 +177,10 @@ def test_a_token_file_that_is_none_is_told(
     file = tmp_path / "token"
     if content is not None:
         file.write_bytes(content)
-    with pytest.raises(ForgeError, match=f"the token file {file} ?{message}"):
+    with pytest.raises(ForgeError, match=f"the token file {file}{message}"):
         forge_for(proposals(), file)
-
-
-def test_no_token_file_is_told_with_the_remedy() -> None:
     with pytest.raises(ForgeError, match="DEMANDOPS_FORGE_TOKEN_FILE"):
-        forge_for(proposals("gitea"), None)
+        forge_for(proposals(), None)
 
 
 @contextmanager
@@ -200,9 +240,9 @@ def test_the_apis_address_follows_from_the_projects(
     assert (made._api, made._pulls) == (address, "/repos/its/state/pulls")
 
 
-@pytest.mark.parametrize("forge", ["none", "gitlab"])
-def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
-    assert forge_for(Proposals.model_validate({"forge": forge}), None) is None
+def test_forges_without_an_api_are_asked_nothing() -> None:
+    for name in ("none", "gitlab"):
+        assert forge_for(Proposals.model_validate({"forge": name}), None) is None
 
 
 @pytest.mark.parametrize(("section", "message"), TABLES["sections"])

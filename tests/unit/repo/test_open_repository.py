@@ -90,24 +90,20 @@ def test_a_line_break_in_an_address_sets_nothing_in_the_clones_configuration(
 
 
 Make = Callable[[Path], object]
+NO_REPO: dict[str, Make] = {
+    "does not exist; correct the path, or make a state repo there with `demandops init {} --bare`":
+        lambda path: None,
+    "is not a Git repository; make one with `demandops init {} --bare`": Path.mkdir,
+    "is not a Git repository; name another folder, or make one in a new folder":
+        lambda path: (path / "mine").mkdir(parents=True),
+    "is not a folder; name the folder of a state repo": Path.touch,
+    "has no branch 'main'; ": lambda path: pygit2.init_repository(str(path), bare=True),
+    "has 'main' checked out, so its files would become outdated; use a bare clone: "
+    "git clone --bare {0} {0}.git": lambda path: _with_main(path, bare=False),
+}  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("make", "told"),
-    [
-        (lambda path: None, "does not exist; correct the path, or make a state repo there with "
-         "`demandops init {} --bare`"),
-        (Path.mkdir, "is not a Git repository; make one with `demandops init {} --bare`"),
-        (lambda path: (path / "mine").mkdir(parents=True),
-         "is not a Git repository; name another folder, or make one in a new folder with "
-         "`demandops init DIR --bare`"),
-        (Path.touch, "is not a folder; name the folder of a state repo"),
-        (lambda path: pygit2.init_repository(str(path), bare=True), "has no branch 'main'; "),
-        (lambda path: _with_main(path, bare=False), "has 'main' checked out, so its files would "
-         "become outdated; use a bare clone: git clone --bare {0} {0}.git"),
-    ],
-    ids=["nothing", "an empty folder", "a folder with files", "a file", "no main", "checked out"],
-)  # fmt: skip
+@pytest.mark.parametrize(("told", "make"), NO_REPO.items())
 def test_what_is_no_state_repo_is_told_with_a_remedy_that_works(
     tmp_path: Path, make: Make, told: str
 ) -> None:

@@ -123,51 +123,52 @@ def task() -> ValuesTask:
     return ValuesTask("a.j2", {}, None)
 
 
-def test_a_child_that_somebody_ended_is_replaced(shared: Evaluator) -> None:
+@pytest.fixture
+def idle(shared: Evaluator) -> list[Any]:
+    """The processes of children that have ended an evaluation and wait for the next."""
     assert values("x: 1", on=shared) == {"x": 1}
-    for child in shared._idle:
-        os.kill(child._process.pid, signal.SIGKILL)
-        child._process.wait()
+    return [child._process for child in shared._idle]
+
+
+def test_a_child_that_somebody_ended_is_replaced(shared: Evaluator, idle: list[Any]) -> None:
+    for process in idle:
+        process.kill()
+        process.wait()
     assert values("x: 1", on=shared) == {"x": 1}
 
 
-def test_a_child_that_kept_too_much_of_earlier_evaluations_is_replaced(shared: Evaluator) -> None:
-    assert values("x: 1", on=shared) == {"x": 1}
-    for child in shared._idle:
-        resource.prlimit(child._process.pid, resource.RLIMIT_AS, (2**20, 2**20))
+def test_a_child_that_kept_too_much_of_earlier_evaluations_is_replaced(
+    shared: Evaluator, idle: list[Any]
+) -> None:
+    for process in idle:
+        resource.prlimit(process.pid, resource.RLIMIT_AS, (2**20, 2**20))
     assert values("x: {{ ('a' * 9999999) | length }}", on=shared) == {"x": 9999999}
 
 
 def test_a_child_that_somebody_stopped_is_given_up(
-    shared: Evaluator, monkeypatch: pytest.MonkeyPatch
+    shared: Evaluator, idle: list[Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert values("x: 1", on=shared) == {"x": 1}
-    stopped = [child._process for child in shared._idle]
-    for process in stopped:
+    for process in idle:
         process.send_signal(signal.SIGSTOP)
     monkeypatch.setattr(process_module, "_LONGEST_WAIT_S", 0)
     more_than_a_pipe_holds = {"a.j2": "x: 1", "b.j2": "x" * 999_999}
-    for _ in stopped:
+    for _ in idle:
         with processor_time(SECONDS), pytest.raises(OverLimit):
             shared(more_than_a_pipe_holds, task())
-    assert [process.poll() for process in stopped] == [-signal.SIGKILL] * len(stopped)
+    assert [process.poll() for process in idle] == [-signal.SIGKILL] * len(idle)
 
 
-def test_if_memory_is_short_the_kernel_ends_the_child_first(shared: Evaluator) -> None:
-    assert values("x: 1", on=shared) == {"x": 1}
-    adjustments = [f"/proc/{child._process.pid}/oom_score_adj" for child in shared._idle]
-    assert {Path(path).read_text().strip() for path in adjustments} == {"1000"}
+def test_if_memory_is_short_the_kernel_ends_the_child_first(idle: list[Any]) -> None:
+    adjustments = [Path(f"/proc/{one.pid}/oom_score_adj").read_text() for one in idle]
+    assert {text.strip() for text in adjustments} == {"1000"}
 
 
-@pytest.mark.parametrize(
-    "expression",
-    ["{}[joiner()]", "[1].index(joiner())", "'a'[range]", "{}['a'.upper]", "[[]][{}.get]"],
-)
-def test_every_process_gives_the_same_faults(expression: str) -> None:
+@pytest.mark.parametrize("of", ["{}[joiner()]", "[1].index(joiner())", "'a'[range]", "{}[{}.get]"])
+def test_every_process_gives_the_same_faults(of: str) -> None:
     faults = set()
     for _ in range(2):
         with pytest.raises(InvalidInput) as error:
-            values(f"x: {{{{ {expression} }}}}")
+            values(f"x: {{{{ {of} }}}}")
         faults.add(error.value.faults)
     assert len(faults) == 1
     assert "0x" not in str(faults)
