@@ -26,7 +26,6 @@ from tests.kit.terminal import terminal
 FOLDER = Path(__file__).parent / "expected"
 HELP = FOLDER / "help.txt"
 NOW = datetime(2026, 11, 23, 8, 0, tzinfo=timezone.utc)
-FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 
 _LISTED = plain_yaml.load(Path(__file__).with_name("commands.yaml").read_text())
 COMMANDS, CHANGING = tuple(_LISTED["unchanged"]), tuple(_LISTED["changing"])

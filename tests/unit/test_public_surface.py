@@ -28,7 +28,6 @@ INTERFACES = ROOT / "ros_bridge" / "interfaces"
 PAGE = (ROOT / "docs" / "public-api.md").read_text()
 PUBLIC = yaml.safe_load(Path(__file__).with_name("public_surface.yaml").read_text())
 
-EXPORTED = demandops_ros.__all__
 Json = dict[str, Any]
 
 

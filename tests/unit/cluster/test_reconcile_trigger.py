@@ -54,10 +54,6 @@ def test_a_file_names_each_cluster_and_how_it_is_reached(tmp_path: Path) -> None
     assert (clusters["a"].kubeconfig, clusters["b"].receiver) == (Path("/x"), "https://h/hook/1")
 
 
-SIGNED = "{receiver: 'http://h/hook', secret_file: SECRET}"
-SECRET_FILE = "clusters.a.secret_file"  # noqa: S105 - a field
-
-
 @pytest.mark.parametrize(("access", "secret", "mode", "field", "told"), TABLES["mistakes"])
 def test_a_file_that_cannot_be_used_is_told_with_field_and_remedy(
     tmp_path: Path, access: str, secret: str | None, mode: int, field: str, told: str
@@ -178,14 +174,11 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
 
 
 def test_an_odd_object_keeps_no_cluster_from_being_woken(api: KubeApi, tmp_path: Path) -> None:
-    state, _ = start("experiment")
     fetch_and_apply(api, "a")
     odd = {"lastAttemptedRevision": "main@sha1:a", "conditions": [None]}
     api.put("kustomizations", "perception", "perception", odd, spec=SOURCED)
-    waker = ReconcileTrigger({"c-its": reached(api, tmp_path)}, lambda since: ("", None))
-    waker(state.config)
-    wait_until(lambda: len(api.patches) == 1, "the call")
-    waker.close()
+    trigger("experiment", reached(api, tmp_path))
+    assert len(api.patches) == 1
 
 
 SECRET = "It's a Secret to Everybody"  # noqa: S105 - of an example
@@ -206,13 +199,11 @@ def secret_file(tmp_path: Path) -> Path:
     return file
 
 
-def test_the_signature_is_the_one_that_github_documents() -> None:
-    """Flux and Argo CD use GitHub's scheme; the values come from GitHub's documentation."""
+def test_a_receiver_of_flux_is_called_with_the_signature_that_github_documents(
+    hook: Server, secret_file: Path
+) -> None:
     documented = "757107ea0eb2509fc211221cce984b8a37570b6d7586c22c46f4379c8b043e17"
     assert signature(SECRET.encode(), b"Hello, World!") == f"sha256={documented}"
-
-
-def test_a_receiver_of_flux_is_called_with_a_signature(hook: Server, secret_file: Path) -> None:
     trigger("experiment", ClusterAccess(receiver=hook.url, secret_file=secret_file))
     call = hook.calls[0]
     assert call.headers["X-Signature"] == signature(SECRET.encode(), call.body)
@@ -274,16 +265,14 @@ def test_a_refused_webhook_is_logged_and_no_redirection_followed(
     assert SECRET not in caplog.text and "/hook" not in caplog.text
 
 
-@pytest.mark.parametrize(
-    ("case", "other", "needs"),
-    [("experiment", "webhook", "receiver"), ("argocd-experiment", "receiver", "webhook")],
-)
 def test_the_other_controller_s_webhook_is_not_called(
-    hook: Server, caplog: pytest.LogCaptureFixture, case: str, other: str, needs: str
+    hook: Server, caplog: pytest.LogCaptureFixture
 ) -> None:
-    trigger(case, ClusterAccess.model_validate({other: hook.url}))
+    trigger("experiment", ClusterAccess(webhook=hook.url))
+    trigger("argocd-experiment", ClusterAccess(receiver=hook.url))
     assert hook.calls == []
-    assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
+    for needs in ("receiver", "webhook"):
+        assert f"(it has neither a kubeconfig nor a {needs})" in caplog.text
 
 
 @pytest.mark.parametrize(("repo", "page"), TABLES["pages"])

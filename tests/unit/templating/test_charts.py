@@ -102,7 +102,6 @@ def test_a_schema_has_what_the_library_has_and_describes_it(chart: Path) -> None
 
 
 METADATA = f"appdefs/{APPDEF.name}/charts/object-detection/Chart.yaml"
-LIBRARY = "file://../../../charts/ros-service"
 
 
 @pytest.mark.parametrize(("path", "old", "new", "field", "told"), CHANGES["misfits"])

@@ -27,7 +27,6 @@ from tests.kit.memory import MemoryRepo
 
 FOLDER = "appdefs/object-detection-fusion"
 TEMPLATE = f"{FOLDER}/values/object-detection.yaml.j2"
-SCHEMA = f"{FOLDER}/charts/object-detection/values.schema.json"
 HERE = Path(__file__).parent
 ENDLESS = "{% for a in range(9999) %}" * 3 + "{% endfor %}" * 3
 SECONDS = 0.1
