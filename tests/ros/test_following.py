@@ -105,44 +105,29 @@ def test_another_node_that_serves_the_same_action_is_noticed(
     assert gone == f"no other node serves {DEFAULT_ACTION_NAME} any more"
 
 
-def address_in(served: Served, before: str) -> str:
-    """Return the address that follows ``before`` in the log."""
-    served.wait_for(before)
-    found = re.search(rf"{before}(http://127.0.0.1:[0-9]+/\w*)", served.log.read_text())
-    assert found is not None
-    return found[1]
-
-
-def test_a_push_that_the_webhook_reports_is_followed_at_once(
+def test_pushes_are_followed_by_a_webhook_and_the_page_shows_what_the_node_does(
     serve: Serve, client: Client, bare: Path
 ) -> None:
-    """The node does not poll, so it can learn of the push only by the webhook."""
-    args = ["--webhook", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
-    served = serve(f"file://{bare}", *args)
+    """Nothing polls the remote, so a push is known by the webhook alone, a commit by the node."""
+    args = ["--webhook", "127.0.0.1:0", "--web", "127.0.0.1:0"]
+    served = serve(f"file://{bare}", *args, "--ros-args", "-p", "fetch_interval:=0")
     client.ready()
+
+    def opened(after: str, path: str = "", data: bytes | None = None) -> str:
+        """Return the answer of the address that the log names after a text."""
+        served.wait_for(after)
+        found = re.search(rf"{after}(http://127.0.0.1:[0-9]+/\w*)", served.log.read_text())
+        assert found is not None
+        with urllib.request.urlopen(found[1] + path, data, PATIENCE_S) as answer:  # noqa: S310
+            return f"{answer.status} {answer.read().decode()}"
+
+    page = "the page of the state repo is at "
+    assert "Nothing is demanded" in opened(page)
     assert client.call(connection(1)).status == "succeeded"
+    client.wait(lambda: "1 in all" in opened(page, "connections"))
     brokers = read(bare, "inventory/brokers.yaml")
     GitRepo(bare).commit({"inventory/brokers.yaml": brokers.replace("broker-edge", "broker-moved")})
-    url = address_in(served, "listening for pushes at ")
-    with urllib.request.urlopen(url, data=b"{}", timeout=PATIENCE_S) as answer:  # noqa: S310
-        assert answer.status == 202
+    assert opened("listening for pushes at ", data=b"{}").startswith("202 ")
     follow = "A person DemandOps generator"
     client.wait(lambda: git(bare, "log", "-1", "--format=%an %cn", "main") == follow)
-    assert served.stop() == 0
-
-
-def test_the_node_shows_its_state_repo_on_a_page(serve: Serve, client: Client, bare: Path) -> None:
-    """Nothing polls the remote, so the page can learn of the node's commit only from the node."""
-    args = ["--web", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
-    served = serve(f"file://{bare}", *args)
-    client.ready()
-    url = address_in(served, "the page of the state repo is at ")
-
-    def shown(view: str) -> str:
-        with urllib.request.urlopen(f"{url}{view}", timeout=PATIENCE_S) as answer:  # noqa: S310
-            return str(answer.read().decode())
-
-    assert "Nothing is demanded" in shown("")
-    assert client.call(connection(1)).status == "succeeded"
-    client.wait(lambda: "1 in all" in shown("connections"))
     assert served.stop() == 0
