@@ -49,19 +49,9 @@ def test_each_function_on_the_path_of_a_demand_exists() -> None:
         assert callable(attrgetter(function)(import_module(module)))
 
 
-ROOT = Path(__file__).parents[2]
 TEST_FILES = sorted((ROOT / "tests").rglob("test_*.py"))
-TARGETS = (
-    "test",
-    "test-processes",
-    "test-packages",
-    "page",
-    "docs",
-    "simulate",
-    "faults",
-    "e2e",
-    "e2e-argocd",
-)
+PROCESSES = ("test-processes", "test-packages", "page", "docs", "simulate", "faults")
+TARGETS = ("test", *PROCESSES, "e2e", "e2e-argocd")
 
 
 @lru_cache
