@@ -4,29 +4,18 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
 from tests.kit import pages
+from tests.kit.repo import git
 
 ROOT = Path(__file__).parents[2]
-LISTED = subprocess.run(
-    ["git", "ls-files", "--cached", "--others", "--exclude-standard", "--", "*.md"],
-    cwd=ROOT,
-    capture_output=True,
-    text=True,
-    check=True,
-).stdout.split()
-PAGES = [
-    page
-    for page in LISTED
-    if not page.startswith(
-        ("docs/decisions/", "tests/", "state-repo-skeleton/", "CHANGELOG", "changelog.d/")
-    )
-]
+OTHERS = ("docs/decisions/", "tests/", "state-repo-skeleton/", "CHANGELOG", "changelog.d/")
+LIST = ("ls-files", "--cached", "--others", "--exclude-standard", "--", "*.md")
+PAGES = [page for page in git(ROOT, *LIST).split() if not page.startswith(OTHERS)]
 BLOCKS = {page: list(pages.blocks(ROOT.joinpath(page).read_text())) for page in PAGES}
 RUN = [page for page, found in BLOCKS.items() if any(block.tag == "run" for block in found)]
 

@@ -5,55 +5,40 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-import time
+from contextlib import ExitStack
 from pathlib import Path
 
-import rclpy
 from std_msgs.msg import Int32, String
 
 from tests.kit import pages
-from tests.kit.limits import PATIENCE_S
-from tests.kit.ros import reserved
+from tests.kit.ros import Client, reserved
 
 PAGE = Path(__file__).parents[2] / "docs" / "tutorial.md"
+ARGUMENTS = {
+    "density": ["/mast01/cars", "/mast01_density"],
+    "warning": ["/ring_road_warning", "/mast01_density", "/mast02_density"],
+}
 
 
 def test_counted_cars_become_a_warning(tmp_path: Path) -> None:
     scripts = {}
     for block in pages.blocks(PAGE.read_text()):
         if block.language == "python":
-            script = tmp_path / Path(block.title).name
+            script = scripts[Path(block.title).stem] = tmp_path / Path(block.title).name
             script.write_text(block.text)
-            scripts[script.stem] = str(script)
-    arguments = {
-        "density": ["/mast01/cars", "/mast01_density"],
-        "warning": ["/ring_road_warning", "/mast01_density", "/mast02_density"],
-    }
-    assert scripts.keys() == arguments.keys()
-    with reserved() as domain:
+    assert scripts.keys() == ARGUMENTS.keys()
+    with reserved() as domain, ExitStack() as stack:
         environment = os.environ | {"ROS_DOMAIN_ID": str(domain)}
-        services = [
-            subprocess.Popen([sys.executable, scripts[name], *topics], env=environment)
-            for name, topics in arguments.items()
-        ]
-        context = rclpy.Context()
-        rclpy.init(context=context, domain_id=domain)
-        try:
-            node = rclpy.create_node("bus01", context=context)
-            heard: list[str] = []
-            node.create_subscription(
-                String, "/ring_road_warning", lambda message: heard.append(message.data), 10
-            )
-            cars = node.create_publisher(Int32, "/mast01/cars", 10)
-            executor = rclpy.executors.SingleThreadedExecutor(context=context)
-            end = time.monotonic() + PATIENCE_S
-            while not heard and time.monotonic() < end:
-                cars.publish(Int32(data=30))
-                rclpy.spin_once(node, executor=executor, timeout_sec=0.1)
-            assert heard[:1] == ["queue ahead: /mast01_density is 30"]
-        finally:
-            for service in services:
-                service.kill()
-            for service in services:
-                service.wait()
-            rclpy.shutdown(context=context)
+        for name, topics in ARGUMENTS.items():
+            command = [sys.executable, scripts[name], *topics]
+            service = stack.enter_context(subprocess.Popen(command, env=environment))
+            stack.callback(service.kill)
+        bus = Client(domain)
+        stack.callback(bus.close)
+        heard: list[str] = []
+        bus.node.create_subscription(
+            String, "/ring_road_warning", lambda message: heard.append(message.data), 10
+        )
+        cars = bus.node.create_publisher(Int32, "/mast01/cars", 10)
+        bus.wait(lambda: cars.publish(Int32(data=30)) or bool(heard))
+    assert heard[0] == "queue ahead: /mast01_density is 30"

@@ -3,7 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
+
+from demandops.cluster.health import Health
+
+from tests.kit import plain_yaml
+
+Case = dict[str, Any]
+"""A row of a table in YAML: the objects in a cluster, and the health that they must give."""
 
 
 class Letters:
@@ -31,3 +39,36 @@ def deployment(name: str, *conditions: Any, of: str = "", **status: Any) -> dict
     whole = {"observedGeneration": 3, "updatedReplicas": 2, "availableReplicas": 2}
     found = whole | status | {"conditions": list(conditions)}
     return {"metadata": metadata, "spec": {"replicas": 2}, "status": found}
+
+
+def read_cases(module: str, name: str) -> dict[str, list[Case]]:
+    """Return the tables of a YAML file beside a test module."""
+    tables: dict[str, list[Case]] = plain_yaml.load(Path(module).with_name(name).read_text())
+    return tables
+
+
+def deployments(case: Case) -> dict[tuple[str, str, str], dict[str, Any]]:
+    """Return the Deployments of a case; ``tracked`` is Argo CD's name of what they belong to."""
+    found = {}
+    for name, fields in case.get("deployments", {}).items():
+        status = {**fields}
+        conditions = [condition(*one) for one in status.pop("conditions", ())]
+        tracked = {"argocd.argoproj.io/tracking-id": status.pop("tracked", "")}
+        generation, replicas = status.pop("generation", 3), status.pop("replicas", 2)
+        made = deployment(name, *conditions, **status)
+        made["metadata"] |= {"annotations": tracked, "generation": generation}
+        made["spec"]["replicas"] = replicas
+        found["Deployment", "ns", name] = made
+    return found
+
+
+def told(health: Health, case: Case) -> Case:
+    """Return the case with the health that was found; what differs is then shown as a whole."""
+    found: Case = {**case, "state": health.state, "reason": health.reason, "object": health.object}
+    if health.reason.startswith(case.get("reason", "-")):
+        found["reason"] = case["reason"]
+    if health.failing:
+        found["failing"] = True
+    return {
+        name: value for name, value in found.items() if name in case or (value and name != "object")
+    }

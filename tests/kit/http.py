@@ -65,7 +65,7 @@ def running(server: ThreadingHTTPServer) -> Iterator[str]:
 
 
 @contextmanager
-def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
+def serving(answer: Callable[[Call], Answer] | None = None, port: int = 0) -> Iterator[Server]:
     """Run an HTTP server for the length of a block; it records and answers one call at a time."""
     served = Server() if answer is None else Server(answer)
     lock = threading.Lock()
@@ -95,7 +95,7 @@ def serving(answer: Callable[[Call], Answer] | None = None) -> Iterator[Server]:
 
         do_GET = do_POST = do_PUT = do_PATCH = do_DELETE = _serve
 
-    with running(ThreadingHTTPServer(("127.0.0.1", 0), Recorder)) as served.url:
+    with running(ThreadingHTTPServer(("127.0.0.1", port), Recorder)) as served.url:
         yield served
 
 

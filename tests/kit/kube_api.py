@@ -25,6 +25,8 @@ class KubeApi:
         self.closed = False
         self.patches: list[tuple[str, Item]] = []
         """The path and the body of each patch."""
+        self.reads = 0
+        """How often objects were listed; what changes later is watched."""
         self._changed = threading.Condition()
         self._items: dict[tuple[str, str, str], Item] = {}
         self._log: list[tuple[str, str, Item]] = []
@@ -53,6 +55,7 @@ class KubeApi:
 
     def listed(self, plural: str, namespace: str) -> Item:
         with self._changed:
+            self.reads += 1
             found = [item for key, item in self._items.items() if key[:2] == (plural, namespace)]
             return {"metadata": {"resourceVersion": str(len(self._log))}, "items": found}
 

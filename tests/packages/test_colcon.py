@@ -28,31 +28,20 @@ pytestmark = [
     pytest.mark.skipif(shutil.which("cmake") is None, reason="CMake is not installed"),
 ]
 
-IMPORT = """
-import application_manager_interfaces, demandops_interfaces
+LOOK_UP = """
+import application_manager_interfaces, demandops, demandops_interfaces, demandops_ros
+from ament_index_python.packages import get_package_prefix, get_package_share_directory
 from application_manager_interfaces.action import DeploymentRequest
 from demandops_interfaces.srv import GetBookkeeping
 from rclpy.type_support import check_for_type_support
 
 check_for_type_support(DeploymentRequest)
 check_for_type_support(GetBookkeeping)
-print(application_manager_interfaces.__file__)
-print(demandops_interfaces.__file__)
-"""
-
-
-LOOK_UP = (
-    sys.executable,
-    "-c",
-    """
-import demandops, demandops_ros
-from ament_index_python.packages import get_package_prefix, get_package_share_directory
-
-print(demandops.__file__, demandops_ros.__file__, sep="\\n")
+for module in (application_manager_interfaces, demandops, demandops_interfaces, demandops_ros):
+    print(module.__file__)
 print(get_package_share_directory("demandops_ros"))
-print(get_package_prefix("demandops_ros") + "/lib/demandops_ros/serve")
-""",
-)
+print(get_package_prefix("demandops_ros"))
+"""
 SITE = Path("lib", f"python{sys.version_info[0]}.{sys.version_info[1]}", "site-packages")
 SKELETON = ("skeleton", "state-repo-skeleton")
 
@@ -75,49 +64,38 @@ def run(command: list[str], folder: Path) -> str:
     return result.stdout
 
 
-def build(folder: Path) -> None:
-    assert COLCON is not None
-    prefix = f"-DCMAKE_PREFIX_PATH={sys.prefix}"
-    python = f"-DPython3_EXECUTABLE={sys.executable}"
-    run([COLCON, "build", "--cmake-args", prefix, python, "-DBUILD_TESTING=OFF"], folder)
-
-
-def test_the_packages_build_with_colcon_and_import_from_its_install_space(tmp_path: Path) -> None:
-    shutil.copytree(BRIDGE / "interfaces", tmp_path / "src")
-    build(tmp_path)
-    script = f". install/setup.sh && {shlex.join([sys.executable, '-c', IMPORT])}"
-    places = run(["sh", "-c", script], tmp_path).splitlines()
-    assert places == [
-        str(tmp_path / "install" / package / SITE / package / "__init__.py")
-        for package in ("application_manager_interfaces", "demandops_interfaces")
-    ]
-    # A colcon build includes the C++ headers, so a C++ node may use the interfaces too.
-    header = Path("include", "demandops_interfaces", "demandops_interfaces", "srv")
-    assert (
-        tmp_path / "install" / "demandops_interfaces" / header / "get_bookkeeping.hpp"
-    ).is_file()
-
-
-def test_the_package_of_the_node_brings_its_code_its_data_and_its_launch_file(
+def test_the_packages_build_with_colcon_and_bring_code_data_and_launch_files(
     tmp_path: Path,
 ) -> None:
-    tmp_path.joinpath("src").mkdir()
+    shutil.copytree(BRIDGE / "interfaces", tmp_path / "src")
     tmp_path.joinpath("src", "demandops_ros").symlink_to(BRIDGE / "ros_package")
-    build(tmp_path)
-    installed = tmp_path / "install" / "demandops_ros"
-    found = run(["sh", "-c", f". install/setup.sh && {shlex.join([*LOOK_UP])}"], tmp_path)
-    assert found.splitlines() == [
-        str(installed / SITE / "demandops" / "__init__.py"),
-        str(installed / SITE / "demandops_ros" / "__init__.py"),
-        str(installed / "share" / "demandops_ros"),
-        str(installed / "lib" / "demandops_ros" / "serve"),
+    assert COLCON is not None
+    options = [f"-DCMAKE_PREFIX_PATH={sys.prefix}", f"-DPython3_EXECUTABLE={sys.executable}"]
+    run([COLCON, "build", "--cmake-args", *options, "-DBUILD_TESTING=OFF"], tmp_path)
+
+    def ran(*command: str) -> str:
+        return run(["sh", "-c", f". install/setup.sh && {shlex.join(command)}"], tmp_path)
+
+    install = tmp_path / "install"
+    node = install / "demandops_ros"
+    *modules, share, prefix = ran(sys.executable, "-c", LOOK_UP).splitlines()
+    assert modules == [
+        str(install / package / SITE / module / "__init__.py")
+        for package, module in (
+            ("application_manager_interfaces", "application_manager_interfaces"),
+            ("demandops_ros", "demandops"),
+            ("demandops_interfaces", "demandops_interfaces"),
+            ("demandops_ros", "demandops_ros"),
+        )
     ]
-    data = installed / SITE / "demandops" / "_data"
+    assert (share, prefix) == (str(node / "share" / "demandops_ros"), str(node))
+    # a colcon build includes the C++ headers, so a C++ node may use the interfaces too
+    headers = Path("include", "demandops_interfaces", "demandops_interfaces", "srv")
+    assert (install / "demandops_interfaces" / headers / "get_bookkeeping.hpp").is_file()
+    data = node / SITE / "demandops" / "_data"
     for name, folder in (("templates", "templates"), ("appdefs", "appdefs"), SKELETON):
         assert files_of(data / name) == files_of(BRIDGE.parent / folder)
-    assert files_of(installed / "share" / "demandops_ros") >= {
-        Path("launch/demandops.launch.xml"),
-        Path("config/params.yaml"),
-    }
-    served = run(["sh", "-c", f". install/setup.sh && {found.splitlines()[-1]} --help"], tmp_path)
+    launched = {Path("launch/demandops.launch.xml"), Path("config/params.yaml")}
+    assert files_of(Path(share)) >= launched
+    served = ran(str(node / "lib" / "demandops_ros" / "serve"), "--help")
     assert served.startswith("Usage: demandops serve [OPTIONS]")

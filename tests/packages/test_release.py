@@ -1,4 +1,4 @@
-"""`make release` builds a wheel that works, of one version and with a changelog that tells all."""
+"""`make release` builds a wheel that works and has all data, and tells all changes."""
 
 from __future__ import annotations
 
@@ -19,23 +19,20 @@ ROOT = Path(__file__).parents[2]
 NAME = f"demandops-{demandops.__version__}"
 
 
+def release(script: Path, *args: str) -> subprocess.CompletedProcess[str]:
+    env = os.environ | {"PYTHON": sys.executable}
+    return subprocess.run([script, *args], env=env, capture_output=True, text=True, check=False)
+
+
 def test_everything_has_the_same_version() -> None:
-    manifests = (
-        "ros_bridge/ros_package/package.xml",
-        "ros_bridge/interfaces/demandops_interfaces/package.xml",
-    )
     chart = yaml.safe_load(ROOT.joinpath("deploy/chart/Chart.yaml").read_text())
-    found = {path: _version(path) for path in manifests} | {
-        "the chart": chart["version"],
-        "the chart's app": chart["appVersion"],
-    }
-    assert set(found.values()) == {demandops.__version__}, found
-    assert f'\nversion = "{demandops.__version__}"\n' in ROOT.joinpath("pyproject.toml").read_text()
-
-
-def _version(manifest: str) -> str | None:
-    found = re.search("<version>(.*)</version>", ROOT.joinpath(manifest).read_text())
-    return found and found[1]
+    assert chart["version"] == chart["appVersion"] == demandops.__version__
+    for path, line in {
+        "ros_bridge/ros_package/package.xml": "<version>{}</version>",
+        "ros_bridge/interfaces/demandops_interfaces/package.xml": "<version>{}</version>",
+        "pyproject.toml": '\nversion = "{}"\n',
+    }.items():
+        assert line.format(demandops.__version__) in ROOT.joinpath(path).read_text(), path
 
 
 def test_each_change_that_no_release_has_told_has_a_group() -> None:
@@ -61,13 +58,7 @@ def test_no_release_leaves_a_change_untold(tmp_path: Path, section: str, told: s
     script = shutil.copy(ROOT / "deploy" / "release", tmp_path / "deploy")
     (tmp_path / "CHANGELOG.md").write_text(f"# Changelog\n\n{section}\n")
     (tmp_path / "changelog.d" / "odd-names.audit.md").write_text("Odd names are refused.\n")
-    done = subprocess.run(
-        [script],
-        env=os.environ | {"PYTHON": sys.executable},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = release(script)
     assert (done.returncode, done.stdout) == (1, ""), done
     assert told in done.stderr
 
@@ -75,20 +66,130 @@ def test_no_release_leaves_a_change_untold(tmp_path: Path, section: str, told: s
 @pytest.mark.slow
 @pytest.mark.limit(600)
 def test_a_release_is_built_and_tried_in_an_empty_environment(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [str(ROOT / "deploy" / "release"), str(tmp_path)],
-        env=os.environ | {"PYTHON": sys.executable},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = release(ROOT / "deploy" / "release", str(tmp_path))
     assert done.returncode == 0, done.stderr
     assert "release: a state repo, a check of it, a demand\nrelease: ready: " in done.stdout
     assert zipfile.is_zipfile(tmp_path / f"{NAME}-py3-none-any.whl")
     with tarfile.open(tmp_path / f"{NAME}.tar.gz") as sdist:
         assert f"{NAME}/pyproject.toml" in sdist.getnames()
     with tarfile.open(tmp_path / f"{NAME}-docs.tar.gz") as docs:
-        assert {f"{NAME}-docs/index.html", f"{NAME}-docs/generated/commands.html"} <= set(
-            docs.getnames()
-        )
+        pages = {f"{NAME}-docs/{page}.html" for page in ("index", "generated/commands")}
+        assert pages <= {*docs.getnames()}
     subprocess.run(["sha256sum", "--check", "--quiet", f"{NAME}.sha256"], cwd=tmp_path, check=True)
+
+
+CONTAINER_FILE = ROOT / "deploy" / "Containerfile"
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("wheel")
+    sources = folder / "sources"  # setuptools would leave its build folder in the checkout
+    sources.mkdir()
+    for line in CONTAINER_FILE.read_text().splitlines():
+        command, *names = line.split() or [""]
+        for name in names[:-1] if command == "COPY" else ():
+            (sources / name).parent.mkdir(exist_ok=True)
+            if (ROOT / name).is_dir():
+                skipped = shutil.ignore_patterns("__pycache__", "*.egg-info")
+                shutil.copytree(ROOT / name, sources / name, ignore=skipped)
+            else:
+                shutil.copy(ROOT / name, sources / name)
+    options = ["-q", "--no-deps", "-w", str(folder)]
+    command = [sys.executable, "-m", "pip", "wheel", *options, str(sources)]
+    subprocess.run(command, check=True)
+    return next(folder.glob("demandops-*.whl"))
+
+
+def test_the_wheel_carries_all_data_files_and_no_others(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for folder, prefix in (
+        ("templates", "demandops/_data/templates/"),
+        ("appdefs", "demandops/_data/appdefs/"),
+        ("state-repo-skeleton", "demandops/_data/skeleton/"),
+        ("generator/demandops/web/pages", "demandops/web/pages/"),
+        ("generator/demandops/web/static", "demandops/web/static/"),
+    ):
+        top = ROOT / folder
+        files = {path.relative_to(top).as_posix() for path in top.rglob("*") if path.is_file()}
+        assert {n.removeprefix(prefix) for n in names if n.startswith(prefix)} == files
+    assert not [name for name in names if name.startswith(("tests/", "examples/", "docs/"))]
+
+
+def test_the_wheel_installs_the_versions_that_it_was_tested_with(wheel: Path) -> None:
+    """The pipelines of a state repo give pip this file (tests/integration/test_pipelines.py)."""
+    packed = zipfile.ZipFile(wheel)
+    (name,) = [name for name in packed.namelist() if name.endswith("constraints.txt")]
+    assert name.partition(".data/")[2] == "data/share/demandops/constraints.txt"
+    assert packed.read(name) == (ROOT / "constraints.txt").read_bytes()
+
+
+def test_ros_finds_its_package_below_the_prefix_of_the_wheel(wheel: Path, tmp_path: Path) -> None:
+    """PyPI has neither `ros2 run` nor `ros2 launch`, so the test only looks up what they need."""
+    packages = pytest.importorskip("ament_index_python.packages")
+    # without --ignore-installed pip would remove the package under test from its environment
+    options = ["-q", "--no-deps", "--no-index", "--ignore-installed", "--prefix", str(tmp_path)]
+    subprocess.run([sys.executable, "-m", "pip", "install", *options, str(wheel)], check=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
+        assert packages.get_package_prefix("demandops_ros") == str(tmp_path)
+        share = Path(packages.get_package_share_directory("demandops_ros"))
+    assert {path.relative_to(share).as_posix() for path in share.rglob("*.*")} == {
+        "package.xml",
+        "config/detector_params.yaml",
+        "config/params.yaml",
+        "launch/demandops.launch.xml",
+        "launch/detector.launch.xml",
+        "launch/parameter_sync.launch.xml",
+    }
+    for program in ("detect", "parameter_sync", "serve"):
+        assert os.access(tmp_path / "lib" / "demandops_ros" / program, os.X_OK)
+
+
+SCRIPT = Path(__file__).parents[2] / "deploy" / "fresh-root"
+STAND_INS = {
+    "debootstrap": 'echo "$@" >"$CALLED"; mkdir -p "$3/etc/apt"',
+    "chroot": "",
+    "mount": "",
+    "umount": "",
+    "apt-get": """
+test "$1" = indextargets
+[ -e "$SOURCES" ] && cat "$SOURCES" || exit 0""",
+}
+
+
+LINES = Path("/etc/os-release").read_text().splitlines()
+RELEASE = dict(line.split("=", 1) for line in LINES if "=" in line)["VERSION_CODENAME"]
+MIRROR = "http://mirror.invalid"
+
+
+@pytest.mark.parametrize("has_sources", [True, False])
+def test_it_has_the_release_and_the_sources_of_the_machine(
+    tmp_path: Path, has_sources: bool
+) -> None:
+    root, called, sources = (tmp_path / name for name in ("root", "called", "sources"))
+    if has_sources:
+        sources.write_text(
+            f"{RELEASE}-security {MIRROR}/security main\n"
+            f"{RELEASE} {MIRROR}/packages main\n"
+            f"{RELEASE} {MIRROR}/packages contrib\n"
+            f"other {MIRROR}/other main\n"
+        )
+    for name, text in STAND_INS.items():
+        (tmp_path / name).write_text(f"#!/bin/sh\n{text}\n")
+        (tmp_path / name).chmod(0o755)
+    environment = {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
+    environment |= {"SOURCES": str(sources), "CALLED": str(called)}
+    command = ["sh", str(SCRIPT), str(root)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    if not has_sources:
+        assert (done.returncode, called.exists()) == (1, False)
+        assert f"apt has no source of {RELEASE}" in done.stderr
+        return
+    assert done.returncode == 0, done.stderr
+    assert called.read_text() == f"--variant=minbase {RELEASE} {root} {MIRROR}/packages\n"
+    assert (root / "etc/apt/sources.list").read_text().splitlines() == [
+        f"deb {MIRROR}/packages {RELEASE} contrib",
+        f"deb {MIRROR}/packages {RELEASE} main",
+        f"deb {MIRROR}/security {RELEASE}-security main",
+    ]

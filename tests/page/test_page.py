@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import threading
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
@@ -17,54 +17,91 @@ from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from playwright.sync_api import Browser, Route, expect
 
-from tests.kit.browser import Visit
+from tests.kit import repo
+from tests.kit.browser import Visit, chromium
 from tests.kit.generator import book
-from tests.kit.page_story import FAILING, Story, leased, released
-from tests.page.conftest import FIGURES, Visits
+from tests.kit.http import Answer, serving
+from tests.kit.limits import PATIENCE_S
+from tests.kit.page_story import FAILING, Story, leased, released, story
+
+expect.set_options(timeout=PATIENCE_S * 1000)
+
+
+@pytest.fixture(scope="module")
+def fleet(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Story]:
+    folder = tmp_path_factory.mktemp("fleet")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DEMANDOPS_DATA_HOME", str(folder / "home"))
+        with story(repo.init(folder / "fleet.git"), folder) as told:
+            yield told
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Browser]:
+    with chromium() as running:
+        yield running
+
+
+Visits = Callable[..., Visit]
+
+
+@pytest.fixture
+def visit(browser: Browser, fleet: Story) -> Iterator[Visits]:
+    """Return a function that opens the page in the browser and returns the :class:`Visit`.
+
+    After the test, the fixture checks that the page called no other host and reported no error.
+    """
+    made: list[Visit] = []
+
+    def start(**options: Any) -> Visit:
+        made.append(Visit(browser, fleet.url, **options))
+        return made[-1]
+
+    yield start
+    for one in made:
+        one.close()
+    assert {host for one in made for host in one.hosts} <= {fleet.url.removeprefix("http://")}
+    assert [text for one in made for text in one.complaints] == []
+
+
+FIGURES = Path(__file__).parents[2] / "docs" / "figures"
+
 
 BUILD = Path(__file__).parents[2] / "build" / "page"
-VIEWS = {
-    "not-ready": "/",
-    "map": "/map",
-    "map-of-a-vehicle": "/map?q=vehicle00",
-    "demands": "/demands",
-    "services": "/services",
-    "connections": "/connections",
-    "leases": "/leases",
-    "timeline": "/timeline",
-    "moment": "/timeline?at=HEAD~2",
-    "release": f"/release?name={FAILING}",
-    "demand": "/demand?id=vehicle01-to-cloud",
-    "overrides": "/overrides",
-    "rates": "/rates",
-}
+VIEWS = [
+    *("", "map", "map?q=vehicle00", "demands", "services", "connections", "leases", "timeline"),
+    *("timeline?at=HEAD~2", f"release?name={FAILING}", "demand?id=vehicle01-to-cloud"),
+    *("overrides", "rates"),
+]
 SERIOUS = ("serious", "critical")
+
+
+def picture(view: str, of: str) -> Path:
+    """Return the file for a screenshot of a view, which people may look at."""
+    BUILD.mkdir(parents=True, exist_ok=True)
+    return BUILD / f"{re.sub(r'[^a-z0-9]+', '-', view.lower()) or 'start'}-{of}.png"
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 def test_every_view_is_accessible(visit: Visits, scheme: str) -> None:
     """axe-core finds nothing serious in any view; the fixture `visit` checks the console too."""
-    BUILD.mkdir(parents=True, exist_ok=True)
-    seen = visit(color_scheme=scheme)
-    axe = Axe()
-    for name, path in VIEWS.items():
-        page = seen.open(path)
+    seen, axe = visit(color_scheme=scheme), Axe()
+    for view in VIEWS:
+        page = seen.open(f"/{view}")
         expect(page.locator("main h1")).to_be_visible()
         page.evaluate("document.querySelectorAll('details').forEach((one) => { one.open = true })")
-        found = axe.run(page).response["violations"]
-        assert [
-            (one["id"], one["nodes"][0]["html"]) for one in found if one["impact"] in SERIOUS
-        ] == []
-        seen.open(path).screenshot(path=BUILD / f"{name}-{scheme}.png")
+        found = [one for one in axe.run(page).response["violations"] if one["impact"] in SERIOUS]
+        assert [(one["id"], one["nodes"][0]["html"]) for one in found] == []
+        seen.open(f"/{view}").screenshot(path=picture(view, scheme))
 
 
 def test_every_view_fits_a_phone(visit: Visits) -> None:
     seen = visit(width=390)
-    for name, path in VIEWS.items():
-        page = seen.open(path)
-        page.screenshot(path=BUILD / f"{name}-phone.png")
+    for view in VIEWS:
+        page = seen.open(f"/{view}")
+        page.screenshot(path=picture(view, "phone"))
         width = page.evaluate("document.documentElement.scrollWidth")
-        assert width <= 390, f"{path} is {width} wide"
+        assert width <= 390, f"{view} is {width} wide"
 
 
 def test_the_first_view_tells_why_since_when_and_who(visit: Visits) -> None:
@@ -73,9 +110,7 @@ def test_the_first_view_tells_why_since_when_and_who(visit: Visits) -> None:
     expect(cause).to_contain_text("object-detection on edge for vehicle00 fails")
     expect(cause).to_contain_text("manifest unknown")
     expect(cause.locator("time")).to_have_text(re.compile(r"^1\dm ago$"))
-    expect(cause.locator("dd").first).to_contain_text(
-        "robotkube-object-detection:2025-04: push the image"
-    )
+    expect(cause.locator("dd").first).to_contain_text("object-detection:2025-04: push the image")
     expect(cause).to_contain_text("edge/object_detection_fusion")
 
 
@@ -179,16 +214,6 @@ def test_what_changes_between_the_page_and_its_first_event_is_shown(
     expect(page.locator("main")).to_contain_text("just-now")
 
 
-class _Away(BaseHTTPRequestHandler):
-    """Answers 502 to each request, as a reverse proxy does while its server is down."""
-
-    def do_GET(self) -> None:
-        self.send_error(502)
-
-    def log_message(self, *args: object) -> None:
-        pass
-
-
 def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet: Story) -> None:
     def serve(address: str) -> WebServer:
         return WebServer(address, "--listen", Follower(Reader.of(str(fleet.bare)), {}, 0))
@@ -198,15 +223,12 @@ def test_the_page_follows_again_when_its_server_is_back(browser: Browser, fleet:
     page, address = visit.open("/demands"), urlsplit(server.url).netloc
     expect(page.locator("#live")).to_have_text("live")
     server.close()
-    host, port = address.split(":")
-    with ThreadingHTTPServer((host, int(port)), _Away) as proxy:
-        thread = threading.Thread(target=proxy.serve_forever)
-        thread.start()
+    # as a reverse proxy while its server is down; after a 502 the browser reopens no stream itself
+    port = address.rpartition(":")[2]
+    with serving(lambda call: Answer(502), int(port)):
         expect(page.locator("#live")).to_have_text("not current: waiting for the server")
         with page.expect_response(lambda answer: answer.status == 502):
-            pass  # after a 502 the browser itself never reopens its stream of events
-        proxy.shutdown()
-        thread.join()
+            pass
     book(fleet.generator, leased("meanwhile", "vehicle03"))
     server = serve(address)
     expect(page.locator("main")).to_contain_text("meanwhile")
@@ -227,12 +249,10 @@ def test_a_demand_that_ended_is_not_shown_any_longer(browser: Browser, fleet: St
 
 
 def test_the_figures_of_the_docs_come_from_here(visit: Visits, tmp_path: Path) -> None:
-    for name in ("page", "page-map"):
-        path = {"page": "/", "page-map": "/map?q=vehicle00"}[name]
+    for name, path in {"page": "/", "page-map": "/map?q=vehicle00"}.items():
         file = tmp_path / f"{name}.png"
-        visit(width=1180).open(path).screenshot(
-            path=file, clip={"x": 0, "y": 0, "width": 1180, "height": 620}
-        )
+        clip = {"x": 0, "y": 0, "width": 1180, "height": 620}
+        visit(width=1180).open(path).screenshot(path=file, clip=clip)
         assert file.stat().st_size < 200_000
         if os.environ.get("FIGURES"):
             FIGURES.mkdir(exist_ok=True)

@@ -6,17 +6,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
-import yaml
 from demandops_ros import DemandClient
 
 from tests.kit import sync
 from tests.kit.generator import wait_until
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import POLICY, GitRepo, init, read, tip
+from tests.kit.repo import GitRepo, init, tip
 from tests.kit.ros import Client, Serve, Served, Servers, reserved
 from tests.kit.warm_commands import WarmCommands
-
-APPDEFS = Path(__file__).parents[1] / "appdefs"
+from tests.scenarios import running
 
 
 @pytest.fixture(scope="session")
@@ -67,37 +65,18 @@ def client(ros_domain: int) -> Iterator[Client]:
 def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
     """A node that serves many tests; each test uses ids of its own.
 
-    The node's state repo has the recorder as a further type of application, and a policy rule that
-    names the requesters.
+    The node's state repo has the recorder as a further type of application.
     """
     folder = tmp_path_factory.mktemp("shared")
     bare = init(folder / "state.git")
     sync.force_in(bare, False)
-    policy = yaml.safe_load(read(bare, POLICY))
-    rule = {"name": "known", "requesters": ["vehicle*", "station*", "r*"]}
-    policy["domains"][0] |= {"rules": [rule]}
-    changed = GitRepo(bare).commit(_recorder(bare) | {POLICY: yaml.safe_dump(policy)})
+    changed = GitRepo(bare).commit({**running.configuration(["recorder"])})
     with reserved() as domain:
         servers = Servers(folder, domain, DEMANDOPS_DATA_HOME=str(folder / "home"))
         served = servers.start(str(bare))
         wait_until(lambda: tip(bare) != changed, "the node has followed the change")
         yield served
         servers.kill()
-
-
-def _recorder(bare: Path) -> dict[str, str | None]:
-    """Return the files that add the recorder to a state repo: YAML and charts, no code."""
-    charts, images = "registry/charts.yaml", "registry/images.yaml"
-    files: dict[str, str | None] = {
-        f"appdefs/{path.relative_to(APPDEFS).as_posix()}": path.read_text()
-        for folder in ("recorder", "driver")
-        for path in sorted((APPDEFS / folder).rglob("*"))
-        if path.is_file()
-    }
-    chart = "  recorder:\n    folder: appdefs/recorder/charts/recorder\n    version: 0.1.0\n"
-    image = "  {0}:\n    repository: ghcr.io/example/{0}\n    tag: v1\n"
-    added = "".join(image.format(name) for name in ("driver", "recorder"))
-    return files | {charts: read(bare, charts) + chart, images: read(bare, images) + added}
 
 
 @pytest.fixture(scope="session")

@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import rclpy
 import yaml
-from demandops.base import strict_yaml
+from builtin_interfaces.msg import Time
 from demandops.detect.rule_file import read
 from demandops_ros.detector.detector_node import DetectorNode
 from diagnostic_msgs.msg import DiagnosticArray
@@ -25,7 +25,7 @@ from rclpy.executors import SingleThreadedExecutor
 from rosgraph_msgs.msg import Clock
 
 from examples.experiment import paper
-from tests.kit.detection import POSE
+from tests.kit.detection import POSE, text_of
 from tests.kit.generator import wait_until
 from tests.kit.goals import put
 from tests.kit.limits import PATIENCE_S
@@ -44,7 +44,11 @@ S, V0, V1, V2, V3 = paper.S, paper.V0, paper.V1, paper.V2, paper.V3
 
 
 class Fleet:
-    """Vehicles that publish their poses ten times a second, while a test waits in `until`."""
+    """Vehicles that publish their poses ten times a second, while a test waits in `until`.
+
+    They publish a simulated time too, unless ``is_timeless``. It runs ``pace`` times as fast as the
+    real one, and never more than `_MOST_AHEAD_S` ahead of what the detector has reported.
+    """
 
     def __init__(self, domain: int) -> None:
         self._context = rclpy.Context()
@@ -57,13 +61,8 @@ class Fleet:
         self.statuses: dict[str, Any] = {}
         self.node.create_subscription(DiagnosticArray, "/diagnostics", self._hear, 10)
         self._clock = self.node.create_publisher(Clock, "/clock", 10)
-        self._seconds, self.pace = 1000.0, 1.0
-        """The simulated time in seconds, and its speed relative to the real time."""
-        self._limit = inf
-        """The simulated time stops here until the detector has reported a later time."""
-        self._since = 0.0
-        self.is_timeless = False
-        """If true, the fleet does not publish the simulated time."""
+        self.pace, self.is_timeless = 1.0, False
+        self._seconds, self._limit, self._since = 1000.0, inf, 0.0
         self.node.create_timer(0.1, self._publish)
 
     def _hear(self, message: Any) -> None:
@@ -80,27 +79,24 @@ class Fleet:
             self._publishers[vehicle] = self.node.create_publisher(PoseStamped, topic, 10)
         self._away[vehicle] = away
 
+    def mute(self, vehicle: str) -> None:
+        del self._away[vehicle]
+
     def forget(self) -> None:
         """Discard the last detector's reports, so that `until` waits for the next detector's."""
         self.statuses.clear()
         self._limit, self._since = inf, self._seconds
-
-    def mute(self, vehicle: str) -> None:
-        del self._away[vehicle]
 
     def _publish(self) -> None:
         for vehicle, away in self._away.items():
             message = PoseStamped()
             message.pose.position.x, message.pose.position.y = STATION[0] + away, STATION[1]
             self._publishers[vehicle].publish(message)
-        if self.is_timeless:
-            return
-        if self._seconds < self._limit:
-            self._seconds += 0.1 * self.pace
-        message = Clock()
-        message.clock.sec = int(self._seconds)
-        message.clock.nanosec = int(self._seconds % 1 * 1e9)
-        self._clock.publish(message)
+        if not self.is_timeless:
+            self._seconds += 0.1 * self.pace if self._seconds < self._limit else 0
+            nanoseconds = int(self._seconds % 1 * 1e9)
+            time_now = Time(sec=int(self._seconds), nanosec=nanoseconds)
+            self._clock.publish(Clock(clock=time_now))
 
     def entities(self) -> str:
         """Return the detector's number of entities, as text; empty before its first report."""
@@ -116,9 +112,8 @@ class Fleet:
             began = time.monotonic()
             if began < next_look[0]:
                 return False
-            found = true()
-            took = time.monotonic() - began
-            next_look[0] = time.monotonic() + max(0.2, took)  # the vehicles publish meanwhile
+            found, ended = true(), time.monotonic()
+            next_look[0] = ended + max(0.2, ended - began)  # the vehicles publish meanwhile
             return found
 
         wait_until(spun, what)
@@ -207,14 +202,8 @@ def rules_of(**fields: Any) -> str:
     demand["applications"][0]["id"] = "edge/near-{entity}"
     near = {"point": {"x": STATION[0], "y": STATION[1]}, "start": 84, "stop": 90}
     rule = {"name": "near", "near": {"source": "vehicles", **near}, "demand": demand}
-    return strict_yaml.dump(
-        {
-            "apiVersion": "demandops/v1",
-            "kind": "DetectorRules",
-            "sources": {"vehicles": {"topic": "/vehicles/{entity}/pose", "type": POSE}},
-            "rules": [rule | {"retry": "1s"} | fields],
-        }
-    )
+    sources = {"vehicles": {"topic": "/vehicles/{entity}/pose", "type": POSE}}
+    return text_of(rule | {"retry": "1s"} | fields, sources=sources)
 
 
 @pytest.mark.nightly
@@ -260,21 +249,18 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
     assert served.bookkeeping()["services"] == {}
 
 
-@pytest.mark.parametrize(
-    "text", ["", "null", "[]", "{", "[" * 100_000, '{"demands": []}', '{"demands": {"a": 1}}']
-)
 def test_bookkeeping_that_cannot_be_read_is_told_and_the_next_one_is_used(
-    text: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(logging.getLogger("demandops"), "propagate", True)
     node = SimpleNamespace(
         _detector=SimpleNamespace(file=read(rules_of(), "rules.yaml")),
         _bookkeeping=None,
     )
-    DetectorNode._hear_books(node, SimpleNamespace(bookkeeping_json=text))
-    assert node._bookkeeping is None
-    [record] = caplog.records
-    assert record.levelname == "WARNING"
-    assert record.getMessage().startswith("the bookkeeping cannot be read (")
-    DetectorNode._hear_books(node, SimpleNamespace(bookkeeping_json='{"demands": {}}'))
+    odd = ["", "null", "[]", "{", "[" * 100_000, '{"demands": []}', '{"demands": {"a": 1}}']
+    for text in (*odd, '{"demands": {}}'):
+        assert node._bookkeeping is None
+        DetectorNode._hear_books(node, SimpleNamespace(bookkeeping_json=text))
     assert node._bookkeeping == {"demands": {}}
+    assert [record.levelname for record in caplog.records] == ["WARNING"] * len(odd)
+    assert all("the bookkeeping cannot be read (" in line for line in caplog.messages)

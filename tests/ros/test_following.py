@@ -100,49 +100,34 @@ def test_another_node_that_serves_the_same_action_is_noticed(
     server.destroy()
     caller.wait(lambda: heard.is_at(ACTIONS, DiagnosticStatus.OK))
     caller.wait(lambda: len(told()) == 2)
-    assert told() == [
-        f"/test_client serves {DEFAULT_ACTION_NAME} too, so a client may get its answer from "
-        "another node, or no answer; give each node an action name of its own",
-        f"no other node serves {DEFAULT_ACTION_NAME} any more",
-    ]
+    another, gone = told()
+    assert another.startswith(f"/test_client serves {DEFAULT_ACTION_NAME} too, so a client may get")
+    assert gone == f"no other node serves {DEFAULT_ACTION_NAME} any more"
 
 
-def test_a_push_that_the_webhook_reports_is_followed_at_once(
+def test_pushes_are_followed_by_a_webhook_and_the_page_shows_what_the_node_does(
     serve: Serve, client: Client, bare: Path
 ) -> None:
-    """The node does not poll, so it can learn of the push only by the webhook."""
-    args = ["--webhook", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
-    served = serve(f"file://{bare}", *args)
+    """Nothing polls the remote, so a push is known by the webhook alone, a commit by the node."""
+    args = ["--webhook", "127.0.0.1:0", "--web", "127.0.0.1:0"]
+    served = serve(f"file://{bare}", *args, "--ros-args", "-p", "fetch_interval:=0")
     client.ready()
+
+    def opened(after: str, path: str = "", data: bytes | None = None) -> str:
+        """Return the answer of the address that the log names after a text."""
+        served.wait_for(after)
+        found = re.search(rf"{after}(http://127.0.0.1:[0-9]+/\w*)", served.log.read_text())
+        assert found is not None
+        with urllib.request.urlopen(found[1] + path, data, PATIENCE_S) as answer:  # noqa: S310
+            return f"{answer.status} {answer.read().decode()}"
+
+    page = "the page of the state repo is at "
+    assert "Nothing is demanded" in opened(page)
     assert client.call(connection(1)).status == "succeeded"
+    client.wait(lambda: "1 in all" in opened(page, "connections"))
     brokers = read(bare, "inventory/brokers.yaml")
     GitRepo(bare).commit({"inventory/brokers.yaml": brokers.replace("broker-edge", "broker-moved")})
-    client.wait(lambda: "listening for pushes at " in served.log.read_text())
-    found = re.search(
-        r"listening for pushes at (http://127.0.0.1:[0-9]+/push)", served.log.read_text()
-    )
-    assert found is not None
-    with urllib.request.urlopen(found[1], data=b"{}", timeout=PATIENCE_S) as answer:  # noqa: S310
-        assert answer.status == 202
+    assert opened("listening for pushes at ", data=b"{}").startswith("202 ")
     follow = "A person DemandOps generator"
     client.wait(lambda: git(bare, "log", "-1", "--format=%an %cn", "main") == follow)
-    assert served.stop() == 0
-
-
-def test_the_node_shows_its_state_repo_on_a_page(serve: Serve, client: Client, bare: Path) -> None:
-    """Nothing polls the remote, so the page can learn of the node's commit only from the node."""
-    args = ["--web", "127.0.0.1:0", "--ros-args", "-p", "fetch_interval:=0"]
-    served = serve(f"file://{bare}", *args)
-    client.ready()
-    client.wait(lambda: "the page of the state repo is at " in served.log.read_text())
-    found = re.search(r"state repo is at (http://127.0.0.1:[0-9]+/)", served.log.read_text())
-    assert found is not None
-
-    def shown(view: str) -> str:
-        with urllib.request.urlopen(f"{found[1]}{view}", timeout=PATIENCE_S) as answer:  # noqa: S310
-            return str(answer.read().decode())
-
-    assert "Nothing is demanded" in shown("")
-    assert client.call(connection(1)).status == "succeeded"
-    client.wait(lambda: "1 in all" in shown("connections"))
     assert served.stop() == 0

@@ -1,4 +1,4 @@
-"""The node over real ROS 2: feedback, results, refusals, load, cancel, shutdown."""
+"""The node over real ROS 2: feedback, results, refusals, load, cancel, approval, shutdown."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from examples.experiment import paper
 from tests.kit.goals import experiment
 from tests.kit.goals import link as connection
 from tests.kit.limits import PATIENCE_S
-from tests.kit.repo import git, hook, tip
+from tests.kit.repo import Person, git, hook, tip
 from tests.kit.ros import Client, Serve, Served
 
 
@@ -77,9 +77,10 @@ def test_a_goal_that_cannot_be_honoured_is_aborted_with_code_field_and_remedy(
         "unknown-node: connections[0].target_node_id: 'egde' is not in inventory/nodes.yaml; "
         "did you mean 'edge'?"
     )
-    assert refused.feedback == []
-    assert git(shared.state_repo, "log", "--format=%an: %s%n%b", f"{before}..main") == ""
-    assert caller.call(connection(1001)).status == "succeeded"
+    assert (refused.feedback, tip(shared.state_repo)) == ([], before)
+    booked, again = caller.call(connection(1001)), caller.call(connection(1001))
+    assert (booked.status, again.status) == ("succeeded", "succeeded")
+    assert again.message == booked.message.replace("booked", "unchanged")
 
 
 def test_a_hostile_id_stands_on_one_line_in_result_and_log(shared: Served, caller: Client) -> None:
@@ -105,27 +106,19 @@ class Answers:
         self.given.append((outcome, reached))
 
 
-def goal_of_a_demand() -> Any:
-    adapter = DemandAdapter()
-    return SimpleNamespace(adapter=adapter, message=adapter.action.Goal(answer=2))
-
-
-def test_a_waiting_demand_reaches_no_more_than_pushed() -> None:
-    answers, receipt = Answers(_status=object()), Receipt("o", "d", "waiting", "a commit")
-    DemandNode._answer(answers, goal_of_a_demand(), receipt)  # type: ignore[arg-type]
-    assert answers.given == [(receipt, "pushed")]
-
-
-@pytest.mark.parametrize("outcome", ["booked", "released"])
-def test_a_level_that_is_not_reached_is_reported_with_what_became_of_the_demand(
-    outcome: Any,
-) -> None:
-    answers, receipt = Answers(), Receipt("o", "d", outcome, "a commit")
+def test_a_level_that_is_not_reached_is_reported_with_what_became_of_the_demand() -> None:
+    adapter, answers = DemandAdapter(), Answers(_status=object())
+    goal: Any = SimpleNamespace(adapter=adapter, message=adapter.action.Goal(answer=2))
+    waiting = Receipt("o", "d", "waiting", "a commit")
+    DemandNode._answer(answers, goal, waiting)  # type: ignore[arg-type]
+    assert answers.given.pop() == (waiting, "pushed"), "a demand that waits gets no further"
     health = Health("reconciled", "is still being removed", "Deployment ns/one")
-    DemandNode._answer_rollout(answers, receipt, "healthy", goal_of_a_demand(), health)  # type: ignore[arg-type]
-    ((error, _),) = answers.given
-    told = f"Deployment ns/one: is still being removed; the demand is {outcome} in a commit"
-    assert (error.level, str(error)) == ("healthy", told)
+    for outcome in ("booked", "released"):
+        receipt = Receipt("o", "d", outcome, "a commit")  # type: ignore[arg-type]
+        DemandNode._answer_rollout(answers, receipt, "healthy", goal, health)  # type: ignore[arg-type]
+        error, _ = answers.given.pop()
+        told = f"Deployment ns/one: is still being removed; the demand is {outcome} in a commit"
+        assert (error.level, str(error)) == ("healthy", told)
 
 
 def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> None:
@@ -166,11 +159,8 @@ def test_a_goal_that_the_journal_cannot_keep_is_rejected_and_the_log_says_why(
     assert client.call(connection(1)).status == "succeeded"
     resource.prlimit(served.process.pid, resource.RLIMIT_FSIZE, (1 << 19, 1 << 19))
     assert client.call({**connection(2), "id": "x" * 900_000}).accepted is False
-    assert re.search(
-        r"goal 'x+.* rejected: the journal \S+/outbox\.jsonl cannot be written: File too large; "
-        "check its disk, then send the demand again",
-        served.log.read_text(),
-    )
+    why = r"goal 'x+.* rejected: the journal \S+/outbox\.jsonl cannot be written: File too large; "
+    assert re.search(why, served.log.read_text())
     assert client.call(connection(3)).status == "succeeded"
 
 
@@ -183,11 +173,9 @@ def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy_but_its_goal_
     client.node.create_subscription(DiagnosticArray, "/diagnostics", heard.append, 10)
 
     listed: list[GoalStatusArray] = []
+    topic = f"{DEFAULT_ACTION_NAME}/_action/status"
     client.node.create_subscription(
-        GoalStatusArray,
-        f"{DEFAULT_ACTION_NAME}/_action/status",
-        listed.append,
-        qos_profile_action_status_default,
+        GoalStatusArray, topic, listed.append, qos_profile_action_status_default
     )
     told = 0
 
@@ -220,13 +208,6 @@ def test_a_result_is_kept_for_longer_than_the_ten_seconds_of_rclpy_but_its_goal_
         return [bytes(goal.goal_info.goal_id.uuid) for goal in goals] == [newest]
 
     client.wait(lists_only_the_newest)
-
-
-def test_a_goal_sent_again_succeeds_without_a_commit(shared: Served, caller: Client) -> None:
-    first, again = caller.call(connection(1002)), caller.call(connection(1002))
-    commit = tip(shared.state_repo)
-    assert first.message == f"booked: {commit}"
-    assert (again.status, again.message) == ("succeeded", f"unchanged: {commit}")
 
 
 def test_a_hundred_goals_at_once_are_all_answered_and_none_is_lost(
@@ -263,22 +244,6 @@ def test_a_goal_can_be_cancelled_until_it_is_committed_and_not_after(
     assert git(bare, "rev-list", "--count", "main") == "2"
 
 
-def test_a_restart_logs_what_it_takes_from_the_journal(
-    serve: Serve, client: Client, bare: Path
-) -> None:
-    remote = held_remote(bare)
-    killed = serve(remote)
-    client.ready()
-    sent = client.send(connection(1))
-    client.wait(lambda: sent.accepted is True)
-    killed.process.kill()
-    served = serve(remote)
-    (bare / "go").touch()
-    served.wait_for("taking demands")
-    served.wait_for("('request1') from the journal: pushed")
-    assert re.search(r"\[INFO\] .*\[demandops\]: resuming demand \S+ from", served.log.read_text())
-
-
 def test_a_stopped_node_first_finishes_the_open_goals(
     serve: Serve, client: Client, bare: Path
 ) -> None:
@@ -295,57 +260,39 @@ def test_a_stopped_node_first_finishes_the_open_goals(
     assert git(bare, "rev-list", "--count", "main") == "6"
 
 
-def test_bookkeeping_is_answered_over_ros(shared: Served, caller: Client) -> None:
+def test_bookkeeping_is_answered_over_ros_by_one_thread(shared: Served, caller: Client) -> None:
     first = caller.call(connection(1003)).message.removeprefix("booked: ")
     caller.call(connection(1004))
     service = caller.node.create_client(GetBookkeeping, "/demandops/get_bookkeeping")
     caller.wait(service.service_is_ready)
 
-    def ask(at: str) -> Any:
-        future = service.call_async(GetBookkeeping.Request(at=at))
-        caller.wait(future.done)
-        return future.result()
+    def count() -> int:
+        return len([*Path(f"/proc/{shared.process.pid}/task").iterdir()])
 
-    now = ask("")
+    threads = [count()]
+
+    def ask(at: str, times: int = 1) -> list[Any]:
+        calls = [service.call_async(GetBookkeeping.Request(at=at)) for _ in range(times)]
+        caller.wait(lambda: threads.append(count()) or all(call.done() for call in calls))
+        return [call.result() for call in calls]
+
+    (now,), (then,), (unknown,) = ask(""), ask(first), ask("nonsense")
     assert now.ok and json.loads(now.bookkeeping_json) == shared.bookkeeping()
-    then = ask(first)
     assert then.commit == first
     assert {"c1003", "c1004"} & json.loads(then.bookkeeping_json)["connections"].keys() == {"c1003"}
-    unknown = ask("nonsense")
     assert not unknown.ok
-    assert unknown.message.startswith(
-        "'nonsense' is neither a commit of the state repo nor a time;"
+    assert unknown.message.startswith("'nonsense' is neither a commit of the state repo nor")
+    answers = [answer for _ in range(10) for answer in ask(first, times=5)]
+    assert max(threads) <= threads[0] + 2, (
+        "one thread reads, and the thread before it may still be ending"
     )
-
-
-def test_calls_for_the_bookkeeping_are_answered_one_after_the_other(
-    shared: Served, caller: Client
-) -> None:
-    first = caller.call(connection(1005)).message.removeprefix("booked: ")
-    service = caller.node.create_client(GetBookkeeping, "/demandops/get_bookkeeping")
-    caller.wait(service.service_is_ready)
-    threads = Path(f"/proc/{shared.process.pid}/task")
-    idle, most, answers = len(list(threads.iterdir())), 0, list[Any]()
-    for _ in range(10):
-        calls = [service.call_async(GetBookkeeping.Request(at=first)) for _ in range(5)]
-        end = time.monotonic() + PATIENCE_S
-        while not all(call.done() for call in calls):
-            assert time.monotonic() < end
-            caller.executor.spin_once(timeout_sec=0.001)
-            most = max(most, len(list(threads.iterdir())))
-        answers += [call.result() for call in calls]
-    assert most <= idle + 2, "one thread reads, and the thread before it may still be ending"
     assert sum(answer.ok for answer in answers) >= 40
     refused = {answer.message for answer in answers if not answer.ok}
     assert refused <= {"4 calls are being answered; try again later"}
 
 
 def test_action_name_state_repo_and_log_level_are_ros_parameters_and_commits_are_signed(
-    serve: Serve,
-    ros_domain: int,
-    bare: Path,
-    new_repo: Callable[[str], Path],
-    tmp_path: Path,
+    serve: Serve, ros_domain: int, bare: Path, new_repo: Callable[[str], Path], tmp_path: Path
 ) -> None:
     key = tmp_path / "key"
     subprocess.run(["ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-f", str(key)], check=True)
@@ -361,3 +308,34 @@ def test_action_name_state_repo_and_log_level_are_ros_parameters_and_commits_are
     assert "\ngpgsig " in git(bare, "cat-file", "commit", "main")
     assert served.stop() == 0
     assert served.log.read_text() == ""
+
+
+def test_a_goal_stays_open_until_a_person_has_decided(
+    serve: Serve, client: Client, person: Person
+) -> None:
+    bare = person.bare
+    person.policy(approval="required")
+    served = serve(str(bare))
+    client.ready()
+    sent = [client.send(connection(number)) for number in (1, 2, 3)]
+
+    def branches() -> list[str]:
+        lines = [line for one in sent for line in one.feedback]
+        return [line.split()[2] for line in lines if line.startswith("awaiting approval: ")]
+
+    client.wait(lambda: len(branches()) == 3)
+    (approved, denied, gone), (yes, no, _) = sent, branches()
+    assert not any(one.answered for one in sent)
+    assert client.cancel(gone)
+    client.wait(lambda: gone.answered)
+    assert gone.status == "cancelled"
+    git(bare, "branch", "--delete", "--force", no)
+    client.wait(lambda: denied.answered)
+    assert denied.status == "aborted"
+    assert denied.message == f"turned-down: was turned down: {no} is gone and was not merged"
+    commit = git(bare, "rev-parse", yes)
+    git(bare, "update-ref", "refs/heads/main", f"refs/heads/{yes}")
+    client.wait(lambda: approved.answered)
+    assert (approved.status, approved.message) == ("succeeded", f"booked: {commit}")
+    assert list(served.bookkeeping()["connections"]) == ["c1"]
+    client.wait(lambda: git(bare, "for-each-ref", "refs/heads/demand") == "")

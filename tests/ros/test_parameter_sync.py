@@ -9,14 +9,14 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from queue import Empty, Queue
 
 import pytest
 from demandops.base.errors import InvalidInput
 from demandops_ros.parameter_sync import parameters_of
 from rclpy.parameter import Parameter
 
-from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.http import kubeconfig
+from tests.kit.kube_api import KubeApi, kube_api
 from tests.kit.limits import PATIENCE_S
 from tests.kit.ros import Client, Served, Servers
 
@@ -30,40 +30,17 @@ DONE = f"set 2 parameters of /{TARGET}"
 FILE_NAME = "ConfigMap perception/of-params params.yml"
 
 
-class Cluster:
-    """An API server with one ConfigMap; it answers a watch as soon as the ConfigMap changes."""
-
-    def __init__(self) -> None:
-        self.item = {"metadata": {"name": "of-params", "resourceVersion": "1"}, "data": {}}
-        self.changes: Queue[int] = Queue()
-        self.reads = 0
-
-    def hold(self, *topics: str, text: str = "") -> None:
-        self.item["data"] = {"params.yml": text or FILE.format(topics=list(topics))}
-        self.changes.put(1)
-
-    def answer(self, call: Call) -> Answer:
-        assert call.path.startswith("/api/v1/namespaces/perception/configmaps?")
-        assert "fieldSelector=metadata.name%3Dof-params" in call.path
-        if "watch=" not in call.path:
-            self.reads += 1
-            listed = {"metadata": {"resourceVersion": "1"}, "items": [self.item]}
-            return Answer.json({"kind": "ConfigMapList", "apiVersion": "v1", **listed})
-        try:
-            self.changes.get(timeout=10)
-        except Empty:
-            self.reads -= 1  # after a watch that ended, the next read is no polling
-            return Answer.json({})
-        return Answer.json({"type": "MODIFIED", "object": self.item})
-
-
 @pytest.fixture
-def cluster(tmp_path: Path) -> Iterator[Cluster]:
-    made = Cluster()
-    with serving(made.answer) as server:
-        kubeconfig(tmp_path, server.url)
-        yield made
-        made.changes.put(0)
+def cluster(tmp_path: Path) -> Iterator[KubeApi]:
+    with kube_api() as api:
+        kubeconfig(tmp_path, api.url)
+        yield api
+
+
+def hold(cluster: KubeApi, *topics: str, text: str = "") -> None:
+    """Change the ConfigMap, which names the topics that the fusion reads."""
+    data = {"params.yml": text or FILE.format(topics=list(topics))}
+    cluster.put("configmaps", "perception", "of-params", {}, data=data)
 
 
 StartFusion = Callable[[], "subprocess.Popen[bytes]"]
@@ -105,28 +82,24 @@ def read_by_the_fusion(client: Client) -> set[str]:
 
 
 def test_a_node_follows_without_a_restart_and_after_one(
-    cluster: Cluster,
-    start_fusion: StartFusion,
-    servers: Servers,
-    client: Client,
-    tmp_path: Path,
+    cluster: KubeApi, start_fusion: StartFusion, servers: Servers, client: Client, tmp_path: Path
 ) -> None:
-    cluster.hold("/a", "/b")
+    hold(cluster, "/a", "/b")
     fusion = start_fusion()
     sync = start_sync(servers, tmp_path)
     client.wait(lambda: read_by_the_fusion(client) == {"/a", "/b"})
-    cluster.hold("/b", "/c")
+    hold(cluster, "/b", "/c")
     client.wait(lambda: read_by_the_fusion(client) == {"/b", "/c"})
     assert cluster.reads <= 3  # it watches the ConfigMap, and does not poll it
     log = sync.log
-    cluster.hold(text="of_edge_fusion: 5")
+    hold(cluster, text="of_edge_fusion: 5")
     fault = f"{FILE_NAME}: of_edge_fusion.ros__parameters: must be a mapping"
     client.wait(lambda: f"{fault}; {TARGET} keeps its parameters" in log.read_text())
     for value in ("9223372036854775808", "[-9223372036854775809]"):
-        cluster.hold(text=f"of_edge_fusion: {{ros__parameters: {{length: {value}}}}}")
+        hold(cluster, text=f"of_edge_fusion: {{ros__parameters: {{length: {value}}}}}")
         fault = f"parameter length: '{value.strip('[]')}' is out of ROS's range"
         client.wait(lambda fault=fault: fault in log.read_text())
-    cluster.hold("")
+    hold(cluster, "")
     client.wait(lambda: read_by_the_fusion(client) == set())
     times = log.read_text().count(DONE)
     assert fusion.poll() is None
@@ -156,16 +129,10 @@ def test_a_file_that_gives_a_node_nothing_is_refused(text: str, message: str) ->
     assert str(refused.value) == message
 
 
-def test_a_kubeconfig_that_is_none_is_refused(servers: Servers, tmp_path: Path) -> None:
+def test_what_cannot_be_used_is_refused_at_the_start(servers: Servers, tmp_path: Path) -> None:
     (tmp_path / "kubeconfig").write_text("kind: Config")
-    refused = start_sync(servers, tmp_path)
-    assert refused.process.wait(PATIENCE_S) == 1
-    refused.wait_for(
-        f"error: {tmp_path}/kubeconfig: --kubeconfig: cannot be used: Invalid kube-con"
-    )
-
-
-def test_a_parameter_that_is_not_set_is_named(servers: Servers) -> None:
-    refused = servers.run("", "parameter-sync")
-    assert refused.process.wait(PATIENCE_S) == 2
-    refused.wait_for("parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE")
+    no_access, no_name = start_sync(servers, tmp_path), servers.run("", "parameter-sync")
+    assert no_access.process.wait(PATIENCE_S) == 1
+    no_access.wait_for(f"{tmp_path}/kubeconfig: --kubeconfig: cannot be used: Invalid kube-con")
+    assert no_name.process.wait(PATIENCE_S) == 2
+    no_name.wait_for("parameter configmap_name is not set; use --ros-args -p configmap_name:=VALUE")

@@ -18,79 +18,23 @@ from demandops.base.runtime import REAL
 from demandops.cli.main import COMMANDS as COMMAND_NAMES
 from demandops.cli.main import cli, load, run
 
+from tests.kit import plain_yaml
 from tests.kit.goals import EXPERIMENT, put
-from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, git, init
+from tests.kit.repo import GIT_ENVIRONMENT, POLICY, GitRepo, git, init
 from tests.kit.terminal import terminal
 
 FOLDER = Path(__file__).parent / "expected"
 HELP = FOLDER / "help.txt"
 NOW = datetime(2026, 11, 23, 8, 0, tzinfo=timezone.utc)
-FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 
-COMMANDS = (
-    "bookkeeping",
-    "decommission vehicle01 --dry-run",
-    "diff main~1 main",
-    "get claims",
-    "get connections",
-    "get demands",
-    "get demands -o wide",
-    "get leases",
-    "get nodes",
-    "get overrides",
-    "get proposals",
-    "get services",
-    "journal",
-    "log",
-    "log -o wide -n 2",
-    "override create calm --node edge --hold -m Demonstration --dry-run",
-    "request visit.yaml --dry-run",
-    "resume --requester vehicle03 --dry-run",
-    "rollback main~5 -m why --dry-run --drop-newer",
-    "schema",
-    "status",
-    "suspend --connection vehicle00/edge -m why --expires 2h --dry-run",
-    "upgrade --dry-run",
-    "verify main~2..main",
-    "why e904285d",
-    "why edge",
-    "why fusion",
-    "why more",
-    "why object-detection-fusion",
-    "why patrol",
-)
-"""Commands that leave the fleet unchanged."""
+_LISTED = plain_yaml.load(Path(__file__).with_name("commands.yaml").read_text())
+COMMANDS, CHANGING = tuple(_LISTED["unchanged"]), tuple(_LISTED["changing"])
+NOT_SHOWN = _LISTED["not shown"]
 
-CHANGING = (
-    "approve visit --yes --commit PROPOSED --state-repo fleet.git",
-    "check clone",
-    "completion bash",
-    "config list",
-    "config set cloud --state-repo https://git.example/cloud.git",
-    "init new.git --bare",
-    "new application tracking --input camera=sensor_msgs/msg/Image -C clone "
-    "--service tracker=tracking/tracker.launch.py --image ghcr.io/me/tracking:1.0",
-    "override end more -m Done --state-repo fleet.git",
-    "reject visit --yes --state-repo fleet.git",
-    "version",
-    "watch --state-repo fleet.git",
-)
-"""Commands that change the fleet; each runs in a copy of it."""
-
-NOT_SHOWN = {
-    "demand": "needs a running node",
-    "detect": "prints nothing but its log",
-    "parameter-sync": "prints nothing but its log",
-    "serve": "prints nothing but its log",
-    "web": "prints an address",
-}
-"""The commands whose output has no file in `expected`, each with the reason."""
-
+PROPOSED = ("for-each-ref", "--format=%(objectname)", "refs/heads/demand")
 _HEX = re.compile(
     r"\b(?=[0-9a-f]*\d)[0-9a-f]{10}(?:[0-9a-f]{30})?\b|(?<=after commit )[0-9a-f]{12}"
 )
-
-
 _CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 
 
@@ -125,14 +69,10 @@ def make_fleet(folder: Path, patch: pytest.MonkeyPatch) -> None:
     clock[0] += timedelta(hours=1)
     _done("suspend --requester vehicle03 -m 'In the workshop'")
     _done("override create more --service object-detection --replicas 2 -m Load --expires 2d")
-    policy = repo.files()["policy/access-domains.yaml"]
-    data = yaml.safe_load(policy)
-    data["domains"][0]["approval"] = "required"
-    repo.commit(
-        {"policy/access-domains.yaml": yaml.safe_dump(data)},
-        "Demands need approval\n",
-        ("Petra Platform", "petra@example.org", int(NOW.timestamp()) - 3600),
-    )
+    policy = yaml.safe_load(repo.files()[POLICY])
+    policy["domains"][0]["approval"] = "required"
+    petra = ("Petra Platform", "petra@example.org", int(NOW.timestamp()) - 3600)
+    repo.commit({POLICY: yaml.safe_dump(policy)}, "Demands need approval\n", petra)
     _done("request visit.yaml")
     clock[0] = NOW
     git(folder, "clone", "-q", "fleet.git", "clone")
@@ -157,16 +97,15 @@ def printed(command: str, patch: pytest.MonkeyPatch, columns: int = 80) -> str:
         if command.startswith("watch"):
             own.setattr(REAL, "sleep", _interrupt)
         with terminal(own, columns, lines=40 if command.startswith("watch") else 1000) as screen:
-            run(shlex.split(command.replace("PROPOSED", _proposed())))
+            proposed = git(
+                "fleet.git", "for-each-ref", "--format=%(objectname)", "refs/heads/demand"
+            )
+            run(shlex.split(command.replace("PROPOSED", proposed)))
         text = "\n".join(map(str.rstrip, _CONTROL.sub("", screen.text).split("\n")))
         text = text.replace(str(Path.cwd()), "/home/petra")
     if command == "version":
         text = re.sub(r"\d[\w.+-]*", "1.2.3", text)
     return same_ids(text)
-
-
-def _proposed() -> str:
-    return git("fleet.git", "for-each-ref", "--format=%(objectname)", "refs/heads/demand")
 
 
 def _interrupt(seconds: float) -> None:

@@ -13,26 +13,18 @@ from tests.kit.repo import GitRepo
 
 
 def test_options_that_are_not_given_are_asked_for(checkout: Path) -> None:
+    asked = [
+        ("such as camera=sensor_msgs/msg/Image; separate several by spaces: ", "camera"),
+        ("Error: 'camera' is not ROLE=TYPE; write it like", "camera=sensor_msgs/Image"),
+        ("write camera=sensor_msgs/msg/Image", ""),
+        ("Error: an answer is needed; Ctrl-C ends the command", "camera=sensor_msgs/msg/Image"),
+        ("such as detector=my_package/detector.launch.py", "tracker=tracking/tracker.launch.py"),
+        ("with a tag or digest, such as ", "ghcr.io/me/tracking:1.0"),
+    ]
     with Dialogue("new", "application", "tracking", folder=checkout) as talk:
-        talk.read_until("such as camera=sensor_msgs/msg/Image; separate several by spaces: ")
-        talk.type("camera\n")
-        talk.read_until("Error: 'camera' is not ROLE=TYPE; write it like")
-        talk.read_until("separate several by spaces: ")
-        talk.type("camera=sensor_msgs/Image\n")
-        talk.read_until("write camera=sensor_msgs/msg/Image")
-        talk.read_until("separate several by spaces: ")
-        talk.type("\n")
-        talk.read_until(
-            "Error: an answer is needed; Ctrl-C ends the command, and nothing is written"
-        )
-        talk.read_until("separate several by spaces: ")
-        talk.type("camera=sensor_msgs/msg/Image\n")
-        talk.read_until(
-            "such as detector=my_package/detector.launch.py; separate several by spaces: "
-        )
-        talk.type("tracker=tracking/tracker.launch.py\n")
-        talk.read_until("Image, with a tag or digest, such as ghcr.io/me/tracking:1.0: ")
-        talk.type("ghcr.io/me/tracking:1.0\n")
+        for text, answer in asked:
+            talk.read_until(text)
+            talk.type(f"{answer}\n")
         assert talk.end() == 0, talk.text
     assert "to check the files: demandops check" in talk.text
     assert (checkout / "appdefs" / "tracking" / "values" / "tracker.yaml.j2").is_file()

@@ -9,30 +9,15 @@ from pathlib import Path
 
 import pytest
 
-from tests.terminal.outputs import (
-    CHANGING,
-    COMMANDS,
-    FOLDER,
-    HELP,
-    file_of,
-    helps,
-    make_fleet,
-    printed,
-)
-
-
-def main() -> None:
-    shutil.rmtree(FOLDER, ignore_errors=True)
-    FOLDER.mkdir()
-    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
-        patch.setenv("DEMANDOPS_DATA_HOME", str(Path(folder) / "home"))
-        make_fleet(Path(folder), patch)
-        HELP.write_text(helps())
-        for command in (*COMMANDS, *CHANGING):
-            file_of(command).write_text(printed(command, patch))
-        os.chdir(FOLDER)
-    print(f"terminal: {len(COMMANDS) + len(CHANGING) + 1} files")
-
+from tests.terminal import outputs
 
 if __name__ == "__main__":
-    main()
+    shutil.rmtree(outputs.FOLDER, ignore_errors=True)
+    outputs.FOLDER.mkdir()
+    with tempfile.TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
+        patch.setenv("DEMANDOPS_DATA_HOME", str(Path(folder) / "home"))
+        outputs.make_fleet(Path(folder), patch)
+        outputs.HELP.write_text(outputs.helps())
+        for command in (*outputs.COMMANDS, *outputs.CHANGING):
+            outputs.file_of(command).write_text(outputs.printed(command, patch))
+        os.chdir(outputs.FOLDER)

@@ -67,36 +67,45 @@ def test_every_status_is_an_answer_and_nothing_is_logged(caplog: pytest.LogCaptu
     assert SECRET not in caplog.text
 
 
+HEAD = b"HTTP/1.1 200 OK\r\n\r\n"
+
+
 def test_an_answer_without_end_is_cut_off() -> None:
-    head = b"HTTP/1.1 200 OK\r\n\r\n"
     with (
-        speaking(head, *[b"x" * 1_000_000] * 5) as url,
+        speaking(HEAD, *[b"x" * 1_000_000] * 5) as url,
         pytest.raises(NoAnswer, match="longer than 4000000 bytes; check the URL"),
     ):
         call(url)
 
 
 def test_an_answer_that_drips_is_cut_off() -> None:
-    head = b"HTTP/1.1 200 OK\r\n\r\n"
+    late = r"no complete answer within 0\.3 s; check that the server"
     with (
-        speaking(head, *repeat(b"x", 10_000), pause=0.1) as url,
-        pytest.raises(NoAnswer, match=r"no complete answer within 0\.3 s; check that the server"),
+        speaking(HEAD, *repeat(b"x", 10_000), pause=0.1) as url,
+        pytest.raises(NoAnswer, match=late),
     ):
+        call(url, timeout=0.3)
+    chunks = b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n", *[b"1\r\ny\r\n"] * 3
+    with speaking(*chunks, b"0\r\n\r\n", pause=0.2) as url, pytest.raises(NoAnswer, match=late):
         call(url, timeout=0.3)
 
 
 @pytest.mark.parametrize(
-    ("url", "message"),
+    ("url", "proxy", "message"),
     [
-        (
-            "http://127.0.0.1:1/s3cret",
-            "Connection refused; check that the server runs and can be reached",
-        ),
-        ("http://s3cret:pass:word@:x/", INVALID),
-        ("ftp://127.0.0.1/s3cret", INVALID),
+        ("http://127.0.0.1:1/s3cret", "", "Connection refused; check that the server runs"),
+        ("http://s3cret:pass:word@:x/", "", INVALID),
+        ("ftp://127.0.0.1/s3cret", "", INVALID),
+        ("http://127.0.0.1:1/", "socks5://127.0.0.1:1", "a SOCKS proxy is set, but only HTTP"),
+        ("http://127.0.0.1:1/", "foo://127.0.0.1:1", INVALID),
     ],
 )
-def test_an_error_tells_no_secret(url: str, message: str) -> None:
+def test_an_error_tells_what_is_wrong_and_no_secret(
+    monkeypatch: pytest.MonkeyPatch, url: str, proxy: str, message: str
+) -> None:
+    if proxy:
+        monkeypatch.delenv("no_proxy")
+        monkeypatch.setenv("ALL_PROXY", proxy)
     with pytest.raises(NoAnswer) as error:
         call(url)
     assert message in str(error.value)
@@ -105,32 +114,9 @@ def test_an_error_tells_no_secret(url: str, message: str) -> None:
 
 def test_an_answer_that_is_not_http_is_not_quoted_because_it_may_echo_the_request() -> None:
     echo = f"POST /{SECRET} HTTP/1.1\r\nAuthorization: {SECRET}\r\n\r\n".encode()
-    with speaking(echo) as url, pytest.raises(NoAnswer) as error:
+    with speaking(echo) as url, pytest.raises(NoAnswer, match="is not HTTP, or not comp") as error:
         call(url)
-    assert str(error.value) == (
-        "the answer is not HTTP, or not complete; check the URL and the server"
-    )
-
-
-def test_an_answer_whose_end_is_late_is_refused() -> None:
-    head = b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n1\r\nx\r\n"
-    with (
-        speaking(head, *[b"1\r\ny\r\n"] * 2, b"0\r\n\r\n", pause=0.3) as url,
-        pytest.raises(NoAnswer, match=r"no complete answer within 0\.4 s"),
-    ):
-        call(url, timeout=0.4)
-
-
-def test_a_proxy_that_cannot_be_used_is_told_apart_from_a_wrong_url(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.delenv("no_proxy")
-    monkeypatch.setenv("ALL_PROXY", "socks5://127.0.0.1:1")
-    with pytest.raises(NoAnswer, match="a SOCKS proxy is set, but only HTTP proxies can be used"):
-        call("http://127.0.0.1:1/")
-    monkeypatch.setenv("ALL_PROXY", "foo://127.0.0.1:1")
-    with pytest.raises(NoAnswer, match=INVALID):
-        call("http://127.0.0.1:1/")
+    assert SECRET not in str(error.value)
 
 
 def test_only_trusted_certificates_are_accepted(
@@ -147,18 +133,11 @@ def test_only_trusted_certificates_are_accepted(
     tls = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
     tls.load_cert_chain(certificate, key)
     answer = b"HTTP/1.1 200 OK\r\nContent-Length: 2\r\n\r\nok"
-    with (
-        speaking(answer, tls=tls) as url,
-        pytest.raises(
-            NoAnswer, match="if you trust the certificate, set SSL_CERT_FILE to its file"
-        ),
-    ):
+    with speaking(answer, tls=tls) as url, pytest.raises(NoAnswer, match="set SSL_CERT_FILE to"):
         call(url)
     monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
     with speaking(answer, tls=tls) as url:
         assert call(url).body == b"ok"
-    with (
-        speaking(answer, tls=tls) as url,
-        pytest.raises(NoAnswer, match="use a host that the certificate names"),
-    ):
+    unnamed = pytest.raises(NoAnswer, match="use a host that the certificate names")
+    with speaking(answer, tls=tls) as url, unnamed:
         call(url.replace("127.0.0.1", "localhost"))

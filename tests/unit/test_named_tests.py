@@ -1,9 +1,13 @@
-"""Each test and each function of the flow that the documentation names exists."""
+"""Every test that the documentation names exists, and a make target runs every test file."""
 
 from __future__ import annotations
 
 import ast
+import os
 import re
+import shlex
+import subprocess
+from functools import lru_cache
 from importlib import import_module
 from operator import attrgetter
 from pathlib import Path
@@ -44,3 +48,43 @@ def test_each_function_on_the_path_of_a_demand_exists() -> None:
     assert len(path) > 30
     for function, module in path:
         assert callable(attrgetter(function)(import_module(module)))
+
+
+TEST_FILES = sorted((ROOT / "tests").rglob("test_*.py"))
+PROCESSES = ("test-processes", "test-packages", "page", "docs", "simulate", "faults")
+TARGETS = ("test", *PROCESSES, "e2e", "e2e-argocd")
+
+
+@lru_cache
+def files_run_by(target: str) -> frozenset[Path]:
+    environment = {name: value for name, value in os.environ.items() if "MAKE" not in name}
+    printed = subprocess.run(
+        ["make", "--dry-run", "--no-print-directory", target],
+        cwd=ROOT,
+        env=environment | {"E2E_KUBECONFIG": "a file"},  # so make e2e builds nothing
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout.replace("\\\n", " ")
+    (call,) = [line for line in printed.splitlines() if " -m pytest " in line]
+    words = shlex.split(call.replace("--ignore ", "--ignore="))
+    ignored = [ROOT / word.removeprefix("--ignore=") for word in words if "--ignore=" in word]
+    named = [ROOT / word for word in words if word.startswith("tests")]
+    assert all(path.exists() for path in (*named, *ignored))
+    return frozenset(
+        file
+        for file in TEST_FILES
+        if any(file.is_relative_to(path) for path in named)
+        and not any(file.is_relative_to(path) for path in ignored)
+    )
+
+
+def test_every_test_file_is_run() -> None:
+    run = frozenset[Path]().union(*map(files_run_by, TARGETS))
+    assert [str(file.relative_to(ROOT)) for file in TEST_FILES if file not in run] == []
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_a_target_runs_tests_of_its_own(target: str) -> None:
+    others = (files_run_by(other) for other in TARGETS if other != target)
+    assert files_run_by(target) - frozenset[Path]().union(*others)

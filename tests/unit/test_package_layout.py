@@ -1,15 +1,22 @@
-"""The layout of the packages: module names, sizes of folders, and the list in `pyproject.toml`."""
+"""The layout of the packages, and the launch files of ROS, which no test here can run."""
 
 from __future__ import annotations
 
 import re
+import subprocess
 import sys
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
+import demandops
+import demandops_ros
 import pytest
+import yaml
 from demandops.cli import main
+
+from tests.kit.limits import PATIENCE_S
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -21,13 +28,7 @@ PACKAGES = (ROOT / "generator" / "demandops", ROOT / "ros_bridge" / "demandops_r
 MODULES = sorted(path for package in PACKAGES for path in package.rglob("*.py"))
 MOST_MODULES = 12
 
-SAME_NAME = {
-    "__init__": "every package has one",
-}
-"""The module names that may occur more than once, with the reason."""
-
 COMMANDS = PACKAGES[0] / "cli"
-"""The folder of the commands; its modules may have the names of modules in other folders."""
 
 
 def dotted(path: Path) -> str:
@@ -41,33 +42,20 @@ def setuptools() -> dict[str, Any]:
 
 def test_the_wheel_has_every_package() -> None:
     packages = {dotted(path.parent) for path in MODULES if path.name == "__init__.py"}
-    data = {name for name in setuptools()["package-dir"] if "._data." in name}
-    listed = setuptools()["packages"]
-    assert len(listed) == len(set(listed))
-    assert set(listed) == packages | data
-
-
-def test_every_folder_with_modules_is_a_package() -> None:
-    assert [path for path in MODULES if not path.with_name("__init__.py").exists()] == []
-
-
-def test_data_packages_are_folders_of_the_repository() -> None:
-    folders = setuptools()["package-dir"].values()
-    assert [folder for folder in folders if not (ROOT / folder).is_dir()] == []
+    assert packages == {dotted(path.parent) for path in MODULES}
+    folders, listed = setuptools()["package-dir"], setuptools()["packages"]
+    assert sorted(listed) == sorted(packages | {name for name in folders if "._data." in name})
+    assert [folder for folder in folders.values() if not (ROOT / folder).is_dir()] == []
 
 
 def test_a_module_name_occurs_once() -> None:
+    """A command may have the name of a module elsewhere."""
     by_name: defaultdict[str, list[str]] = defaultdict(list)
     for path in MODULES:
         is_command = path.is_relative_to(COMMANDS) and path.stem in main.COMMANDS
-        if path.stem not in SAME_NAME and not is_command:
+        if path.stem != "__init__" and not is_command:
             by_name[path.stem].append(dotted(path))
     assert {name: paths for name, paths in by_name.items() if len(paths) > 1} == {}
-
-
-@pytest.mark.parametrize("name", sorted(SAME_NAME))
-def test_an_allowed_name_still_occurs_more_than_once(name: str) -> None:
-    assert sum(path.stem == name for path in MODULES) > 1
 
 
 def test_only_the_runtime_reads_a_clock_or_starts_threads() -> None:
@@ -83,3 +71,75 @@ def test_a_folder_has_at_most_twelve_modules() -> None:
     for path in MODULES:
         count[dotted(path.parent)] += path.stem != "__init__"
     assert {name: number for name, number in count.items() if number > MOST_MODULES} == {}
+
+
+PACKAGE = Path(__file__).parents[2] / "ros_bridge" / "ros_package"
+
+
+@pytest.mark.parametrize(("name", "program"), [("demandops", "serve"), ("detector", "detect")])
+def test_a_launch_file_uses_all_its_arguments(name: str, program: str) -> None:
+    launch = ElementTree.parse(PACKAGE / "launch" / f"{name}.launch.xml").getroot()  # noqa: S314
+    arguments = [each.get("name") for each in launch.findall("arg")]
+    assert all(each.get("description") for each in launch.findall("arg"))
+    (node,) = launch.findall("node")
+    assert (node.get("pkg"), node.get("exec")) == ("demandops_ros", program)
+    used = re.findall(r"\$\(var (\w+)\)", ElementTree.tostring(node, "unicode"))
+    assert sorted(used) == sorted(filter(None, arguments))
+    if name == "demandops":  # as the reference's
+        assert arguments == ["name", "namespace", "params", "log_level", "args"]
+        # the values of the file come last, so they take precedence
+        given = [sorted(each.keys()) for each in node.findall("param")]
+        assert given == [["name", "value"], ["from"]]
+
+
+def test_the_parameter_files_have_the_defaults() -> None:
+    node = pytest.importorskip("demandops_ros.node_parameters").DEFAULTS
+    command = pytest.importorskip("demandops_ros.detector.detect_command")
+    detector = {name: default for name, (default, *_) in command.PARAMETERS.items()}
+    of_node = (node, {"state_repo", "fetch_interval", "log_level"})
+    of_detector = (detector, {"rules", "log_level"})
+    for file, (defaults, left_out) in {"params": of_node, "detector_params": of_detector}.items():
+        data: dict[str, Any] = yaml.safe_load((PACKAGE / "config" / f"{file}.yaml").read_text())
+        named = data["/**"]["ros__parameters"]
+        assert named == {name: defaults[name] for name in defaults.keys() - left_out}
+
+
+def test_the_package_has_the_version_and_the_needs_of_the_code() -> None:
+    manifest = ElementTree.parse(PACKAGE / "package.xml").getroot()  # noqa: S314
+    assert manifest.findtext("version") == demandops.__version__
+    code = "".join(path.read_text() for path in PACKAGE.parent.glob("demandops_ros/**/*.py"))
+    imported = set(re.findall(r"^(?:from|import) (\w+(?:_msgs|_interfaces)|rclpy)\b", code, re.M))
+    assert {each.text for each in manifest.findall("exec_depend")} >= imported
+
+
+def test_the_wheel_and_colcon_install_the_same_files() -> None:
+    folders = setuptools()["data-files"]
+    installed = {
+        Path(file)
+        for folder in folders
+        if "demandops_ros" in folder or "ament" in folder
+        for file in folders[folder]
+    }
+    kept = {path for path in PACKAGE.rglob("*") if path.is_file()} - {PACKAGE / "CMakeLists.txt"}
+    assert {PACKAGE.parents[1] / path for path in installed} == kept
+
+
+IMPORT = """
+import sys
+import demandops_ros
+assert "rclpy" not in sys.modules, "the import alone loads rclpy"
+from demandops_ros import DemandClient
+assert DemandClient.__module__ == "demandops_ros.client"
+assert "rclpy" in sys.modules
+"""
+
+
+def test_only_using_the_client_imports_rclpy() -> None:
+    subprocess.run([sys.executable, "-c", IMPORT], check=True, timeout=PATIENCE_S)
+
+
+def test_every_public_name_can_be_imported_and_no_other() -> None:
+    assert set(demandops_ros.__all__) <= set(dir(demandops_ros))
+    assert all(hasattr(demandops_ros, name) for name in demandops_ros.__all__)
+    with pytest.raises(AttributeError, match="module 'demandops_ros' has no attribute 'Client'"):
+        demandops_ros.Client  # noqa: B018

@@ -31,17 +31,9 @@ PUBLIC = yaml.safe_load(Path(__file__).with_name("public_surface.yaml").read_tex
 Json = dict[str, Any]
 
 
-def commands() -> Json:
-    return {name: command_of(main.load(name)) for name in main.COMMANDS}
-
-
 def command_of(command: click.Command) -> Json | list[str]:
     if isinstance(command, click.Group):
         return {name: command_of(each) for name, each in sorted(command.commands.items())}
-    return parameters(command)
-
-
-def parameters(command: click.Command) -> list[str]:
     return [parameter(each) for each in command.params]
 
 
@@ -53,10 +45,6 @@ def parameter(each: click.Parameter) -> str:
     value = "|".join(choices) or each.metavar or each.type.name.upper()
     text = " ".join(each.opts if each.is_flag else [*each.opts, value])
     return f"{text} [env: {each.envvar}]" if each.envvar else text
-
-
-def client() -> Json:
-    return {name: members(getattr(demandops_ros, name)) for name in demandops_ros.__all__}
 
 
 def members(exported: Any) -> Json | str:
@@ -74,35 +62,23 @@ def members(exported: Any) -> Json | str:
 def arguments(member: Any) -> str:
     if not inspect.isfunction(member):
         return "field"
-    signature = inspect.signature(member)
-    bare = [
-        each.replace(
-            annotation=inspect.Parameter.empty,
-            default=... if inspect.isfunction(each.default) else each.default,
-        )
-        for each in list(signature.parameters.values())[1:]
-    ]
+    _, *given = inspect.signature(member).parameters.values()
+    bare = []
+    for each in given:
+        default = ... if inspect.isfunction(each.default) else each.default
+        bare.append(each.replace(annotation=inspect.Parameter.empty, default=default))
     return str(inspect.Signature(bare))
 
 
 def interfaces() -> Json:
-    suffixes = (".action", ".msg", ".srv")
-    files = sorted(path for path in INTERFACES.rglob("*.*") if path.suffix in suffixes)
-    return {
-        f"{path.relative_to(INTERFACES).parts[0]}/{path.stem}": fields_of_interface(path)
-        for path in files
-    }
-
-
-def fields_of_interface(path: Path) -> list[str]:
-    lines = (line.partition("#")[0].split() for line in path.read_text().splitlines())
-    return [" ".join(words) for words in lines if words]
-
-
-def files() -> Json:
-    return {
-        name: fields_of_schema(model.model_json_schema()) for name, (model, _) in SCHEMAS.items()
-    }
+    """Return the fields of each action, message and service."""
+    found = {}
+    for path in sorted(INTERFACES.rglob("*.*")):
+        if path.suffix in (".action", ".msg", ".srv"):
+            lines = (line.partition("#")[0].split() for line in path.read_text().splitlines())
+            name = f"{path.relative_to(INTERFACES).parts[0]}/{path.stem}"
+            found[name] = [" ".join(words) for words in lines if words]
+    return found
 
 
 def fields_of_schema(schema: Json) -> Json:
@@ -149,18 +125,18 @@ def environment() -> list[str]:
     return sorted({name for text in texts for name in re.findall(r"\bDEMANDOPS_[A-Z_]+\b", text)})
 
 
-def exit_codes() -> Json:
-    return {each.name: each.value for each in main.ExitCode}
-
-
 SECTIONS: dict[str, Callable[[], object]] = {
-    "options": lambda: parameters(main.cli),
-    "commands": commands,
-    "exit codes": exit_codes,
+    "options": lambda: [parameter(each) for each in main.cli.params],
+    "commands": lambda: {name: command_of(main.load(name)) for name in main.COMMANDS},
+    "exit codes": lambda: {each.name: each.value for each in main.ExitCode},
     "environment": environment,
-    "client": client,
+    "client": lambda: {
+        name: members(getattr(demandops_ros, name)) for name in demandops_ros.__all__
+    },
     "ROS interfaces": interfaces,
-    "files": files,
+    "files": lambda: {
+        name: fields_of_schema(model.model_json_schema()) for name, (model, _) in SCHEMAS.items()
+    },
     "claim files": claim_files,
 }
 
@@ -187,13 +163,8 @@ def test_people_find_everything_in_the_documentation() -> None:
     interface_names = {name.split("/")[1] for name in PUBLIC["ROS interfaces"]}
     kinds = {text for kind in PUBLIC["claim files"] for text in kind.split()}
     names = {*PUBLIC["commands"], *PUBLIC["environment"], *PUBLIC["client"], *PUBLIC["files"]}
-    names |= {
-        *map(str, PUBLIC["exit codes"].values()),
-        *interface_names,
-        *kinds,
-        settings.API_VERSION,
-    }
-    assert names - listed == set()
+    names |= {*map(str, PUBLIC["exit codes"].values()), *interface_names, *kinds}
+    assert {*names, settings.API_VERSION} - listed == set()
 
 
 if __name__ == "__main__":  # writes the listing; review the diff

@@ -10,20 +10,16 @@ import unicodedata
 from typing import Any
 
 import pytest
-from demandops.base.errors import Fault, InvalidInput, StateRepoError, fault
-from demandops.base.quoting import (
-    LONGEST_LINE,
-    OneLineFormatter,
-    is_visible,
-    json_escaped,
-    lines,
-    one_line,
-    quoted,
-)
+from demandops.base import quoting
+from demandops.base.errors import MOST_FAULTS, Fault, InvalidInput, StateRepoError, fault
+from demandops.base.quoting import is_visible, json_escaped, one_line
+from demandops.base.strict_yaml import located_in
 from demandops.cli import output
 from demandops.cli.json_output import print_json, show
 from demandops.cli.repo import check
 from demandops.cli.table import Column, Table
+from demandops.model.config.base_model import parse_file
+from demandops.model.ledger.records import _KeptReplicasFile
 from demandops.repo.load import last_valid_config
 from hypothesis import given
 from hypothesis import strategies as st
@@ -37,12 +33,12 @@ TEXTS = st.one_of(st.text(), st.text("\n\t\x1b\u202e\u200b\u00ad\u3164\ufe0f'\"\
 @given(TEXTS)
 @examples(150)
 def test_a_quoted_text_is_one_visible_line_of_bounded_length(text: str) -> None:
-    for quote in (one_line(text), quoted(text), one_line(text, 5)):
+    for quote in (one_line(text), quoting.quoted(text), one_line(text, 5)):
         assert is_visible(quote)
         assert "".join(f"{quote}\n").splitlines() == [quote]
     assert len(one_line(text * 50, 60)) <= 60
     assert one_line(one_line(text)) == one_line(text)
-    assert lines(text).count("\n") == text.count("\n")
+    assert quoting.lines(text).count("\n") == text.count("\n")
     assert json.loads(json_escaped(json.dumps(text, ensure_ascii=False))) == text
 
 
@@ -57,7 +53,7 @@ def test_no_kind_of_character_without_a_glyph_is_visible() -> None:
 def test_faults_and_errors_are_one_line_each() -> None:
     found = fault(HOSTILE, HOSTILE).within(HOSTILE)
     assert found.file == HOSTILE, "a program needs the file's exact name"
-    assert is_visible(str(found)) and len(str(found)) < 4 * LONGEST_LINE
+    assert is_visible(str(found)) and len(str(found)) < 4 * quoting.LONGEST_LINE
     assert len(str(InvalidInput([found, found])).splitlines()) == 2
     assert is_visible(str(StateRepoError(f"cannot be read: {HOSTILE}")))
 
@@ -65,7 +61,7 @@ def test_faults_and_errors_are_one_line_each() -> None:
 def test_a_log_record_is_one_line_and_its_trace_is_indented(caplog: Any) -> None:
     stream = io.StringIO()
     handler = logging.StreamHandler(stream)
-    handler.setFormatter(OneLineFormatter("%(levelname)s: %(message)s"))
+    handler.setFormatter(quoting.OneLineFormatter("%(levelname)s: %(message)s"))
     log = logging.Logger("of this test")
     log.addHandler(handler)
     log.error("refused: %s", HOSTILE)
@@ -76,15 +72,12 @@ def test_a_log_record_is_one_line_and_its_trace_is_indented(caplog: Any) -> None
         log.exception("internal error")
     told = stream.getvalue().removesuffix("\n").split("\n")
     assert told[0].startswith("ERROR: refused: a; ERROR: forged; \\x1b[2J")
-    assert told[1] == "ERROR: a: one; b: two"
-    assert told[2] == "ERROR: internal error"
+    assert told[1:3] == ["ERROR: a: one; b: two", "ERROR: internal error"]
     assert all(line.startswith("  ") for line in told[4:])
     assert all(is_visible(line) for line in told)
 
 
-def test_commands_print_no_text_that_controls_a_terminal(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_commands_print_no_text_that_controls_a_terminal(capsys: Any) -> None:
     table = Table([Column("Summary")], [[HOSTILE[:90]], [[HOSTILE[:90]]]])
     show("text", None, [HOSTILE[:90], table])
     output.errors.print(HOSTILE[:90])
@@ -106,3 +99,16 @@ def test_the_problem_report_quotes_and_finds_its_problems_again() -> None:
     assert text and all(is_visible(line) for line in text.split("\n"))
     again = last_valid_config.with_origins(found, last_valid_config.read(text), lambda path: None)
     assert again == first
+
+
+def test_faults_that_are_passed_on_are_still_counted_right() -> None:
+    found = InvalidInput(Fault("invalid", f"a{n}", "is wrong") for n in range(MOST_FAULTS + 900))
+    with pytest.raises(InvalidInput) as raised, located_in("a: 1\n"):
+        raise found
+    *listed, last = raised.value.faults
+    assert (len(listed), last.message) == (MOST_FAULTS, "has 900 more faults")
+
+
+def test_a_file_that_is_no_mapping_is_told_the_format_of_its_own_kind() -> None:
+    with pytest.raises(InvalidInput, match=r"starts with apiVersion: demandops\.ledger/v2"):
+        parse_file(_KeptReplicasFile, "[]", "ledger/replicas/a.yaml")

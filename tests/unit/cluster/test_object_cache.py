@@ -1,17 +1,32 @@
-"""The cache reads a cluster's objects over real HTTP: which calls it makes, and what it reports."""
+"""What is read and watched in a cluster over real HTTP, and a cluster that cannot be reached."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import logging
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from threading import Event
+from typing import Any
 
 import pytest
+from demandops.base import strict_yaml
+from demandops.base.errors import InvalidInput
+from demandops.cluster import rollouts
 from demandops.cluster.clusters_file import ClusterAccess
-from demandops.cluster.health import ObjectSelector
+from demandops.cluster.config_map_watch import ConfigMapWatch
+from demandops.cluster.health import ClusterDomain, ObjectName, ObjectSelector, Target
 from demandops.cluster.object_cache import ObjectCache
+from demandops.cluster.rollouts import RolloutWatcher
+from demandops.decide.decision import decide
 
+from tests.kit import goals
+from tests.kit.clock import Clock
+from tests.kit.cluster import Letters
+from tests.kit.golden import requests_of, start
 from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.limits import PATIENCE_S
+from tests.kit.memory import NOW, MemoryRepo
 
 OVER = ObjectSelector("Application", "argocd", "demandops-perception")
 CHILDREN = ObjectSelector("Application", "perception")
@@ -46,16 +61,15 @@ def store(api: Api) -> ObjectCache:
 
 def test_one_object_is_asked_for_by_its_name(api: Api) -> None:
     read = store(api)
+    assert read.pods("perception", "mqtt-edge") == [], "of a Deployment that is not known"
     read.read_once([OVER, CHILDREN])
     over, children = api.asked
     assert over.endswith(
         "/namespaces/argocd/applications?fieldSelector=metadata.name%3Ddemandops-perception"
     )
     assert children.endswith("/namespaces/perception/applications")
-    assert set(read.objects()) == {
-        ("Application", "argocd", "one"),
-        ("Application", "perception", "one"),
-    }
+    found = {("Application", namespace, "one") for namespace in ("argocd", "perception")}
+    assert set(read.objects()) == found
 
 
 def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
@@ -67,14 +81,126 @@ def test_what_may_not_be_read_is_told_and_the_rest_is_known(api: Api) -> None:
     assert read.why_unknown([DEPLOYMENTS]) == "some objects have not been read yet"
 
 
-def test_a_deployment_that_is_not_known_has_no_pods(api: Api) -> None:
-    assert store(api).pods("perception", "mqtt-edge") == []
-    assert api.asked == []
-
-
 def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:
     away = ClusterAccess(kubeconfig=kubeconfig(tmp_path, "http://127.0.0.1:1"))
     read = ObjectCache("away", away, lambda: None)
     read.read_once([OVER, CHILDREN])
     assert read.why_unknown([OVER]).startswith("MaxRetryError")
     assert read.why_unknown([CHILDREN]) == read.why_unknown([OVER])
+
+
+AWAY = "http://127.0.0.1:1"
+
+
+def test_a_cluster_that_is_away_is_the_reason_at_the_end_of_the_time(tmp_path: Path) -> None:
+    file, clock = kubeconfig(tmp_path, AWAY), Clock(NOW)
+    status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters(), runtime=clock)
+    try:
+        target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
+        late = status.follow("a" * 40, [target], "healthy", timeout=60)
+        soon = status.follow("a" * 40, [target], "healthy", timeout=10)
+        clock.pass_(11)
+        health = soon.result(PATIENCE_S)
+        assert not late.done()
+        clock.pass_(60)
+        assert late.result(PATIENCE_S).state == "waiting"
+        assert (health.state, health.object) == ("waiting", "cluster away")
+        assert health.reason.startswith("cannot be read: ")
+        # a demand without a target on that cluster does not wait for the cluster
+        without = status.follow("a" * 40, [], "healthy", timeout=60)
+        assert without.result(PATIENCE_S).state == "healthy"
+    finally:
+        status.close()
+
+
+def test_clusters_without_a_kubeconfig_tell_nothing() -> None:
+    status = RolloutWatcher({"w": ClusterAccess(receiver="https://h/hook")}, Letters())
+    asked = [ClusterDomain("w", "d", "n"), ClusterDomain("x", "d", "n")]
+    assert status.why_unreachable(asked) == "no access to cluster w, x"
+    assert status.why_unreachable([]) == ""
+    status.close()
+
+
+def test_closing_answers_the_rollouts_that_are_still_followed(tmp_path: Path) -> None:
+    file = kubeconfig(tmp_path, AWAY)
+    status = RolloutWatcher({"away": ClusterAccess(kubeconfig=file)}, Letters())
+    target = Target(ClusterDomain("away", "d", "ns"), "r", is_service=True)
+    followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
+    status.close()
+    assert followed.result(PATIENCE_S).state == "waiting"
+
+
+ITEM = {"metadata": {"name": "of-params", "resourceVersion": "1"}, "data": {"params.yml": "a"}}
+NAME = "ConfigMap perception/of-params"
+
+
+def test_data_of_a_deleted_config_map_stay_valid(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    items: list[list[Any]] = [[], [ITEM], []]
+    is_read, passed_on = Event(), list[Mapping[str, str]]()
+
+    def answer(call: Call) -> Answer:
+        if "watch=" in call.path:
+            gone = {"type": "DELETED", "object": ITEM}
+            return Answer.json(gone if len(items) == 1 else {})
+        if not items:
+            is_read.set()
+            return Answer.json({"reason": "over"}, 503)
+        return Answer.json({"metadata": {"resourceVersion": "1"}, "items": items.pop(0)})
+
+    monkeypatch.setattr(logging.getLogger("demandops"), "propagate", True)
+    with serving(answer) as server:
+        config = kubeconfig(tmp_path, server.url)
+        watch = ConfigMapWatch(
+            "perception", "of-params", lambda data: passed_on.append({**data}), config
+        )
+        assert is_read.wait(PATIENCE_S)
+        watch.close()
+    assert passed_on == [{"params.yml": "a"}]
+    assert [message for message in caplog.messages if "retrying" not in message] == [
+        f"{NAME} does not exist yet",
+        f"{NAME} is gone; its last data stay valid",
+    ]
+
+
+def test_without_a_kubeconfig_the_process_must_be_a_pod(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("KUBERNETES_SERVICE_HOST", raising=False)
+    with pytest.raises(InvalidInput) as refused:
+        ConfigMapWatch("perception", "of-params", print, None)
+    assert str(refused.value).startswith(
+        "without --kubeconfig: needs a pod with a service account's token: "
+    )
+
+
+@pytest.mark.parametrize(
+    ("case", "application"),
+    [("experiment", None), ("argocd-experiment", ObjectName("argocd", "demandops-perception"))],
+)
+def test_a_rollout_target_names_its_argo_cd_application_or_none_for_flux(
+    case: str, application: ObjectName | None
+) -> None:
+    state, files = start(case)
+    goal = strict_yaml.load(requests_of(case)[0].read_text())
+    found = rollouts.targets_of_state(decide(state, goal, NOW, files.get).state)
+    assert {target.name for release, target in found} == {release.name for release, _ in found}
+    assert {target.domain.application for _, target in found} == {application}
+    assert {target.is_service for _, target in found} == {True, False}
+
+
+def test_a_demand_waits_for_no_release_that_only_others_need() -> None:
+    def join(cloud: goals.Topic) -> goals.Goal:
+        return goals.goal([goals.application(who=[cloud[1]], clouds=[cloud])], id=cloud[1])
+
+    def followed(goal: goals.Goal) -> dict[str, bool]:
+        before = repo.state
+        targets = rollouts.targets_of_decision(before, repo.send(goal))
+        return {target.name: target.wanted for target in targets}
+
+    repo, fusion = MemoryRepo(), "of-edge-object-detection-fusion-cf7e0180a8bb"
+    vehicle, station = join(goals.CLOUD), join(goals.STATION_CLOUD)
+    repo.send(vehicle)
+    own = {fusion: True, "od-edge-station00": True}
+    assert followed(station) == own
+    assert followed(station) == own, "the demand was booked before"
+    assert followed(vehicle | {"shutdown": True}) == {fusion: True, "od-edge-vehicle00": False}

@@ -1,15 +1,23 @@
-"""A restart or new rules do not make the detector end an event and start it again."""
+"""The detector over a restart and new rules, and stories of its events and goals."""
 
 from __future__ import annotations
 
+from datetime import datetime
+from operator import itemgetter
+from pathlib import Path
 from typing import Any
 
-from demandops.detect.detector import Detector, booked_events
-from demandops.detect.observations import Key
+import pytest
+from demandops.detect.detector import Detector, Outcome, Sending, Want, WantedDemands, booked_events
+from demandops.detect.observations import Key, Observation
+from demandops.detect.rule_file import Goal
 
-from tests.kit.detection import at, demand, file_of, rule
+from tests.kit import plain_yaml
+from tests.kit.detection import POSE, SOURCES, Run, at, demand, file_of, rule
 
 NEAR = {"source": "cars", "point": {"x": 0, "y": 0}, "start": 84, "stop": 90}
+LEVELS = {"start": 2, "stop": 1}
+POSITIONS = [{"node": "n", "x": "{x}"}]
 REQUEST = {
     "id": "station/perception",
     "connections": [{"id": "{entity}/edge", "requester_ids": ["{entity}", "station"]}],
@@ -18,15 +26,8 @@ RULES = [
     rule("joins", near=NEAR, deploymentRequest=REQUEST, entities=["car*"]),
     rule("puts", near=NEAR, entities=["bus*"]),
     rule("pair", together={"source": "cars", "start": 5, "stop": 8}),
-    rule(
-        "full",
-        count={"source": "cars", "point": {"x": 0, "y": 0}, "radius": 9, "start": 2, "stop": 1},
-    ),
-    rule(
-        "there",
-        near=NEAR,
-        demand=demand(demand="at/{entity}", positions=[{"node": "n", "x": "{x}"}]),
-    ),
+    rule("full", count={"source": "cars", "point": {"x": 0, "y": 0}, "radius": 9, **LEVELS}),
+    rule("there", near=NEAR, demand=demand(demand="at/{entity}", positions=POSITIONS)),
 ]
 
 
@@ -71,11 +72,8 @@ def test_the_booked_demands_of_rules_are_told_from_all_others() -> None:
         ("full", ()): "full",
         ("there", ("car9",)): "at/car9",
     }
-    assert booked["there", ("car9",)].ended().data == {
-        "demand": "at/car9",
-        "requesters": ["car9"],
-        "operation": "release",
-    }
+    released = {"demand": "at/car9", "requesters": ["car9"], "operation": "release"}
+    assert booked["there", ("car9",)].ended().data == released
     assert booked_events(file_of(*RULES), {"services": {}}) == {}
 
 
@@ -98,22 +96,14 @@ def test_events_last_if_the_rules_are_replaced_by_the_same() -> None:
 
 
 def test_the_demands_of_a_rule_that_is_gone_or_for_others_end() -> None:
-    assert changes(started(rule("a", near=NEAR))) == {("a", ("car1",)): None}
-    others = rule("a", near=NEAR, entities=["bus*"])
-    assert changes(started(rule("a", near=NEAR)), others) == {("a", ("car1",)): None}
+    for rules in ([], [rule("a", near=NEAR, entities=["bus*"])]):
+        assert changes(started(rule("a", near=NEAR)), *rules) == {("a", ("car1",)): None}
 
 
 def test_a_changed_demand_is_wanted_with_the_values_of_the_events_start() -> None:
-    positions = [{"node": "n", "x": "{x}"}]
-    detector = started(rule("a", near=NEAR))
-    changed = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=positions))
-    assert changes(detector, changed) == {
-        ("a", ("car1",)): {
-            "demand": "car1",
-            "requesters": ["car1"],
-            "positions": [{"node": "n", "x": 80}],
-        }
-    }
+    changed = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=POSITIONS))
+    wanted = {"demand": "car1", "requesters": ["car1"], "positions": [{"node": "n", "x": 80}]}
+    assert changes(started(rule("a", near=NEAR)), changed) == {("a", ("car1",)): wanted}
 
 
 def test_an_entity_that_does_not_come_back_after_a_restart_is_gone() -> None:
@@ -124,3 +114,104 @@ def test_an_entity_that_does_not_come_back_after_a_restart_is_gone() -> None:
     assert detector.step([], 4.9) == []
     ((event, want),) = detector.step([], 5)
     assert (event.why, want.goal) == ("bus1 has not been seen since the start", None)
+
+
+EVENTS, DEMANDS = (
+    plain_yaml.load(Path(__file__).with_name(f"{name}.yaml").read_text())
+    for name in ("events", "wanted_demands")
+)
+
+
+def seconds(time: float | datetime) -> float:
+    return time.timestamp() if isinstance(time, datetime) else time
+
+
+def heard(now: float, one: Any) -> Observation:
+    return at(*one) if isinstance(one, list) else Observation("batteries", "a", now, None, one)
+
+
+@pytest.mark.parametrize("story", EVENTS, ids=itemgetter("must"))
+def test_a_story_of_events(story: dict[str, Any]) -> None:
+    slow = {"topic": "/slow/{entity}", "type": POSE, "timeout": story.get("slow", "1s")}
+    rules = [rule(name, **fields) for name, fields in story["rules"].items()]
+    run = Run(*rules, now=seconds(story.get("now", 0)), sources={**SOURCES, "slow": slow})
+    if "held" in story:
+        held, unknown = (
+            [(name, tuple(entities)) for name, *entities in story.get(part, ())]
+            for part in ("held", "unknown")
+        )
+        run.state = run.engine.start(0, [*held, *unknown], settle_s=story["settle"])
+        assert run.state.lasting == {*held}
+    for step in story["steps"]:
+        run.state = run.state.shifted(step.get("clock", 0))
+        now = seconds(step["at"])
+        told = run.told(now, *(heard(now, one) for one in step.get("hears", ())))
+        lines = [" ".join([*filter(None, words), f"{time:.10g}"]) for *words, time in told]
+        assert lines == step.get("tells", []), step
+
+
+def test_an_event_says_what_has_happened() -> None:
+    run = Run(rule("near", near=NEAR))
+    (event,) = run.step(1, at(1, "a", 30, 40))
+    assert event.why == "a is 50.0 m from the area"
+    assert event.values == {"rule": "near", "entity": "a", "x": 30, "y": 40, "distance": 50}
+    (event,) = run.step(9)
+    assert (event.why, event.at) == ("a has been silent for 3 s", 4)
+
+
+def test_a_step_leaves_the_state_before_as_it_was() -> None:
+    run = Run(
+        rule("near", near=NEAR), rule("pair", together={"source": "cars", "start": 5, "stop": 8})
+    )
+    run.step(1, at(1, "a", 0), at(1, "b", 1))
+    before = run.state
+    first = run.engine.step(before, [at(2, "a", 95)], 2)
+    assert run.engine.step(before, [at(2, "a", 95)], 2) == first
+    assert len(first[1]) == 2
+
+
+GOALS = {
+    "put": Goal("demand", {"demand": "d", "requesters": ["a"], "applications": [1]}),
+    "other": Goal("demand", {"demand": "d", "requesters": ["a"], "applications": [2]}),
+    "join": Goal("deployment_request", {"id": "r", "apps": []}),
+    "changed": Goal("deployment_request", {"id": "r", "apps": [1]}),
+}
+
+
+def key(event: str) -> tuple[str, tuple[str, ...]]:
+    return event, ("a",)
+
+
+def check(wanted: WantedDemands, step: dict[str, Any], under_way: list[Sending]) -> None:
+    if "want" in step:
+        times = {name: step[name] for name in ("retry_s", "renew_s") if name in step}
+        goal = step["want"] and GOALS[step["want"]]
+        wanted.want(Want(key(step.get("event", "rule")), goal, **times))
+    if "answer" in step:
+        assert wanted.answered(under_way.pop(), Outcome(), step["answer"]) == ""
+    if "at" in step:
+        now, sending = step["at"], wanted.next(step["at"])
+        assert (sending and sending.purpose) == step["sends"]
+        assert "next" not in step or wanted.next_at() == pytest.approx(step["next"])
+        if sending is not None:
+            assert sending.key == key(step.get("event", "rule"))
+            assert sending.goal.data == step.get("data", sending.goal.data)
+            if step.get("unanswered"):
+                under_way.append(sending)
+            else:
+                texts = (step.get("code", ""), step.get("message", ""))
+                told = wanted.answered(sending, Outcome(*texts, step.get("lease", 0.0)), now)
+                assert told == step.get("logs", "")
+    if "refused" in step:
+        assert [*wanted.refusals()] == [(key("rule"), step["refused"])]
+    assert wanted.unanswered() == step.get("lost", wanted.unanswered())
+    assert len(wanted) == step.get("left", len(wanted))
+
+
+@pytest.mark.parametrize("story", DEMANDS, ids=itemgetter("must"))
+def test_a_story_of_wanted_demands(story: dict[str, Any]) -> None:
+    wanted, under_way = WantedDemands(), list[Sending]()
+    if "held" in story:
+        wanted.hold(key("rule"), GOALS[story["held"]])
+    for step in story["steps"]:
+        check(wanted, step, under_way)

@@ -1,18 +1,30 @@
-"""A confined program reaches no network, knows no secrets, and ends."""
+"""A confined program, such as Helm, reaches no network, knows no secrets, and ends."""
 
 from __future__ import annotations
 
 import subprocess
 import sys
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from demandops.decide.changeset import trial_releases
 from demandops.repo.pull_request import confined
 from demandops.repo.pull_request import helm as helm_runs
-from demandops.repo.pull_request.helm import HELM_BIN, Helm, Report
+from demandops.repo.pull_request.helm import (
+    HELM_BIN,
+    Helm,
+    Report,
+    parsed_error,
+    parsed_kinds,
+    parsed_lint,
+)
+from demandops.repo.pull_request.rendered_charts import _Run
 
+from tests.kit.config import edited
 from tests.kit.http import serving
+from tests.kit.memory import MemoryRepo
 
 
 def confine(code: str, *arguments: str, seconds: int = 60) -> subprocess.CompletedProcess[str]:
@@ -20,6 +32,7 @@ def confine(code: str, *arguments: str, seconds: int = 60) -> subprocess.Complet
     return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
 
 
+Ran = Callable[[str], Report]
 FETCH = "import sys, urllib.request; urllib.request.urlopen(sys.argv[1], timeout=5)"
 
 
@@ -34,13 +47,7 @@ def test_it_reaches_no_network_where_the_kernel_lets_us_say_so() -> None:
 
 
 @pytest.mark.parametrize(
-    "code",
-    [
-        "while True: pass",
-        "x = b'x' * (8 << 30)",
-        "open('big', 'wb').truncate(1 << 40)",
-    ],
-    ids=["time", "memory", "file"],
+    "code", ["while True: pass", "x = b'x' * (8 << 30)", "open('big', 'wb').truncate(1 << 40)"]
 )
 def test_it_has_only_so_much(code: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
@@ -54,7 +61,7 @@ def test_a_program_that_cannot_run_is_told() -> None:
 
 
 @pytest.fixture
-def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
+def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ran:
     """Return a function that runs a program in place of helm and returns the report."""
 
     def run(code: str) -> Report:
@@ -70,41 +77,97 @@ def ran(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> object:
 
 
 def test_helm_knows_nothing_of_the_environment(
-    ran: object, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ran: Ran, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert callable(ran)
     for name in ("TOKEN", "HELM_PLUGINS", "HELM_REGISTRY_CONFIG", "XDG_CONFIG_HOME", "LD_PRELOAD_"):
         monkeypatch.setenv(name, "hunter2")
     report = ran("for name in os.environ: print('---\\nkind:', name, os.environ[name])")
-    assert {kind for _, kind in report.kinds} - {"LC_CTYPE", "_DEMANDOPS_PROCESS"} == {
-        "PATH",
-        "HOME",
-        "TMPDIR",
-        "KUBECONFIG",
-        "HELM_PLUGINS",
-    }
+    known = {kind for _, kind in report.kinds} - {"LC_CTYPE", "_DEMANDOPS_PROCESS"}
+    assert known == {"PATH", "HOME", "TMPDIR", "KUBECONFIG", "HELM_PLUGINS"}
     assert report.ended
     assert [*tmp_path.joinpath("home").iterdir()]  # what it writes lands there
 
 
-def test_output_without_end_is_a_fault(ran: object) -> None:
-    assert callable(ran)
+def test_output_without_end_is_a_fault(ran: Ran) -> None:
     report = ran("while True: print('a' * 1000000)")
     assert not report.ended
-    (fault,) = report.faults
-    assert fault.file == "chart"
+    assert [fault.file for fault in report.faults] == ["chart"]
 
 
-def test_a_program_that_loops_is_a_fault(ran: object, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert callable(ran)
+def test_a_program_that_loops_is_a_fault(ran: Ran, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(helm_runs, "_CPU_SECONDS", 1)
     report = ran("while True: pass")
     assert not report.ended
     assert report.faults
 
 
-def test_a_message_of_any_length_is_parsed_soon(ran: object) -> None:
-    assert callable(ran)
+def test_a_message_of_any_length_is_parsed_soon(ran: Ran) -> None:
     report = ran("sys.exit('Error: ' + 'templates/' * 5_000_000)")
     assert report.ended
     assert len(report.faults[0].message) < 1_000
+
+
+@pytest.mark.parametrize(
+    ("err", "file", "line"),
+    [
+        ("parse error at (camera/templates/service.yaml:7): unclosed action",
+         "camera/templates/service.yaml", 7),
+        ("execution error at (camera/charts/ros-service/templates/_names.tpl:31:4): no",
+         "camera/charts/ros-service/templates/_names.tpl", 31),
+        ("cannot load values.yaml: error converting YAML to JSON", "camera", None),
+        # a line number that a template made up
+        (f"camera/templates/x.yaml:{'9' * 5000}: made up", "camera/templates/x.yaml", None),
+    ],
+)  # fmt: skip
+def test_an_error_names_template_and_line(err: str, file: str, line: int | None) -> None:
+    fault = parsed_error(f"level=WARN msg=x\nError: {err}\n\nUse --debug flag\n", "camera")
+    assert (fault.file, fault.line) == (file, line)
+    assert fault.message.startswith(f"helm says '{err[:40]}")
+    assert "--debug" not in fault.message
+
+
+def test_the_kinds_of_objects_are_read() -> None:
+    out = (
+        "---\n# Source: camera/templates/a.yaml\napiVersion: apps/v1\nkind: Deployment\nspec:\n"
+        '  kind: inner\n---\napiVersion: "v1"\nkind: "ConfigMap"\ndata:\n'
+        "  a: |\n    kind: text\n---\n"
+        "# Source: camera/templates/empty.yaml\n"
+    )
+    assert [*parsed_kinds(out)] == [("apps", "Deployment"), ("", "ConfigMap")]
+
+
+def test_lint_gives_errors_and_warnings_and_no_advice() -> None:
+    found = parsed_lint(
+        "==> Linting camera\n"
+        "[INFO] Chart.yaml: icon is recommended\n"
+        "[WARNING] camera/templates/hpa.yaml: autoscaling/v2beta1 is gone\n"
+        "[ERROR] values.yaml: - at '/replicas': got string, want integer\n"
+        "- at '/image': missing property 'tag'\n\n"
+        "Error: 1 chart(s) linted, 1 chart(s) failed\n",
+        "camera",
+    )
+    (warning,), (error,) = found.warnings, found.faults
+    assert warning.file == "camera/templates/hpa.yaml"
+    assert "'/replicas': got string, want integer - at '/image': missing prop" in error.message
+
+
+DOMAINS = "policy/access-domains.yaml"
+KINDS = "kinds: [ConfigMap, Deployment, Secret]"
+
+
+@pytest.mark.parametrize(
+    ("field", "kind", "remedy"),
+    [
+        ("", "apps/DaemonSet", f"list DaemonSet in 'kinds' in {DOMAINS} together with all kinds"),
+        (KINDS, "apps/DaemonSet", f"add DaemonSet to 'kinds' in {DOMAINS}"),
+        (KINDS, "example.org/Robot", "add Robot, with its group and resource, to 'kinds'"),
+        ("network: namespace", "networking.k8s.io/NetworkPolicy", "remove 'network: namespace'"),
+    ],
+)
+def test_what_to_do_about_a_kind(field: str, kind: str, remedy: str) -> None:
+    state = MemoryRepo(edited(DOMAINS, 'nodes: ["*"]', f'nodes: ["*"]\n    {field}')).state
+    release = next(one for found in trial_releases(state.config).values() for one in found)
+    group, _, name = kind.partition("/")
+    (fault,) = _Run(None, state)._kinds_refused(Report(((group, name),)), release)
+    assert f"renders a {name}, which is not among the kinds of access domain 'perc" in fault.message
+    assert remedy in fault.message

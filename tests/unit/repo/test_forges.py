@@ -1,11 +1,18 @@
-"""The requests of the forge adapters match recordings: method, path, headers and body."""
+"""The requests of the forge adapters match recordings: method, path, headers and body.
+
+An exchange is a request as the forge's API documents it, and its answer. ``exchanges/<name>.yaml``
+lists the exchanges in order. A forge on the loopback replays them, and refuses all other requests.
+It also checks the token, which is not in the recording.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import pytest
 from demandops.base.errors import InvalidInput
@@ -14,11 +21,53 @@ from demandops.model.config.repo_settings import Proposals
 from demandops.repo.forge import Forge, ForgeError, Gitea, PullRequest, forge_for
 from demandops.serve.approvals.forge_worker import ForgeWorker
 
+from tests.kit import plain_yaml
 from tests.kit.config import configuration
-from tests.kit.http import Answer, Call, serving
+from tests.kit.http import Answer, Call, Server, serving
 from tests.kit.turns import Turns
-from tests.unit.repo.replaying import TOKEN, Replay, replaying
 
+TOKEN = "t0ken-of-nobody"  # noqa: S105 - no real token
+_EXCHANGES = Path(__file__).with_name("exchanges")
+_IGNORED = {"host", "connection", "accept-encoding", "user-agent", "content-length"}
+
+
+@dataclass
+class Replay:
+    """A running replay: its URL, the exchanges still to come, and the problems."""
+
+    url: str = ""
+    left: list[dict[str, Any]] = field(default_factory=list)
+    problems: list[str] = field(default_factory=list)
+
+    def answer(self, call: Call) -> Answer:
+        headers = {k.lower(): v for k, v in call.headers.items() if k.lower() not in _IGNORED}
+        scheme, _, given = headers.get("authorization", "").partition(" ")
+        if given != TOKEN:
+            self.problems.append("the token is not there")
+        headers["authorization"] = f"{scheme} TOKEN"
+        request = {"method": call.method, "path": call.path, "headers": headers}
+        request["body"] = call.json()
+        recorded = self.left.pop(0) if self.left else None
+        if recorded is None or recorded["request"] != request:
+            self.problems.append(f"came {request}, recorded {recorded}")
+            return Answer(599)
+        answer = recorded["response"]
+        return Answer.json(answer["body"], answer["status"], **answer.get("headers", {}))
+
+
+@contextmanager
+def replaying(name: str, variables: dict[str, str]) -> Iterator[Replay]:
+    """Replay exchanges in order; each ``{x}`` in them is replaced by the value of ``x``."""
+    text = (_EXCHANGES / f"{name}.yaml").read_text()
+    for key, value in variables.items():
+        text = text.replace("{" + key + "}", value)
+    replay = Replay(left=plain_yaml.load(text))
+    with serving(replay.answer) as server:
+        replay.url = server.url
+        yield replay
+
+
+TABLES = plain_yaml.load(Path(__file__).with_name("forges.yaml").read_text())
 BRANCH = "demand/one-0123456789ab"
 LINKS = {
     "github": "https://github.com/its/state/pull/7",
@@ -39,17 +88,21 @@ def kind(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
+def proposals(kind: str = "github", url: str = "https://github.com/a/b", **more: str) -> Proposals:
+    return Proposals.model_validate({"forge": kind, "url": url, **more})
+
+
+def forge_at(kind: str, api: str, token: Path) -> Forge:
+    made = forge_for(proposals(kind, "https://git.example.org/its/state", api=api), token)
+    assert made is not None
+    return made
+
+
 @contextmanager
-def forge(kind: str, name: str, token: Path, **variables: str) -> Iterator[tuple[Forge, Replay]]:
+def forge(kind: str, name: str, token: Path, **variables: str) -> Iterator[Forge]:
     with replaying(f"{kind}-{name}", variables=variables) as replay:
-        configured = Proposals.model_validate(
-            {"forge": kind, "url": "https://git.example.org/its/state", "api": replay.url}
-        )
-        made = forge_for(configured, token)
-        assert made is not None
-        yield made, replay
-        assert replay.problems == []
-        assert replay.left == []
+        yield forge_at(kind, replay.url, token)
+        assert (replay.problems, replay.left) == ([], [])
 
 
 def open_one(made: Forge) -> PullRequest:
@@ -57,54 +110,46 @@ def open_one(made: Forge) -> PullRequest:
 
 
 @pytest.mark.parametrize(
-    ("name", "state"),
-    [("new", "open"), ("there", "open"), ("lost", "open"), ("closed", "closed")],
+    ("name", "state"), [("new", "open"), ("there", "open"), ("lost", "open"), ("closed", "closed")]
 )
 def test_a_request_is_opened_once_whatever_happened_before(
     kind: str, name: str, state: str, token: Path
 ) -> None:
-    with forge(kind, name, token) as (made, _):
+    with forge(kind, name, token) as made:
         found = open_one(made)
     assert found == PullRequest(7, LINKS[kind], state)
 
 
 @pytest.mark.parametrize("state", ["merged", "closed", "none"])
 def test_what_became_of_a_request_is_told(kind: str, state: str, token: Path) -> None:
-    with forge(kind, state, token) as (made, _):
+    with forge(kind, state, token) as made:
         found = made.find(BRANCH, "main")
     assert (found.state if found else "none") == state
 
 
 def test_a_request_is_closed(kind: str, token: Path) -> None:
-    with forge(kind, "close", token) as (made, _):
+    with forge(kind, "close", token) as made:
         made.close(PullRequest(7, LINKS[kind], "open"), "Closed: ` was replaced `")
 
 
 def test_a_refusal_is_told_in_the_forges_words_without_the_token(kind: str, token: Path) -> None:
-    with forge(kind, "denied", token) as (made, _), pytest.raises(ForgeError) as error:
+    with forge(kind, "denied", token) as made, pytest.raises(ForgeError) as error:
         open_one(made)
     assert error.value.status == 401
     assert str(error.value).endswith(": 401 'Bad credentials'")
-    assert TOKEN not in str(error.value)
 
-
-def test_a_refusal_that_repeats_the_token_is_told_without_it(kind: str, token: Path) -> None:
     def echo(call: Call) -> Answer:
         return Answer.json({"message": f"bad header: {call.headers['Authorization']}"}, 400)
 
-    with serving(echo) as there:
-        project = {"forge": kind, "url": "https://git.example.org/its/state", "api": there.url}
-        made = forge_for(Proposals.model_validate(project), token)
-        assert made is not None
-        with pytest.raises(ForgeError, match="400 'bad header: ") as error:
-            made.find(BRANCH, "main")
+    with serving(echo) as there, pytest.raises(ForgeError, match="400 'bad header: ") as error:
+        forge_at(kind, there.url, token).find(BRANCH, "main")
     assert TOKEN not in str(error.value)
 
 
 def test_the_token_follows_no_redirect(kind: str, token: Path) -> None:
     with (
         serving() as there,
-        forge(kind, "moved", token, elsewhere=there.url) as (made, _),
+        forge(kind, "moved", token, elsewhere=there.url) as made,
         pytest.raises(ForgeError),
     ):
         made.find(BRANCH, "main")
@@ -112,39 +157,46 @@ def test_the_token_follows_no_redirect(kind: str, token: Path) -> None:
 
 
 def test_a_forge_that_is_away_is_told(kind: str, token: Path) -> None:
-    with replaying(f"{kind}-none") as replay:
-        gone = replay.url
-    made = forge_for(
-        Proposals.model_validate({"forge": kind, "url": "https://x.org/a/b", "api": gone}), token
-    )
-    assert made is not None
+    with serving() as gone:
+        pass
     with pytest.raises(ForgeError, match="refused") as error:
-        made.find(BRANCH, "main")
+        forge_at(kind, gone.url, token).find(BRANCH, "main")
     assert error.value.status is None
 
 
-Write = Callable[[Path], object]
+ODD = " must hold a token: one line of plain text"
 
 
 @pytest.mark.parametrize(
-    ("write", "message"),
-    [
-        (
-            lambda path: None,
-            ": cannot be read: No such file or directory; write the secret into this file, and "
-            "make it readable",
-        ),
-        (lambda path: path.write_text("two\nlines"), " must hold a token: one line of plain text"),
-        (lambda path: path.write_bytes(b"\xff\xfe"), " must hold a token: one line of plain text"),
-    ],
+    ("content", "message"),
+    [(None, ": cannot be read: No such"), (b"two\nlines", ODD), (b"\xff\xfe", ODD)],
 )
-def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message: str) -> None:
+def test_a_token_file_that_is_none_is_told(
+    tmp_path: Path, content: bytes | None, message: str
+) -> None:
     file = tmp_path / "token"
-    write(file)
-    configured = Proposals.model_validate({"forge": "github", "url": "https://github.com/a/b"})
-    with pytest.raises(ForgeError) as error:
-        forge_for(configured, file)
-    assert str(error.value) == f"the token file {file}{message}"
+    if content is not None:
+        file.write_bytes(content)
+    with pytest.raises(ForgeError, match=f"the token file {file}{message}"):
+        forge_for(proposals(), file)
+    with pytest.raises(ForgeError, match="DEMANDOPS_FORGE_TOKEN_FILE"):
+        forge_for(proposals(), None)
+
+
+@contextmanager
+def asked(
+    token: Path, answer: Answer, *branches: str
+) -> Iterator[tuple[Turns, Server, list[tuple[str, int]]]]:
+    """Let a worker open pull requests at a forge that always gives the same answer.
+
+    The list has each branch of which the worker told, and the number of calls until then.
+    """
+    turns, told = Turns(1), list[tuple[str, int]]()
+    with serving(lambda call: answer) as server:
+        worker = ForgeWorker(token, lambda branch: told.append((branch, len(server.calls))), turns)
+        for branch in branches:
+            worker.open(proposals(api=server.url), branch, "x", "x")
+        yield turns, server, told
 
 
 @pytest.mark.parametrize(
@@ -152,99 +204,48 @@ def test_a_token_file_that_is_none_is_told(tmp_path: Path, write: Write, message
     [(429, {}), (403, {"Retry-After": "60"}), (403, {"X-RateLimit-Remaining": "0"})],
 )
 def test_a_forge_that_is_asked_too_often_is_left_alone_for_a_minute(
-    tmp_path: Path, status: int, headers: dict[str, str]
+    token: Path, status: int, headers: dict[str, str]
 ) -> None:
-    (tmp_path / "token").write_text(TOKEN)
-    turns, told = Turns(1), list[str]()
     slow_down = Answer.json({"message": "slow down"}, status, **headers)
-    with serving(lambda call: slow_down) as server:
-        at = {"forge": "github", "url": "https://github.com/a/b", "api": server.url}
-        proposals = Proposals.model_validate(at)
-        worker = ForgeWorker(tmp_path / "token", told.append, turns)
-        for branch in ("demand/x", "demand/y", "demand/z"):
-            worker.open(proposals, branch, "x", "x")
+    with asked(token, slow_down, "demand/x", "demand/y", "demand/z") as (turns, server, told):
         turns.sleep(59)
         assert len(server.calls) == 1
-        assert told == ["demand/x", "demand/y", "demand/z"], "their requesters need not wait"
+        assert [branch for branch, _ in told] == ["demand/x", "demand/y", "demand/z"], (
+            "their requesters need not wait"
+        )
         turns.sleep(2)
         assert len(server.calls) == 2
 
 
-def test_a_forge_that_may_not_be_used_is_asked_again_at_the_usual_interval(tmp_path: Path) -> None:
-    (tmp_path / "token").write_text(TOKEN)
-    turns = Turns(1)
-    with serving(lambda call: Answer.json({"message": "no"}, 403)) as server:
-        at = {"forge": "github", "url": "https://github.com/a/b", "api": server.url}
-        worker = ForgeWorker(tmp_path / "token", lambda branch: None, turns)
-        worker.open(Proposals.model_validate(at), "demand/x", "x", "x")
+def test_a_forge_that_may_not_be_used_is_asked_again_at_the_usual_interval(token: Path) -> None:
+    denied = Answer.json({"message": "no"}, 403)
+    with asked(token, denied, "demand/x") as (turns, server, _):
         turns.sleep(31)
         assert len(server.calls) == 2
 
 
-def test_while_a_forge_is_away_no_requester_waits_for_the_calls_of_others(tmp_path: Path) -> None:
-    (tmp_path / "token").write_text(TOKEN)
-    turns, told = Turns(1), list[tuple[str, int]]()
-    with serving(lambda call: Answer(200, b"<html>")) as server:
-        at = {"forge": "github", "url": "https://github.com/a/b", "api": server.url}
-        proposals = Proposals.model_validate(at)
-        worker = ForgeWorker(
-            tmp_path / "token", lambda branch: told.append((branch, len(server.calls))), turns
-        )
-        for branch in ("demand/x", "demand/y"):
-            worker.open(proposals, branch, "x", "x")
+def test_while_a_forge_is_away_no_requester_waits_for_the_calls_of_others(token: Path) -> None:
+    odd = Answer(200, b"<html>")
+    with asked(token, odd, "demand/x", "demand/y") as (turns, _, told):
         turns.sleep(1)
         assert told == [("demand/x", 1), ("demand/y", 1)]
 
 
-def test_no_token_file_is_told_with_the_remedy() -> None:
-    configured = Proposals.model_validate({"forge": "gitea", "url": "https://x.org/a/b"})
-    with pytest.raises(ForgeError, match="DEMANDOPS_FORGE_TOKEN_FILE"):
-        forge_for(configured, None)
-
-
-@pytest.mark.parametrize(
-    ("kind", "url", "address"),
-    [
-        ("github", "https://github.com/its/state", "https://api.github.com"),
-        ("github", "https://ghe.example.org/its/state.git", "https://ghe.example.org/api/v3"),
-        ("gitea", "https://git.example.org/its/state", "https://git.example.org/api/v1"),
-        ("gitea", "https://example.org:3000/git/its/state/", "https://example.org:3000/git/api/v1"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "url", "address"), TABLES["addresses"])
 def test_the_apis_address_follows_from_the_projects(
     kind: str, url: str, address: str, token: Path
 ) -> None:
-    made = forge_for(Proposals.model_validate({"forge": kind, "url": url}), token)
+    made = forge_for(proposals(kind, url), token)
     assert made is not None
-    assert made._api == address
-    assert made._pulls == "/repos/its/state/pulls"
+    assert (made._api, made._pulls) == (address, "/repos/its/state/pulls")
 
 
-@pytest.mark.parametrize("forge", ["none", "gitlab"])
-def test_forges_without_an_api_are_asked_nothing(forge: str) -> None:
-    assert forge_for(Proposals.model_validate({"forge": forge}), None) is None
+def test_forges_without_an_api_are_asked_nothing() -> None:
+    for name in ("none", "gitlab"):
+        assert forge_for(Proposals.model_validate({"forge": name}), None) is None
 
 
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [
-        ("{forge: github}", "proposals: 'forge: github' needs 'url', the project's address"),
-        ("{forge: github, url: 'https://github.com/its'}", "needs 'url', the project's address"),
-        (
-            "{forge: gitea, url: 'http://git.example.org/a/b'}",
-            "proposals.url: 'http://git.example.org/a/b' is not an address that a token may be "
-            "sent to",
-        ),
-        ("{forge: gitea, url: 'https://me:secret@x.org/a/b'}", "proposals.url: "),
-        ("{forge: none, api: 'https://x.org/a'}", "api: is not used with 'forge: none'"),
-        (
-            "{forge: gitea, url: 'https://x.org/a/b', labels: [x]}",
-            "labels: are used only with 'forge: gitlab'",
-        ),
-        ('{forge: gitlab, labels: ["a\\nb"]}', "proposals.labels[0]: "),
-        ("{forge: bitbucket}", "proposals.forge: "),
-    ],
-)
+@pytest.mark.parametrize(("section", "message"), TABLES["sections"])
 def test_a_section_that_cannot_work_is_refused(section: str, message: str) -> None:
     config = configuration()
     config["demandops.yaml"] += f"\nproposals: {section}\n"

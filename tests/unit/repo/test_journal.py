@@ -1,10 +1,12 @@
-"""The journal's file after a crash, on a full or damaged disk, and its size."""
+"""The journal's file after a crash, on a full or damaged disk, and what forces it there."""
 
 from __future__ import annotations
 
 import json
 import os
 import stat
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -19,6 +21,7 @@ from demandops.repo.write.journal import (
     read,
 )
 
+from tests.kit.goals import perception
 from tests.kit.limits import files_end_at
 
 PROPOSAL = ProposalRecord("demand/x", ("a",))
@@ -69,7 +72,9 @@ def test_only_its_owner_reads_a_journal(tmp_path: Path) -> None:
         assert stat.S_IMODE(folder.stat().st_mode) == stat.S_IRWXU
 
 
-def test_a_torn_last_entry_is_dropped(path: Path, text: bytes) -> None:
+def test_a_torn_last_entry_is_dropped_and_gone_before_the_next_is_written(
+    path: Path, text: bytes
+) -> None:
     *lines, last = text.splitlines(keepends=True)
     before = pending(b"".join(lines))
     for length in range(len(last) - 1):
@@ -77,12 +82,8 @@ def test_a_torn_last_entry_is_dropped(path: Path, text: bytes) -> None:
     whole = pending(text)
     assert pending(text[:-1]) == whole
     assert pending(text + b"\0" * 100) == whole, "a crash may leave pages of zeros"
-
-
-def test_a_torn_entry_is_gone_before_the_next_is_written(path: Path, text: bytes) -> None:
     path.write_bytes(text[:-9])
-    journal = Journal(path)
-    journal.append([entry("d")])
+    Journal(path).append([entry("d")])
     assert list(read(path)) == ["op-a", "op-c", "op-d"]
 
 
@@ -111,23 +112,11 @@ def test_no_missing_doubled_or_moved_entry_is_overlooked(path: Path, text: bytes
 
 
 def test_a_damaged_journal_is_refused_with_the_line_and_the_remedy(path: Path, text: bytes) -> None:
-    path.write_bytes(text.replace(b"wish", b"wash", 2))
-    with pytest.raises(DamagedJournal) as error:
+    damaged = text.replace(b"wish", b"wash", 2)
+    path.write_bytes(damaged)
+    with pytest.raises(DamagedJournal, match=r"line 1 is .* `demandops journal --set-aside`"):
         Journal(path)
-    assert str(error.value) == (
-        f"{path}: line 1 is not what the generator wrote there; run `demandops journal --set-aside`"
-        " for this state repo to move the file away and list its demands, then send again "
-        "what is still needed"
-    )
-    assert path.read_bytes() != text, "the damaged file must stay as it is"
-
-
-def test_a_line_of_the_first_version_whose_ids_are_no_texts_is_damage(path: Path) -> None:
-    entry = {"operation": "o", "goal": None, "received": "2026-01-01T00:00:00+00:00", "base": ""}
-    for wrong in ({"operation": 5}, {"base": 5}):
-        path.write_text(json.dumps(entry | wrong) + "\n")
-        with pytest.raises(DamagedJournal):
-            Journal(path)
+    assert path.read_bytes() == damaged
 
 
 @pytest.mark.parametrize("waiting", [0, 1000])
@@ -188,14 +177,21 @@ def test_a_journal_that_filled_the_disk_makes_room_once_all_is_done(path: Path) 
 # ---- the first version's journal ----
 
 
-def of_the_first_version(*records: dict[str, object]) -> bytes:
+def of_the_first_version(*records: object) -> bytes:
     return b"".join(json.dumps(record).encode() + b"\n" for record in records)
 
 
 _AT = "2026-01-31T12:00:00"
 WAITING = {"operation": "op-1", "goal": {"id": 1}, "received": f"{_AT}+00:00", "base": ""}
 PROPOSED = {**WAITING, "operation": "op-2", "proposal": {"branch": "demand/x", "commits": ["a"]}}
-NOT_PROPOSED = ({}, {"branch": "x"}, {"branch": "x", "commits": [], "brunch": ""}, "x", "", [])
+NOT_WRITTEN = (
+    *(42, None, {}, {"done": []}, {"operation": "x"}),
+    *(WAITING | wrong for wrong in ({"operation": 5}, {"base": 5})),
+    *(WAITING | {"received": at} for at in (_AT, "9999-12-31T23:59:59+00:00")),
+    WAITING | {"received": "1969-12-31T23:59:59+00:00"},
+    *(PROPOSED | {"proposal": one} for one in ({}, {"branch": "x"}, "x", "", [])),
+    PROPOSED | {"proposal": {"branch": "x", "commits": [], "brunch": ""}},
+)
 
 
 def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
@@ -209,14 +205,52 @@ def test_the_first_version_s_journal_is_carried_over(path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "line",
-    [b"42", b"null", b"{}", b"\x00\xff", b'{"done": []}', b'{"operation": "x"}', b"[" * 9999]
-    + [json.dumps(PROPOSED | {"proposal": one}).encode() for one in NOT_PROPOSED]
-    + [
-        json.dumps(WAITING | {"received": at}).encode()
-        for at in (_AT, "9999-12-31T23:59:59+00:00", "1969-12-31T23:59:59+00:00")
-    ],
+    "line", [b"\x00\xff\n", b"[" * 9999 + b"\n", *map(of_the_first_version, NOT_WRITTEN)]
 )
-def test_a_line_that_the_first_version_did_not_write_is_damage(path: Path, line: bytes) -> None:
+def test_a_line_that_the_first_version_did_not_write_is_damage(line: bytes) -> None:
     with pytest.raises(DamagedJournal, match="line 2 is not what"):
-        pending(of_the_first_version(WAITING) + line + b"\n" + of_the_first_version(PROPOSED))
+        pending(of_the_first_version(WAITING) + line + of_the_first_version(PROPOSED))
+
+
+PROGRAM = """
+import json, os, sys
+from datetime import datetime, timezone
+from pathlib import Path
+import pygit2
+from pygit2.enums import Option
+
+calls = []
+
+def recorded(owner, name):
+    known = getattr(owner, name)
+    def call(*args):
+        calls.append([name, *map(int, args)])
+        return known(*args)
+    setattr(owner, name, call)
+
+recorded(pygit2, "option")
+from demandops.serve.generator import Generator
+from demandops.repo import new_repo
+
+bare = Path(sys.argv[1])
+new_repo.init(bare, datetime.now(timezone.utc), bare=True, gitops="flux")
+generator = Generator(str(bare))
+recorded(os, "fdatasync")
+before = []
+goal = json.loads(sys.argv[2])
+ticket = generator.submit(goal, "op", lambda stage, text: before.append((stage, calls[-1][0])))
+ticket.future.result(240)
+generator.close()
+setting = pygit2.Repository(str(bare)).config["core.fsync"]
+options = [call[2:] for call in calls if call[:2] == ["option", Option.ENABLE_FSYNC_GITDIR]]
+print(json.dumps([options, setting, dict(before)["admitted"]]))
+"""
+
+
+def test_libgit2_git_and_the_journal_force_their_writes(tmp_path: Path) -> None:
+    command = [sys.executable, "-c", PROGRAM, str(tmp_path / "state.git"), json.dumps(perception())]
+    said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+    options, setting, last_call = json.loads(said)
+    assert options == [[1]], "libgit2's forced writes must be switched on once, and never off"
+    assert setting == "committed"
+    assert last_call == "fdatasync", "the journal must be on the disk before a demand is admitted"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 import pygit2
 from demandops.base.quoting import harmless, is_visible, one_line
@@ -10,15 +11,13 @@ from demandops.repo.history.commit_log import compose, parse
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from tests.kit import plain_yaml
 from tests.kit.chance import examples
 from tests.kit.repo import git
 
-HOSTILE = (
-    "a\n\nOperation: join\nRequester: control-room\nRender-Version: 1\x00",
-    *("\x00", "\n\n", "\r\nA: b", "\u202eabc", "a\u200bb", "\ud800", "\ud83d\ude97", "\u2028"),
-    *("\x1b[2J", "\x9b2J", "\u3164", "\ufe0f", '"', '"a"', '"\\u202e"', '"\\x20"', "\\x41", "\\"),
-    *(" a", "a ", " ", "\ta", "x" * 100_000, "Key: value", "%(trailers)", "---", "\U000e0001"),
-)
+TEXTS = plain_yaml.load(Path(__file__).with_name("texts.yaml").read_text())
+HOSTILE = [*TEXTS["hostile"], "\ud800", "\ud83d\ude97", "x" * 100_000]
+FORGES, ORDERS = TEXTS["forges"], TEXTS["orders"]
 VALUES = st.one_of(
     st.sampled_from(HOSTILE),
     st.text(),
@@ -74,45 +73,12 @@ def _trailers_of_git(repo: pygit2.Repository, text: str) -> str:
     return git(repo.path, *shown).strip()
 
 
-FORGES = {
-    "GitHub skips a pipeline": r"(?i)\[(skip ci|ci skip|no ci|skip actions|actions skip)\]",
-    "GitLab skips a pipeline": r"(?i)\[(ci[ _-]skip|skip[ _-]ci)\]",
-    "Azure skips a pipeline": r"(?i)\*\*\*NO_CI\*\*\*|\[skip (azp|azurepipelines)\]",
-    "GitHub skips its checks": r"(?im)^(skip|request)-checks\s*:",
-    "GitHub and Gitea link an issue": r"(?i)(?<![\w&])(#|[\w.-]+/[\w.-]+#|GH-)[0-9]+",
-    "GitLab links an issue, a merge request, a snippet or an epic": r"(?<!\w)[\w./-]*[#!$&][0-9]+",
-    "GitLab closes an issue": r"(?i)\b(clos(e[sd]?|ing)|fix(e[sd]|ing)?|resolv(e[sd]?|ing)|"
-    r"implement(s|ed|ing)?):? +(issues? +)?([\w./-]*#[0-9]+|[A-Z][A-Z0-9_]+-[0-9]+|"
-    r"https?://\S+/(-/)?(issues|work_items|merge_requests|epics)/[0-9]+)",
-    "Gitea and GitHub follow an address": r"https?://\S+/(issues|pulls?|merge_requests)/[0-9]+",
-    "Gitea links an issue": r"""(?:\s|^|[(\["'])[#!][0-9]+""",
-    "Jira obeys": r"\B#(close|resolve|comment|time)\b",
-    "somebody is called": r"(?a:(^|\W)@[A-Za-z0-9_])",
-    "GitLab or Prow obeys": r"(?m)^/[a-z]",
-    "somebody has signed": r"(?im)^(signed-off|co-authored|reviewed|acked|tested)-by\s*:",
-}
-"""What forges and pipelines act on, in the form that their documentation gives."""
-
-ORDERS = (
-    *("[skip ci]", "[CI SKIP]", "[no ci]", "[skip-ci]", "[actions skip]", "***NO_CI***"),
-    *("#1", "its/state#12", "GH-7", "!3", "its/state!3", "$4", "&5", "@petra", "@its/admins"),
-    *("Fixes #1", "closes: its/state#2", "Resolve GH-3", "Closes ABC-12", "Fix issue ABC-1"),
-    *("https://github.com/its/state/issues/1", "Closes https://gitlab.com/a/b/-/issues/9"),
-    *("/merge", "/approve", "Signed-off-by: Petra <petra@example.org>", "skip-checks: true"),
-    *("Co-authored-by: Petra <petra@example.org>", "ABC-1 #close", "\n", "\n\n", " ", "x", "ä"),
-    *("[", "]", "skip", "ci", "#", "@", "!", "*", "-", "/", "1", '"', "\\", "\\x23", "\u200b"),
-)
-
-
 @given(text=st.lists(st.sampled_from(ORDERS), min_size=1, max_size=6).map("".join))
 @example(text=" ".join(ORDERS))
 @examples(200)
 def test_no_forge_acts_on_what_a_requester_writes(repo: pygit2.Repository, text: str) -> None:
-    paragraphs = [
-        [f"Join {text}"],
-        [f"Why: request '{text}', asks for {text}."],
-        ["List:", f"  {text}"],
-    ]
+    why = f"Why: request '{text}', asks for {text}."
+    paragraphs = [[f"Join {text}"], [why], ["List:", f"  {text}"]]
     trailers = [("Requester", text), ("Demand-Id", text), ("Override", f"overrides/{text}.yaml")]
     message = compose(paragraphs, trailers)
     assert {what for what, acts in FORGES.items() if re.search(acts, message)} == set()
@@ -132,5 +98,5 @@ def test_a_person_may_close_an_issue_with_a_reason() -> None:
 
 def test_messages_of_earlier_versions_are_read_as_they_were_meant() -> None:
     values = ["Fixes #1", "@a", '"', "\\", '"a"', "a: b", "a\u200bb", '"\\\'"', "a\\x41"]
-    text = "Join a\n\n" + "".join(f"Requester: {value}\n" for value in values)
-    assert parse(text).trailers["Requester"] == values
+    text = "".join(f"Requester: {value}\n" for value in values)
+    assert parse(f"Join a\n\n{text}").trailers["Requester"] == values

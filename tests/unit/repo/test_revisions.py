@@ -1,4 +1,4 @@
-"""Times as people write them, and the newest commit that main had at a given time."""
+"""Times and revisions as people write them, and the history of a path as `git log` tells it."""
 
 from __future__ import annotations
 
@@ -6,57 +6,36 @@ import re
 from contextlib import suppress
 from datetime import datetime, timezone
 from pathlib import Path
+from random import Random
 
 import demandops
 import pygit2
 import pytest
 from demandops.base.errors import StateRepoError
 from demandops.repo.git import tree as trees
-from demandops.repo.history import revisions
+from demandops.repo.history import commit_log, revisions
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from pygit2 import Oid
 from pygit2.enums import ObjectType
+
+from tests.kit import plain_yaml
+from tests.kit.repo import git, write_tree
 
 MAIN = "refs/heads/main"
 ROS_BRIDGE = Path(__file__).parents[3] / "ros_bridge"
 WHO = pygit2.Signature("a", "a@example.org", 0, 0)
 NOW = datetime(2026, 1, 31, 12, 0, 30, tzinfo=timezone.utc)
+TABLES = plain_yaml.load(Path(__file__).with_name("revisions.yaml").read_text())
 
 
-def at(text: str) -> datetime:
-    return datetime.fromisoformat(text).replace(tzinfo=timezone.utc)
+@pytest.mark.parametrize("text", TABLES["times"])
+def test_a_time_begins_and_ends(text: str) -> None:
+    found = [revisions.parse_time(text, NOW, end=end) for end in (False, True)]
+    assert found == [one.replace(tzinfo=timezone.utc) for one in TABLES["times"][text]]
 
 
-@pytest.mark.parametrize(
-    ("text", "begins", "ends"),
-    [
-        ("2026-01-30", "2026-01-30T00:00:00", "2026-01-30T23:59:59"),
-        ("2026-01-30T14:03", "2026-01-30T14:03:00", "2026-01-30T14:03:59"),
-        ("2026-01-30 14:03", "2026-01-30T14:03:00", "2026-01-30T14:03:59"),
-        ("2026-01-30T14:03:20", "2026-01-30T14:03:20", "2026-01-30T14:03:20"),
-        ("2026-01-30T14:03:20Z", "2026-01-30T14:03:20", "2026-01-30T14:03:20"),
-        ("2026-01-30T14:03+02:00", "2026-01-30T12:03:00", "2026-01-30T12:03:59"),
-        ("11:59", "2026-01-31T11:59:00", "2026-01-31T11:59:59"),
-        ("9:05:07", "2026-01-31T09:05:07", "2026-01-31T09:05:07"),
-        ("14:03", "2026-01-30T14:03:00", "2026-01-30T14:03:59"),
-        ("2h", "2026-01-31T10:00:30", "2026-01-31T10:00:30"),
-        ("1h30m ago", "2026-01-31T10:30:30", "2026-01-31T10:30:30"),
-        ("2d", "2026-01-29T12:00:30", "2026-01-29T12:00:30"),
-        ("9999-12-31", "9999-12-31T00:00:00", "9999-12-31T23:59:59"),
-    ],
-)
-def test_a_time_begins_and_ends(text: str, begins: str, ends: str) -> None:
-    assert revisions.parse_time(text, NOW) == at(begins)
-    assert revisions.parse_time(text, NOW, end=True) == at(ends)
-
-
-@pytest.mark.parametrize(
-    "text",
-    (
-        *("", " ", "now", "main", "2026", "2026-13-01", "25:00", "12:60", "5", "2x", "ago"),
-        *("T14:03", "0001-01-01T00:00+05:00", "2026-01-30T14:03:20 UTC"),
-    ),
-)
+@pytest.mark.parametrize("text", TABLES["no_times"])
 def test_a_text_that_is_no_time_gives_none(text: str) -> None:
     assert revisions.parse_time(text, NOW) is None
 
@@ -81,43 +60,26 @@ def commit_of(repo: pygit2.Repository, text: str) -> pygit2.Commit:
     return revisions.resolve(repo, tip, text, NOW)
 
 
-def resolved(repo: pygit2.Repository, text: str) -> str:
-    return commit_of(repo, text).message
+def test_the_name_of_a_tag_comes_before_a_time(repo: pygit2.Repository) -> None:
+    first = commit_of(repo, "main~2").id
+    repo.references.create("refs/tags/2026-01-31", first)
+    assert commit_of(repo, "2026-01-31").id == first
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
+    ("text", "told"),
     [
-        ("main", "2"),
-        ("HEAD", "2"),
-        ("main~1", "5"),
-        ("HEAD^", "5"),
-        ("10:00", "0"),
-        ("10:01:59", "0"),
-        ("10:03", "2"),
-        ("11:00", "2"),
-        ("1h", "2"),
-        ("2026-01-31", "2"),
+        ("9:59:59", "at 2026-01-31 09:59:59 UTC the state repo did not exist yet; its first commit "
+         "is of 2026-01-31 10:00:00 UTC"),
+        ("domain", "'domain' is neither a commit of the state repo nor a time; write a branch"),
     ],
-)
-def test_a_revision_or_the_newest_commit_at_a_time(
-    repo: pygit2.Repository, text: str, wanted: str
+)  # fmt: skip
+def test_neither_revision_nor_a_time_of_the_state_repo(
+    repo: pygit2.Repository, text: str, told: str
 ) -> None:
-    assert resolved(repo, text) == wanted
-
-
-def test_the_name_of_a_tag_comes_before_a_time(repo: pygit2.Repository) -> None:
-    repo.references.create("refs/tags/2026-01-31", commit_of(repo, "main~2").id)
-    assert resolved(repo, "2026-01-31") == "0"
-
-
-def test_before_the_first_commit(repo: pygit2.Repository) -> None:
-    with pytest.raises(StateRepoError) as told:
-        resolved(repo, "9:59:59")
-    assert str(told.value) == (
-        "at 2026-01-31 09:59:59 UTC the state repo did not exist yet; its first commit is of "
-        "2026-01-31 10:00:00 UTC"
-    )
+    with pytest.raises(StateRepoError) as error:
+        commit_of(repo, text)
+    assert str(error.value).startswith(told)
 
 
 @pytest.fixture
@@ -143,29 +105,7 @@ def named(repo: pygit2.Repository) -> dict[str, str]:
 
 
 @pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("main~2", "first"),
-        ("main^^", "first"),
-        ("main~1~1", "first"),
-        ("main~0", "tip"),
-        ("HEAD~", "middle"),
-        ("refs/heads/main", "tip"),
-        ("heads/main", "tip"),
-        ("annotated", "first"),
-        ("plain~1", "first"),
-        ("demand/a-b", "first"),
-        ("\u00e9", "middle"),
-        ("origin/tracked", "first"),
-        ("tracked", "first"),
-        ("-x", "first"),
-        ("{tag}", "first"),
-        ("{first:.8}", "first"),
-        ("{middle:.8}~1", "first"),
-        ("{tip}", "tip"),  # a branch of that name does not count
-        ("refs/heads/{tip}", "first"),
-        ("refs/tags/twice", "tip"),
-    ],
+    ("text", "wanted"), [(one, name) for name, every in TABLES["commits"].items() for one in every]
 )
 def test_names_ids_and_steps_back(
     repo: pygit2.Repository, named: dict[str, str], text: str, wanted: str
@@ -176,17 +116,11 @@ def test_names_ids_and_steps_back(
 @pytest.mark.parametrize(
     "text",
     [
-        *(":/2", ":/", ":0:file", "main:file", "main^{{/5}}", "main^{{tree}}", "main^{{}}"),
-        *("main^2", "^main", "~1", "@", "@~1", "HEAD@{{1}}", "@{{u}}", "@{{-1}}", "main@{{1h}}"),
-        *("main..main", "main...main", "--all", "--upload-pack=x", "-", "refs/heads/../../HEAD"),
-        *("../HEAD", "/main", "refs/heads/", "refs/heads/main.lock", "refs/stash", "stash"),
-        *("main~3", "main~999999999", "main~9999999999", "main~" + "9" * 5000, "main~-1"),
-        *("main\0", "main\n", "main\nx", "\0", "\udcff", "main~\u0661", "\uff12h", "\uff4dain"),
-        *("MAIN", "config", "abc", "folder", "{tree}", "{tree:.8}", "{middle:.9}", "twice"),
-        *("0" * 40, "f" * 40, "f" * 41, "x" * 251, "x" * 249, "x/" * 120, "x" * 1_000_000),
-        *("main" + "^" * 1_000_000, "", " "),
+        *TABLES["none"],
+        *("main~" + "9" * 5000, "\udcff", "0" * 40, "f" * 40, "f" * 41, "x" * 251, "x" * 249),
+        *("x/" * 120, "x" * 1_000_000, "main" + "^" * 1_000_000),
     ],
-)  # fmt: skip
+)
 def test_anything_else_is_refused_and_quoted(
     repo: pygit2.Repository, named: dict[str, str], text: str
 ) -> None:
@@ -197,26 +131,10 @@ def test_anything_else_is_refused_and_quoted(
     assert str(told.value).startswith("'") and len(str(told.value)) < 600
 
 
-_PIECES = [
-    "main",
-    "HEAD",
-    "@",
-    "{",
-    "}",
-    "^",
-    "~",
-    ":/",
-    "/",
-    "..",
-    "-",
-    "0",
-    "\0",
-    "refs/heads/",
-    "1h",
-]
+PIECES = ["main", "HEAD", "refs/heads/", "1h", *"@{}^~/-0\0", ":/", ".."]
 
 
-@given(st.one_of(st.text(), st.lists(st.sampled_from(_PIECES), max_size=12).map("".join)))
+@given(st.one_of(st.text(), st.lists(st.sampled_from(PIECES), max_size=12).map("".join)))
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_whatever_the_text_it_is_a_commit_or_refused(repo: pygit2.Repository, text: str) -> None:
     with suppress(StateRepoError):
@@ -231,21 +149,115 @@ def test_nothing_lets_libgit2_or_git_parse_a_revision() -> None:
     assert [path.name for path in sources if parsers.search(path.read_text())] == []
 
 
-def test_neither_revision_nor_time(repo: pygit2.Repository) -> None:
-    with pytest.raises(StateRepoError) as told:
-        resolved(repo, "domain")
-    assert str(told.value) == (
-        "'domain' is neither a commit of the state repo nor a time; write a branch, a tag or 4 to "
-        "40 digits of an id, with ~N for the Nth commit before it, or a time like "
-        "2026-01-31T14:03, 2026-01-31, 14:03 (all UTC) or 2h (two hours ago); `demandops log` "
-        "lists the commits"
-    )
-
-
-@pytest.mark.parametrize("text", ["main", "HEAD", ":/2", "main^{/2}", "{tip:.39}", "none", ""])
+@pytest.mark.parametrize("text", ["main", "HEAD", ":/2", "{tip:.39}", "none", ""])
 def test_a_trailer_or_a_journal_names_a_commit_by_its_whole_id_only(
     repo: pygit2.Repository, named: dict[str, str], text: str
 ) -> None:
     assert str(trees.commit_of(repo, named["tip"]).id) == named["tip"]
     with pytest.raises(StateRepoError):
         trees.commit_of(repo, text.replace("{tip:.39}", named["tip"][:39]))
+
+
+PATH = "clusters/c/d/n/r.yaml"
+
+
+class History:
+    """A repository whose commits are a minute apart; some of them are merges."""
+
+    def __init__(self, folder: Path) -> None:
+        self.repo = pygit2.init_repository(str(folder), bare=True, initial_head="main")
+        self.made: list[pygit2.Oid] = []
+
+    def commit(self, text: str | None, *parents: int, path: str = PATH) -> pygit2.Oid:
+        """Commit a tree with ``text`` at a path, or without a file there if ``text`` is None.
+
+        ``parents`` are the numbers of earlier commits.
+        """
+        number = len(self.made)
+        who = pygit2.Signature("a", "a@example.org", 1_770_000_000 + 60 * number, 0)
+        files = {"other": str(number)} | ({path: text} if text is not None else {})
+        tree = write_tree(self.repo, None, files)
+        above = [self.made[parent] for parent in parents]
+        made = self.repo.create_commit(None, who, who, f"{number}\n", tree, above)
+        self.made.append(made)
+        return made
+
+    def by_git(self, path: str) -> set[str]:
+        tip = str(self.made[-1])
+        return {*git(self.repo.path, "log", "--format=%H", tip, "--", path).split()}
+
+    def ours(self, path: str) -> list[str]:
+        return [t.entry.commit for t in commit_log.changes_to(self.repo, self.made[-1], path)]
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_the_same_commits_as_git_log(tmp_path: Path, seed: int) -> None:
+    random = Random(seed)
+    history = History(tmp_path / "r.git")
+    history.commit(None)
+    for number in range(1, 30):
+        parents = {number - 1, random.randrange(number)} if random.random() < 0.3 else {number - 1}
+        parents = {random.randrange(number)} if random.random() < 0.1 else parents
+        chosen = sorted(parents, reverse=random.random() < 0.5)
+        tip = history.repo[history.made[chosen[0]]].peel(pygit2.Commit)
+        text = trees.read_text(tip.tree, PATH)
+        if random.random() < 0.3:
+            text = random.choice([None, "a", "b", "c"])
+        history.commit(text, *chosen)
+    for path in (PATH, "clusters/c", "nothing"):
+        ours = history.ours(path)
+        assert set(ours) == history.by_git(path)
+        assert len(ours) == len(set(ours))
+
+
+def test_the_last_time_that_something_stood_there(tmp_path: Path) -> None:
+    history = History(tmp_path / "r.git")
+    history.commit("a")
+    history.commit(None, 0)
+    started = history.commit("b", 1)
+    first = history.commit("c", 2)
+    second = history.commit("d", 3)
+    tip = history.commit("d", 4)
+    found = commit_log.history_of(history.repo, tip, PATH, 1)
+    assert found.started and found.started.commit == str(started)
+    assert ([one.commit for one in found.newest], found.more) == ([str(second)], 1)
+    assert found.stopped is None
+    stopped = history.commit(None, 5)
+    gone = commit_log.history_of(history.repo, stopped, PATH, 9)
+    assert gone.stopped and gone.stopped.commit == str(stopped)
+    assert [one.commit for one in gone.newest] == [str(second), str(first)]
+    assert gone.started == found.started
+    never = commit_log.history_of(history.repo, stopped, "nothing/there", 9)
+    assert never == commit_log.PathHistory(None, (), 0, None)
+
+
+def test_where_a_release_is_or_once_was(tmp_path: Path) -> None:
+    history = History(tmp_path / "r.git")
+    there = history.commit("a")
+    gone = history.commit(None, 0)
+    assert commit_log.release_path(history.repo, there, "r") == PATH
+    assert commit_log.release_path(history.repo, gone, "r") == PATH
+    assert commit_log.release_path(history.repo, gone, "q") is None
+    assert commit_log.release_path(history.repo, gone, "*") is None
+    assert commit_log.stopped_release_names(history.repo, gone) == {"r"}
+    history.commit("a", 1, path="clusters/c/d/_charts/detection-0.1.0.yaml")
+    without_chart = history.commit(None, 2)
+    assert commit_log.stopped_release_names(history.repo, without_chart) == {"r"}
+
+
+def test_a_clock_that_was_set_back_hides_no_commit_and_shows_no_known_one(tmp_path: Path) -> None:
+    repo = pygit2.init_repository(str(tmp_path), bare=True)
+    tree = repo.TreeBuilder().write()
+
+    def commit(seconds: int, *parents: Oid) -> Oid:
+        who = pygit2.Signature("someone", "someone@example.org", seconds)
+        return repo.create_commit(None, who, who, f"at {seconds}", tree, list(parents))
+
+    first = until = commit(1000)
+    # after second 1030 the clock is set back to 10
+    for second in (*range(1001, 1031), *range(10, 40)):
+        until = commit(second, until)
+    branch = commit(5000, first)
+    merge = commit(5001, until, branch)
+    found = {one.id for one, _ in commit_log.commits(repo, str(merge), str(until))}
+    assert found == {merge, branch}

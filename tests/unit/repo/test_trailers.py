@@ -14,40 +14,21 @@ from hypothesis import strategies as st
 
 from tests.kit.chance import examples, visible
 from tests.kit.repo import git
+from tests.unit.repo.test_message_format import TEXTS
 
 
-@pytest.mark.parametrize(
-    ("text", "wanted"),
-    [
-        ("Subject\n\nKey: value\n", {"Key": ["value"]}),
-        ("Subject\n\nBody.\n\nA: 1\nB: 2\nA: 3\n", {"A": ["1", "3"], "B": ["2"]}),
-        ("Subject\n\nBody.\n\nA: 1", {"A": ["1"]}),
-        ("Subject\n\nBody.\n\nA: 1\n\n\n", {"A": ["1"]}),
-        ("Subject\n\nA: 1\n\nBody.\n", {}),
-        ("Key: value\n", {}),
-        ("Subject\nKey: value\n", {}),
-        ("Subject\n\nSome text: with a colon\n", {}),
-        ("Subject\n\nA: 1\nno colon\n", {}),
-        ("Subject\n\nA: 1: 2\n", {"A": ["1: 2"]}),
-        ("Subject\n\nSee https://example.org/: there\n", {}),
-        ("Subject\r\n\r\nA: 1\r\n", {}),
-        ("", {}),
-        ("\n\n\n", {}),
-        ('Revert "Join x"\n\nThis reverts commit 1234.\n', {}),
-    ],
-)
+@pytest.mark.parametrize(("text", "wanted"), TEXTS["trailers"].items())
 def test_trailers_are_the_last_paragraph_if_it_holds_nothing_else(
     text: str, wanted: dict[str, list[str]]
 ) -> None:
     assert parse(text).trailers == wanted
 
 
-def test_a_commit_that_a_person_picked_is_not_taken_for_the_generators() -> None:
-    text = "Join x\n\nOperation: join\nRender-Version: 1\n(cherry picked from commit 12ab)\n"
-    assert parse(text).trailers == {}
-
-
-IDS = st.text(visible, min_size=1, max_size=60).filter(lambda text: not id_problem(text))
+NASTY = [*TEXTS["ids"], "x" * 300, "ü" * 300, "🚗" * 300]
+IDS = st.one_of(
+    st.text(visible, min_size=1, max_size=60).filter(lambda text: not id_problem(text)),
+    st.sampled_from(NASTY),
+)
 
 
 @given(names=st.lists(IDS, min_size=1, max_size=3, unique=True), request=IDS, application=IDS)
@@ -58,6 +39,7 @@ def test_every_id_is_read_back_by_git_and_by_us_as_it_was(
     decision = type(desk)().join(*names, id=request, application=application)
     text = commit_message.of_decision(decision, "op-1", desk.now)
     who = commit_message.author(decision, desk.now)
+    assert who.name.strip() and len(who.name) <= 200
     tree = repo.TreeBuilder().write()
     committer = commit_message.generator_signature(desk.now)
     commit = repo.create_commit(None, who, committer, text, tree, [])
@@ -84,21 +66,19 @@ def _commit(repo: pygit2.Repository, operation: str, *parents: pygit2.Oid) -> py
 def test_operations_that_arrived_after_a_commit_are_found_and_no_others(
     repo: pygit2.Repository,
 ) -> None:
-    def found(tip: pygit2.Oid, base: str) -> dict[str, str]:
-        return {name: a.commit for name, a in operations_since(repo, tip, base).items()}
-
     first = _commit(repo, "op-1")
     second = _commit(repo, "op-2", first)
-    person = _commit(repo, "", second)
-    third = _commit(repo, "op-3", person)
-    assert found(third, str(first)) == {"op-2": str(second), "op-3": str(third)}
-    assert found(third, str(third)) == {}
-    everything = {"op-1": str(first), "op-2": str(second), "op-3": str(third)}
-    assert found(third, "") == everything, "without a base, all operations must be found"
-    assert found(third, "0" * 40) == everything
-    assert found(third, "no commit") == everything
+    tip = _commit(repo, "op-3", _commit(repo, "", second))
     beside = _commit(repo, "op-9", first)
-    assert found(third, str(beside)) == everything, "a base on another branch must count as none"
+
+    def found(base: object) -> dict[str, str]:
+        return {name: a.commit for name, a in operations_since(repo, tip, str(base)).items()}
+
+    assert found(first) == {"op-2": str(second), "op-3": str(tip)}
+    assert found(tip) == {}
+    everything = {"op-1": str(first), "op-2": str(second), "op-3": str(tip)}
+    for none in ("", "0" * 40, "no commit", beside):  # `beside` is on another branch
+        assert found(none) == everything
 
 
 def test_the_newest_commit_of_the_generator_is_found_behind_those_of_people(

@@ -8,7 +8,7 @@ import os
 import subprocess
 import tempfile
 import weakref
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -20,7 +20,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tests.kit.chance import examples
-from tests.kit.repo import git, write_tree
+from tests.kit.repo import git
 
 Files = dict[str, str]
 
@@ -29,50 +29,40 @@ PATHS = st.lists(NAMES, min_size=1, max_size=4).map("/".join)
 TEXTS = st.sampled_from(["", "x", "x\n", "ü{{ y }}\n"])
 
 
-def _without_conflict(paths: set[str], path: str) -> bool:
-    """Return whether a tree with the files ``paths`` can also have a file ``path``."""
-    return not any(o.startswith(f"{path}/") or path.startswith(f"{o}/") for o in paths - {path})
+def fits(path: str, paths: Iterable[str]) -> bool:
+    """Return whether one tree can have files at a path and at others."""
+    others = {*paths} - {path}
+    return not any(one.startswith(f"{path}/") or path.startswith(f"{one}/") for one in others)
 
 
 @st.composite
 def file_trees(draw: st.DrawFn) -> Files:
     files: Files = {}
     for path, text in draw(st.dictionaries(PATHS, TEXTS, max_size=8)).items():
-        if _without_conflict(set(files), path):
+        if fits(path, files):
             files[path] = text
     return files
 
 
 @st.composite
 def changes(draw: st.DrawFn, files: Files) -> dict[str, str | None]:
-    """Return random changes: files to remove (None), and new texts of files.
-
-    Some of the files to remove do not exist. The files with new texts fit into one tree.
-    """
+    """Return random changes: files to remove (None), also such that do not exist, and new texts."""
     known = st.sampled_from(sorted(files)) if files else PATHS
-    removed = draw(st.lists(known | PATHS, max_size=4))
-    made: dict[str, str | None] = {
-        path: None for path in removed if not any(file.startswith(f"{path}/") for file in files)
-    }
+    made: dict[str, str | None] = {}
+    for path in draw(st.lists(known | PATHS, max_size=4)):
+        if not any(file.startswith(f"{path}/") for file in files):
+            made[path] = None
     for path, text in draw(st.lists(st.tuples(known | PATHS, TEXTS), max_size=5)):
-        if _without_conflict({p for p, t in made.items() if t is not None}, path):
+        if fits(path, (other for other, new in made.items() if new is not None)):
             made[path] = text
-    order = draw(st.permutations(sorted(made)))
-    return {path: made[path] for path in order}
+    return {path: made[path] for path in draw(st.permutations(sorted(made)))}
 
 
 def changed(files: Files, change: Mapping[str, str | None]) -> Files:
-    """Return the files after a change, by the model.
-
-    First, files are removed. Then each new text replaces the files that conflict with its path.
-    """
-    after = {path: text for path, text in files.items() if change.get(path, text) is not None}
-    for path, text in change.items():
-        if text is None:
-            continue
-        after = {known: t for known, t in after.items() if _without_conflict({known}, path)}
-        after[path] = text
-    return after
+    """Return the files after a change; a new text replaces the files that conflict with it."""
+    after = {path: text for path, text in files.items() if path not in change}
+    new = {path: text for path, text in change.items() if text is not None}
+    return {path: text for path, text in after.items() if fits(path, new)} | new
 
 
 @contextmanager
@@ -136,12 +126,6 @@ def test_differences_between_trees_list_exactly_the_changed_files(
         assert len(told) == len(paths)
         for path, blob in told:
             assert (_text(repo, blob) if blob else None) == after.get(path)
-
-
-def test_a_change_rewrites_only_the_folders_on_its_way(repo: pygit2.Repository) -> None:
-    base = lay(repo, {f"{top}/{n}": "x" for top in "abc" for n in range(3)})
-    made = repo[write_tree(repo, base, {"b/1": "y"})].peel(pygit2.Tree)
-    assert [made[name].id == base[name].id for name in "abc"] == [True, False, True]
 
 
 def test_bytes_that_are_no_text_show_instead_of_stopping(repo: pygit2.Repository) -> None:

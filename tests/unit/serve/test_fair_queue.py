@@ -2,44 +2,32 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from random import Random
 from typing import Any
 
 import pytest
+from demandops.base.errors import QueueFull
+from demandops.base.runtime import REAL
+from demandops.repo.write.journal import Journal
+from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.queue import FairQueue, Ticket, requester_of, subjects_of
 
 from tests.kit.memory import NOW
 
 
-def ticket(name: str, who: str, *subjects: str, **fields: Any) -> Ticket:
+def ticket(text: str) -> Ticket:
+    """Return the ticket of a demand: its name, which begins with its requester, and its subjects.
+
+    The demand ``all`` may touch anything.
+    """
+    name, *subjects = text.split()
+    if name == "all":
+        return Ticket(name, {"kind": "Decommission", "name": "vehicle01"}, NOW)
     applications = [{"id": subject} for subject in subjects]
-    goal = {"demand": name, "requesters": [who], "applications": applications, **fields}
-    return Ticket(name, goal, NOW)
-
-
-def order(*tickets: Ticket) -> list[str]:
-    queue = FairQueue()
-    for each in tickets:
-        queue.append(each)
-    return [queue.popleft().operation for _ in tickets]
-
-
-def test_requesters_take_turns() -> None:
-    many = [ticket(f"a{number}", "a", f"x{number}") for number in range(100)]
-    assert order(*many, ticket("b0", "b", "y"), ticket("c0", "c", "z"))[:5] == [
-        *("a0", "b0", "c0"),
-        *("a1", "a2"),
-    ]
-
-
-def test_the_turn_goes_to_what_a_demand_must_follow() -> None:
-    waiting = (
-        ticket("a0", "a", "x0"),
-        ticket("a1", "a", "x1"),
-        ticket("a2", "a", "x2", "shared"),
-        ticket("b0", "b", "shared"),
+    return Ticket(
+        name, {"demand": name, "requesters": [name[0]], "applications": applications}, NOW
     )
-    assert order(*waiting) == ["a0", "a2", "a1", "b0"]
 
 
 def reference(name: str, subject: str, *who: str) -> Ticket:
@@ -47,57 +35,66 @@ def reference(name: str, subject: str, *who: str) -> Ticket:
     return Ticket(name, {"id": name, "connections": [connection]}, NOW)
 
 
-def test_goals_of_the_reference_that_share_a_requester_keep_their_order() -> None:
-    waiting = (reference("a0", "x", "a"), reference("a1", "y", "a", "b"), reference("b0", "z", "b"))
-    assert order(*waiting) == ["a0", "a1", "b0"]
-
-
-def test_demands_of_one_client_keep_their_order() -> None:
-    queue = FairQueue(in_order=True)
-    for each in (ticket("a0", "a", "x"), ticket("a1", "a", "y"), ticket("b0", "b", "z")):
+def order(*tickets: Ticket, in_order: bool = False) -> list[str]:
+    queue = FairQueue(in_order=in_order)
+    for each in tickets:
         queue.append(each)
-    assert [queue.popleft().operation for _ in range(3)] == ["a0", "a1", "b0"]
+    return [queue.popleft().operation for _ in tickets]
 
 
-def test_nothing_overtakes_what_may_touch_anything() -> None:
-    everything = Ticket("all", {"kind": "Decommission", "name": "vehicle01"}, NOW)
-    waiting = (ticket("a0", "a", "x"), ticket("a1", "a", "y"), everything, ticket("b0", "b", "z"))
-    assert order(*waiting) == ["a0", "a1", "all", "b0"]
+def test_requesters_take_turns() -> None:
+    many = [ticket(f"a{number} x{number}") for number in range(100)]
+    assert order(*many, ticket("b0 y"), ticket("c0 z"))[:5] == ["a0", "b0", "c0", "a1", "a2"]
 
 
-def test_what_was_put_back_comes_first_and_requesters_take_turns_again() -> None:
+@pytest.mark.parametrize(
+    ("came", "left"),
+    [
+        ("a0 x0, a1 x1, a2 x2 shared, b0 shared", "a0 a2 a1 b0"),  # b0 must follow a2
+        ("a0 x, a1 y, all, b0 z", "a0 a1 all b0"),
+    ],
+)
+def test_nothing_overtakes_what_it_must_follow(came: str, left: str) -> None:
+    assert order(*map(ticket, came.split(", "))) == left.split()
+
+
+def test_what_must_keep_its_order_keeps_it() -> None:
+    shared = (reference("a0", "x", "a"), reference("a1", "y", "a", "b"), reference("b0", "z", "b"))
+    assert order(*shared) == ["a0", "a1", "b0"], "goals of the reference share a requester"
+    of_one_client = map(ticket, ("a0 x", "a1 y", "b0 z"))
+    assert order(*of_one_client, in_order=True) == ["a0", "a1", "b0"]
+
+
+@pytest.mark.parametrize(
+    ("came", "is_served", "left"),
+    [
+        ("a0 x0, a1 x1, a2 x2, a3 x3, b0 y", False, "b0 a1 c0 a2 a3"),
+        # who had a turn comes after who came meanwhile
+        ("a0 x0, a1 x1, a2 x2, b0 y", True, "b0 c0 a1 a2"),
+    ],
+)
+def test_what_was_put_back_comes_first_and_requesters_take_turns_again(
+    came: str, is_served: bool, left: str
+) -> None:
     queue = FairQueue()
-    for each in (*(ticket(f"a{n}", "a", f"x{n}") for n in range(4)), ticket("b0", "b", "y")):
-        queue.append(each)
+    for each in came.split(", "):
+        queue.append(ticket(each))
     taken = [queue.popleft() for _ in range(4)]
     assert [each.operation for each in taken] == ["a0", "b0", "a1", "a2"]
-    queue.append(ticket("c0", "c", "z"))
-    queue.put_back(taken[1:])
-    left = [queue.popleft().operation for _ in range(len(queue))]
-    assert left == ["b0", "a1", "c0", "a2", "a3"]
-
-
-def test_who_had_a_turn_comes_after_who_came_meanwhile() -> None:
-    queue = FairQueue()
-    for each in (*(ticket(f"a{n}", "a", f"x{n}") for n in range(3)), ticket("b0", "b", "y")):
-        queue.append(each)
-    taken = [queue.popleft() for _ in range(4)]
-    queue.append(ticket("c0", "c", "z"))
-    queue.put_back(taken[1:], served=taken[:1])
-    left = [queue.popleft().operation for _ in range(len(queue))]
-    assert left == ["b0", "c0", "a1", "a2"]
+    queue.append(ticket("c0 z"))
+    queue.put_back(taken[1:], served=taken[: int(is_served)])
+    assert [queue.popleft().operation for _ in range(len(queue))] == left.split()
 
 
 @pytest.mark.parametrize("seed", range(20))
 def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> None:
     random = Random(seed)
     queue, waiting, left = FairQueue(), list[Ticket](), list[Ticket]()
-    sent = [
-        ticket(f"{number}", random.choice("abc"), *random.sample("uvwxyz", random.randrange(3)))
-        if random.random() < 0.9
-        else Ticket(f"{number}", None, NOW)
-        for number in range(80)
-    ]
+    sent = []
+    for number in range(80):
+        words = [f"{random.choice('abc')}{number}", *random.sample("uvwxyz", random.randrange(3))]
+        is_valid = random.random() < 0.9
+        sent.append(ticket(" ".join(words)) if is_valid else Ticket(f"{number}", None, NOW))
     for each in sent:
         queue.append(each)
         waiting.append(each)
@@ -119,13 +116,9 @@ def test_every_demand_comes_once_and_in_the_order_of_its_subjects(seed: int) -> 
     assert len(queue) == 0 and len(set(left)) == len(left)
     for number, later in enumerate(left):
         for earlier in left[:number]:
-            if earlier.goal is None or later.goal is None:
-                shared = True
-            else:
-                shared = bool(
-                    set(subjects_of(earlier.goal) or ()) & set(subjects_of(later.goal) or ())
-                )
-            assert not shared or sent.index(earlier) < sent.index(later)
+            of_both = (set(subjects_of(one.goal) or ()) for one in (earlier, later))
+            is_free = earlier.goal and later.goal and set.isdisjoint(*of_both)
+            assert is_free or sent.index(earlier) < sent.index(later)
 
 
 @pytest.mark.parametrize(
@@ -139,3 +132,18 @@ def test_an_invalid_goal_is_queued_too(goal: Any) -> None:
     assert requester_of(goal) == ""
     assert not subjects_of(goal)
     assert order(Ticket("one", goal, NOW), Ticket("two", goal, NOW)) == ["one", "two"]
+
+
+@pytest.mark.parametrize(
+    ("goal", "whose"), [({"requesters": ["one"]}, "of 'one'"), ({}, "without a requester")]
+)
+def test_too_many_demands_are_told_with_their_requester(
+    tmp_path: Path, goal: dict[str, Any], whose: str
+) -> None:
+    demands = Demands(Journal(tmp_path / "journal"), 10, 1, REAL)
+    tickets = [Ticket(name, goal, REAL.now()) for name in ("a", "b")]
+    for ticket in tickets:
+        demands.arrive(ticket)
+    demands.take([], 0)
+    with pytest.raises(QueueFull, match=f"^1 demands {whose} have no answer yet; "):
+        tickets[1].future.result(0)

@@ -1,0 +1,277 @@
+"""Pauses between tries, times of polls, demands in a minute, and which leases have ended."""
+
+from __future__ import annotations
+
+import logging
+from dataclasses import replace
+from datetime import timedelta
+from itertools import count
+
+import pytest
+from demandops.base.runtime import REAL
+from demandops.connections.connection import Connection, Route
+from demandops.connections.mqtt import MQTT
+from demandops.model.config.load import load
+from demandops.model.demand.claim import Application, Claim, Lease
+from demandops.model.demand.demand_request import Demanded, Join
+from demandops.model.ledger.ledger import Ledger
+from demandops.serve.timing.expiry import LeaseExpiry
+from demandops.serve.timing.timers import (
+    FIRST_PAUSE_S,
+    LONGEST_AWAY_S,
+    LONGEST_TURN_S,
+    Backoff,
+    PollTimer,
+    RateLimit,
+    parse_interval,
+)
+from demandops.serve.worker import RemoteMonitor
+
+from tests.kit.clock import Clock
+from tests.kit.config import configuration, edited
+from tests.kit.memory import NOW, rebuilt
+
+
+def test_waits_grow_to_their_bounds_and_never_beyond() -> None:
+    pace = Backoff(200, REAL)
+    away = [pace.unreachable() for _ in range(20)]
+    assert max(away) <= LONGEST_AWAY_S
+    assert min(away[-5:]) >= LONGEST_AWAY_S / 2
+    turns = [pace.overtaken(10, 0.1, 1.0) for _ in range(20)]
+    assert max(turns) <= LONGEST_TURN_S
+    assert min(turns[-5:]) >= LONGEST_TURN_S / 2
+
+
+def test_a_remote_that_answers_is_not_taken_to_be_away_and_success_begins_anew() -> None:
+    pace = Backoff(200, REAL)
+    for _ in range(10):
+        pace.unreachable()
+    pace.overtaken(10, 0.1, 1.0)
+    assert pace.unreachable() <= FIRST_PAUSE_S
+    for _ in range(10):
+        pace.overtaken(10, 0.1, 1.0)
+    pace.published()
+    assert pace.overtaken(10, 0.1, 1.0) <= FIRST_PAUSE_S
+
+
+def test_a_batch_takes_no_more_demands_than_are_evaluated_during_one_push() -> None:
+    pace = Backoff(200, REAL)
+    assert pace.max_demands == 200
+    for demands, evaluating_s, most in ((100, 0.1, 100), (100, 1.0, 20), (2, 100.0, 1), (1, 0, 1)):
+        pace.overtaken(demands, evaluating_s=evaluating_s, pushing_s=0.2)
+        assert pace.max_demands == most
+    pace.published()
+    assert pace.max_demands == 200
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock(NOW)
+
+
+def test_the_first_look_is_due_at_once_and_the_next_after_the_interval(clock: Clock) -> None:
+    made = PollTimer(30, clock)
+    assert made.start_if_due()
+    made.finished(reached=True)
+    assert made.seconds_until_due() == 30 and not made.start_if_due()
+    clock.pass_(30)
+    assert made.start_if_due()
+
+
+@pytest.mark.parametrize(
+    ("interval", "is_local", "reached", "pauses"),
+    [
+        (10, False, [False] * 5 + [True], [20, 40, 60, 60, 60, 10]),
+        (600, False, [False, True], [600, 600]),  # above the bound
+        (30, True, [True], [1]),  # on this disk a look costs little
+        (0, True, [True], [None]),
+    ],
+)
+def test_while_the_remote_is_away_looks_become_seldom_within_bounds(
+    clock: Clock, interval: float, is_local: bool, reached: list[bool], pauses: list[float | None]
+) -> None:
+    made, found = PollTimer(interval, clock, local=is_local), []
+    for is_reached in reached:
+        made.finished(reached=is_reached)
+        found.append(made.seconds_until_due())
+    assert found == pauses
+
+
+def test_many_requests_give_one_poll_and_one_more_after_it(clock: Clock) -> None:
+    made = PollTimer(0, clock)
+    assert made.seconds_until_due() is None and not made.start_if_due()
+    for _ in range(3):
+        made.request()
+    assert made.start_if_due()
+    assert not made.start_if_due()
+    made.request()  # this comes during the poll, which may have missed the cause of the request
+    made.finished(reached=True)
+    assert made.seconds_until_due() == 0.5, "a burst of requests must not give one poll each"
+    clock.pass_(0.5)
+    assert made.start_if_due()
+    made.finished(reached=True)
+    assert made.seconds_until_due() is None
+
+
+def test_by_chance_looks_come_earlier_and_never_later() -> None:
+    made = PollTimer(100, REAL)
+    pauses = set()
+    for _ in range(50):
+        made.finished(reached=True)
+        pauses.add(made.seconds_until_due())
+    assert len(pauses) > 10
+    assert all(pause is not None and 80 <= pause <= 100 for pause in pauses)
+
+
+@pytest.mark.parametrize(
+    ("text", "seconds"), [("30s", 30), ("1h30m", 5400), ("0", 0), ("0s", 0), ("0.2", 0.2)]
+)
+def test_an_interval_is_a_duration_or_seconds(text: str, seconds: float) -> None:
+    assert parse_interval(text) == seconds
+
+
+@pytest.mark.parametrize("text", ["", "-1", "often", "1e9", "30 s", "nan"])
+def test_anything_else_is_no_interval(text: str) -> None:
+    with pytest.raises(ValueError, match="is not a duration"):
+        parse_interval(text)
+
+
+def test_away_and_back_are_logged_once_each(clock: Clock, caplog: pytest.LogCaptureFixture) -> None:
+    caplog.set_level(logging.INFO, logger="demandops")
+    remote = RemoteMonitor("https://git.example/state.git", clock)
+    remote.record_reached()
+    for _ in range(3):
+        remote.record_unreachable("cannot be fetched: no route")
+    assert remote.status.unreachable == "cannot be fetched: no route"
+    clock.pass_(90)
+    for _ in range(3):
+        remote.record_reached(pushed=True)
+    away, back = caplog.messages
+    assert away.startswith("cannot be fetched: no route; trying again")
+    assert back == "https://git.example/state.git is back after 90 s"
+    assert not remote.status.unreachable and remote.status.last_push is not None
+
+
+def test_a_push_that_is_denied_is_remembered_until_one_is_taken(clock: Clock) -> None:
+    remote = RemoteMonitor("somewhere", clock)
+    remote.record_push_denied("takes no push: frozen")
+    remote.record_reached()
+    assert (remote.status.push_denied, remote.status.unreachable) == ("takes no push: frozen", "")
+    remote.record_reached(pushed=True)
+    assert remote.status.push_denied == ""
+
+
+class Sending:
+    """Sends demands to a rate limit of two a minute."""
+
+    def __init__(self) -> None:
+        self.throttle = RateLimit()
+        quotas = "    quotas: {demandsPerMinute: 2}\n    namespace:"
+        policy = edited("policy/access-domains.yaml", "    namespace:", quotas)
+        self._config = load(configuration(policy))
+        self._names = map(str, count())
+
+    def send(self, requester: str, at_s: float, operation: str = "") -> bool:
+        """Send a demand; return whether the limit allowed it."""
+        app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
+        request = Join("one", (Demanded(app, (requester,), "applications[0].{}".format),))
+        moment, name = NOW + timedelta(seconds=at_s), operation or next(self._names)
+        return not list(self.throttle.faults(request, self._config, name, moment))
+
+
+def test_a_hand_in_that_is_judged_again_counts_once() -> None:
+    sending = Sending()
+    assert [sending.send("vehicle00", 0, "same") for _ in range(5)] == [True] * 5
+    assert sending.send("vehicle00", 1)
+    assert not sending.send("vehicle00", 2)
+
+
+def test_who_sends_no_more_is_forgotten() -> None:
+    sending = Sending()
+    for number in range(500):
+        assert sending.send(f"vehicle{number}", number)
+    assert len(sending.throttle._seen) <= 62
+    assert sending.send("vehicle499", 499.5)
+    assert not sending.send("vehicle499", 499.6)
+
+
+def test_a_clock_that_is_set_back_does_not_shut_anybody_out() -> None:
+    sending = Sending()
+    assert [sending.send("vehicle00", at) for at in (5000, 5001)] == [True, True]
+    assert sending.send("vehicle00", 0)
+
+
+def leased(*terms: tuple[str, int, int]) -> Ledger:
+    """Return a ledger with a claim for each (demand, lease seconds, slack), booked at `NOW`."""
+    claims = []
+    for number, (demand, seconds, slack) in enumerate(terms):
+        link = Connection(f"{number}", MQTT, "vehicle00", "edge", "", (Route("/a", "/a"),))
+        lease = Lease(seconds, slack, NOW + timedelta(seconds=seconds))
+        claims.append(Claim(link, demand, demand, ("a",), NOW, lease))
+    return rebuilt(claims)
+
+
+@pytest.fixture
+def expiry(clock: Clock) -> LeaseExpiry:
+    return LeaseExpiry(clock)
+
+
+def ended(expiry: LeaseExpiry, ledger: Ledger) -> list[str]:
+    return [claim.demand for claim in expiry.ended_claims(ledger)[1]]
+
+
+@pytest.mark.parametrize("steps", [[3600], [40, 40, 3600], [3600, -3600, 3600]])
+def test_it_is_set_forward_and_a_full_term_is_granted(
+    clock: Clock, expiry: LeaseExpiry, steps: list[int], caplog: pytest.LogCaptureFixture
+) -> None:
+    ledger = leased(("short", 60, 5), ("long", 600, 5))
+    for step in steps:
+        clock.set_by(step)
+        assert ended(expiry, ledger) == []
+    assert "the clock jumped forward by 3600 s, so leases get their full term" in caplog.text
+    for seconds, over in ((65, []), (1, ["short"]), (539, ["short"]), (1, ["short", "long"])):
+        clock.pass_(seconds)
+        assert ended(expiry, ledger) == over
+
+
+def test_a_step_that_nobody_looked_at_is_noticed_later(clock: Clock, expiry: LeaseExpiry) -> None:
+    ledger = leased(("a", 60, 0))
+    clock.pass_(50)
+    clock.set_by(3600)
+    clock.pass_(50)
+    assert ended(expiry, ledger) == []
+    clock.pass_(61)
+    assert ended(expiry, ledger) == ["a"]
+
+
+def test_small_adjustments_of_the_clock_count_as_no_step(
+    clock: Clock, expiry: LeaseExpiry, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.WARNING)
+    ledger = leased(("a", 60, 0))
+    for _ in range(31):
+        clock.pass_(1)
+        clock.set_by(1)
+        expiry.seconds_until_due(ledger, 60.0)
+    assert ended(expiry, ledger) == ["a"]
+    assert caplog.text == ""
+
+
+def test_it_looks_again_when_the_first_lease_ends(clock: Clock, expiry: LeaseExpiry) -> None:
+    ledger = leased(("a", 20, 10), ("b", 600, 0))
+    assert expiry.seconds_until_due(ledger, 60.0) == pytest.approx(30.01)
+    clock.pass_(29.5)
+    assert expiry.seconds_until_due(ledger, 60.0) == 1.0
+    clock.pass_(100)
+    assert expiry.seconds_until_due(ledger, 60.0) == 1.0, "it must not keep the clock busy"
+    assert expiry.seconds_until_due(Ledger(), 60.0) == 60.0
+    assert expiry.seconds_until_due(leased(("b", 86_400, 0)), 60.0) == 60.0
+
+
+def test_an_end_that_moves_within_its_minute_is_seen(expiry: LeaseExpiry) -> None:
+    ledger = leased(("a", 50, 0), ("b", 55, 0))
+    assert expiry.seconds_until_due(ledger, 60) == pytest.approx(50, abs=0.1)
+    (claim,) = ledger.claims_of_demand("b")
+    sooner = replace(claim, lease=Lease(20, 0, NOW + timedelta(seconds=20)))
+    ledger = ledger.replace(claim.key, sooner)
+    assert expiry.seconds_until_due(ledger, 60) == pytest.approx(20, abs=0.1)
