@@ -13,12 +13,11 @@ from demandops.cli.main import run as run_command
 from demandops.model.config.override import format_time
 from demandops.model.ledger.claim_file import read
 
+from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import APP, EXPERIMENT, application, connection, goal, perception, put
 from tests.kit.golden import GOLDEN, requests_of
 from tests.kit.repo import FORGER, GitRepo, git
-
-Ask = Callable[..., Any]
 
 ROOT = Path(__file__).parents[2]
 DETECTION = "od-edge-vehicle00"
@@ -80,8 +79,8 @@ def test_git_finds_commits_as_the_docs_say(played: GitRepo) -> None:
 
 
 class TestWhy:
-    def test_a_release_that_runs(self, ask: Ask, played: GitRepo) -> None:
-        found = ask("why", FUSION)
+    def test_a_release_that_runs(self, on: On, played: GitRepo) -> None:
+        found = on.json("why", FUSION)
         assert (found["runs"], found["kind"], found["commit"]) == (True, "release", played.tip)
         assert (found["node"], found["cluster"]) == ("edge", "c-its")
         assert (found["namespace"], found["domain"]) == ("perception", "perception")
@@ -111,20 +110,20 @@ class TestWhy:
         said = git(played, "log", "--format=%H", "main", "--", found["file"]).splitlines()
         assert [one["commit"] for one in [*found["changes"], found["started"]]] == said
         assert (found["stopped"], found["more_changes"]) == (None, 0)
-        bounded = ask("why", FUSION, "-n", "1")
+        bounded = on.json("why", FUSION, "-n", "1")
         assert [one["commit"] for one in bounded["changes"]] == said[:1]
         assert bounded["more_changes"] == len(said) - 2
         assert bounded["started"]["commit"] == said[-1]
 
-    def test_a_release_that_stopped(self, ask: Ask, on: Run, played: GitRepo) -> None:
-        found = ask("why", DETECTION)
+    def test_a_release_that_stopped(self, on: On, played: GitRepo) -> None:
+        found = on.json("why", DETECTION)
         stopped, started = git(played, "log", "--format=%H", "main", "--", PATH).splitlines()
         assert (found["runs"], found["file"]) == (False, PATH)
         assert (found["stopped"]["commit"], found["started"]["commit"]) == (stopped, started)
         assert found["stopped"]["operation"] == "shutdown"
-        assert ask("why", PATH)["stopped"] == found["stopped"]
-        assert ask("why", DETECTION[:-1])["name"] == DETECTION
-        before = ask("why", DETECTION, "--at", "main~2")
+        assert on.json("why", PATH)["stopped"] == found["stopped"]
+        assert on.json("why", DETECTION[:-1])["name"] == DETECTION
+        before = on.json("why", DETECTION, "--at", "main~2")
         assert (before["runs"], before["requesters"]) == (True, ["station00", "vehicle00"])
         out = on("why", DETECTION).out.splitlines()
         headings = [line for line in out if not line.startswith(" ")]
@@ -132,40 +131,38 @@ class TestWhy:
         assert headings == [f"release {DETECTION} does not run at {at}", "stopped by", "started by"]
         assert out[1] == f"  file        {PATH}"
 
-    def test_what_is_no_release(self, ask: Ask, on: Run, played: GitRepo) -> None:
-        found = ask("why", "vehicle02/edge")
+    def test_what_is_no_release(self, on: On, played: GitRepo) -> None:
+        found = on.json("why", "vehicle02/edge")
         assert (found["kind"], found["runs"]) == ("connection", True)
         assert {one["node"] for one in found["releases"]} == {"vehicle02", "edge"}
-        assert ask("why", APP)["requesters"] == ["station00", "vehicle02", "vehicle03"]
-        gone = ask("why", "vehicle00/edge")
+        assert on.json("why", APP)["requesters"] == ["station00", "vehicle02", "vehicle03"]
+        gone = on.json("why", "vehicle00/edge")
         assert (gone["kind"], gone["runs"]) == ("connection", False)
         assert gone["stopped"]["requesters"] == ["vehicle00", "station00"]
-        found = ask("why", "object-detection-fusion")
+        found = on.json("why", "object-detection-fusion")
         assert (found["kind"], found["runs"]) == ("appdef", True)
         assert found["file"] == "appdefs/object-detection-fusion/appdef.yaml"
         assert FUSION in [one["name"] for one in found["releases"]]
         assert {one["subject"]["id"] for one in found["claims"]} == {APP}
-        found = ask("why", "vehicle02", "--kind", "requester")
+        found = on.json("why", "vehicle02", "--kind", "requester")
         assert found["runs"]
         assert {who for one in found["claims"] for who in one["requesters"]} >= {"vehicle02"}
         select = ["--service", "object-fusion", "--replicas", "0", "-m", "a test"]
         assert on("override", "create", "quiet", *select).code == 0
-        found = ask("why", "quiet")
+        found = on.json("why", "quiet")
         assert (found["kind"], found["file"]) == ("override", "overrides/quiet.yaml")
         assert [one["name"] for one in found["releases"]] == [FUSION]
         told = f"override quiet is not rendered yet at {played.tip[:10]}\n"
         assert on("why", "quiet").out.startswith(told)
         path = next(iter(played.files("ledger/connections/")))
-        found = ask("why", path)
+        found = on.json("why", path)
         assert (found["kind"], found["file"], found["runs"]) == ("claim", path, True)
         played.commit({path: None}, "Nobody needs it\n")
-        gone = ask("why", path)
+        gone = on.json("why", path)
         assert (gone["runs"], gone["stopped"]["author"]) == (False, "A person")
 
     @pytest.mark.parametrize("case", ["zenoh", "ros"])
-    def test_every_release_of_other_carriers(
-        self, on: Run, ask: Ask, state: GitRepo, case: str
-    ) -> None:
+    def test_every_release_of_other_carriers(self, on: On, state: GitRepo, case: str) -> None:
         overlay = GOLDEN / case / "state-repo"
         files = [file for file in overlay.rglob("*") if file.is_file()]
         state.commit({file.relative_to(overlay).as_posix(): file.read_text() for file in files})
@@ -173,38 +170,34 @@ class TestWhy:
         clients = [path for path in state.manifests() if "/_" not in path]
         assert clients
         for path in clients:
-            found = ask("why", Path(path).stem)
+            found = on.json("why", Path(path).stem)
             assert (found["runs"], found["file"]) == (True, path)
             assert found["claims"]
             assert {claim["file"] for claim in found["claims"]} <= set(state.files("ledger/"))
             assert found["started"]["operation"] == "join"
 
-    def test_what_a_person_changed_is_named(
-        self, ask: Ask, played: GitRepo, request_json: Run
-    ) -> None:
+    def test_what_a_person_changed_is_named(self, on: On, played: GitRepo) -> None:
         by_hand = played.commit(newer_images(played), "Newer images\n")
-        request_json(goal([], [connection("another")]))
-        change = ask("why", FUSION)["changes"][0]
+        on.request(goal([], [connection("another")]))
+        change = on.json("why", FUSION)["changes"][0]
         assert change["operation"] == "follow"
         (behind,) = change["carries_out"]
         told = (behind["commit"], behind["author"], behind["summary"])
         assert told == (by_hand, "A person", "Newer images")
-        assert behind == ask("log", "--operation", "by-hand", "-n", "1")[0]
-        found = ask("diff", "main~2", "main~1")
+        assert behind == on.json("log", "--operation", "by-hand", "-n", "1")[0]
+        found = on.json("diff", "main~2", "main~1")
         assert found["bookkeeping"] == []
         details = {one["name"]: one["details"] for one in found["releases"]}
         assert any("'2025-04' → '2025-05'" in line for line in details[FUSION])
 
-    def test_an_application_and_a_connection_of_one_id(
-        self, on: Run, ask: Ask, request_json: Run
-    ) -> None:
-        request_json(goal([application("twin")], [connection("twin")]))
+    def test_an_application_and_a_connection_of_one_id(self, on: On) -> None:
+        on.request(goal([application("twin")], [connection("twin")]))
         ran = on("why", "twin")
         assert (ran.code, ran.out) == (1, "")
         assert "application, connection; choose one with --kind" in ran.err
-        assert ask("why", "twin", "--kind", "connection")["kind"] == "connection"
+        assert on.json("why", "twin", "--kind", "connection")["kind"] == "connection"
 
-    def test_what_there_is_not(self, on: Run, demandops: Run, played: GitRepo) -> None:
+    def test_what_there_is_not(self, on: On, demandops: Run, played: GitRepo) -> None:
         for name, kind, hint in (
             ("od-edge-vehicle09", "", f"did you mean '{DETECTION}'?"),  # it ran once
             ("vehicle02/edgy", "", "did you mean 'vehicle02/edge'?"),
@@ -223,9 +216,9 @@ class TestWhy:
             assert ran.code in (0, 1) and "\x1b" not in ran.err
 
     def test_a_demand_in_a_history_that_was_made_anew(
-        self, demandops: Run, request_json: Run, state: GitRepo, tmp_path: Path
+        self, on: On, demandops: Run, state: GitRepo, tmp_path: Path
     ) -> None:
-        request_json(put("patrol-7"))
+        on.request(put("patrol-7"))
         git(state, "branch", "anew", git(state, "commit-tree", "-m", "All", "main^{tree}"))
         git(tmp_path, "clone", "--quiet", "--bare", "--single-branch", "--branch", "anew",
             str(state.path), "anew.git")  # fmt: skip
@@ -235,7 +228,7 @@ class TestWhy:
         assert ran.out.startswith("demand patrol-7 holds claims at ")
 
     def test_a_file_that_people_broke_is_told_and_does_not_hide_the_answer(
-        self, on: Run, played: GitRepo
+        self, on: On, played: GitRepo
     ) -> None:
         played.commit({"inventory/nodes.yaml": "nodes: [\n"})
         ran = on("why", FUSION)
@@ -245,7 +238,7 @@ class TestWhy:
 
 
 class TestLogFilters:
-    def test_what_fits(self, ask: Ask, on: Run, played: GitRepo) -> None:
+    def test_what_fits(self, on: On, played: GitRepo) -> None:
         for filters, operations in (
             ("--requester vehicle01", ["shutdown", "join"]),
             ("--requester vehicle01 --operation join", ["join"]),
@@ -263,26 +256,24 @@ class TestLogFilters:
             ("--until 2020-01-01", []),
             ("--operation by-hand", []),
         ):
-            found = [row["operation"] for row in ask("log", *filters.split())]
+            found = [row["operation"] for row in on.json("log", *filters.split())]
             assert found == operations, filters
-        rows = ask("log")
-        assert [row["commit"] for row in ask("log", "--demand", rows[0]["demands"][0])] == [
+        rows = on.json("log")
+        assert [row["commit"] for row in on.json("log", "--demand", rows[0]["demands"][0])] == [
             row["commit"] for row in rows if row["demands"] == rows[0]["demands"]
         ]
         ran = on("log", "--requester", "vehicle01", "main~6")
         assert (ran.code, ran.out) == (0, "no commit matches\n")
 
-    def test_a_node_that_only_a_claim_names(
-        self, ask: Ask, played: GitRepo, request_json: Run
-    ) -> None:
+    def test_a_node_that_only_a_claim_names(self, on: On, played: GitRepo) -> None:
         """The second demand needs what already runs, so its commit changes only the ledger."""
-        request_json(perception(id="first"))
+        on.request(perception(id="first"))
         before = played.tip
-        request_json(perception(id="second"))
+        on.request(perception(id="second"))
         assert git(played, "diff", "--name-only", before, "main", "--", "clusters") == ""
-        assert ask("log", "--node", "vehicle00", f"{before}..main")[0]["request"] == "second"
+        assert on.json("log", "--node", "vehicle00", f"{before}..main")[0]["request"] == "second"
 
-    def test_what_no_commit_can_be_about_is_refused(self, on: Run, played: GitRepo) -> None:
+    def test_what_no_commit_can_be_about_is_refused(self, on: On, played: GitRepo) -> None:
         options = ("--requester", "vehicle1", "--node", "egde", "--application", "nothing")
         ran = on("log", *options)
         assert (ran.code, ran.out) == (1, "")
@@ -297,36 +288,34 @@ class TestLogFilters:
             assert ran.code == 2 and f"'{value}' is not " in ran.err
 
 
-def test_bookkeeping_at_a_time(ask: Ask, played: GitRepo) -> None:
+def test_bookkeeping_at_a_time(on: On, played: GitRepo) -> None:
     """The first commit has a date in January; all other commits are made during the test."""
     first = git(played, "rev-list", "--max-parents=0", "main")
-    assert ask("bookkeeping", "--at", "2026-01-31")["commit"] == first
-    assert ask("bookkeeping", "--at", "1d")["commit"] == first
-    assert ask("bookkeeping", "--at", "0s")["commit"] == played.tip
+    assert on.json("bookkeeping", "--at", "2026-01-31")["commit"] == first
+    assert on.json("bookkeeping", "--at", "1d")["commit"] == first
+    assert on.json("bookkeeping", "--at", "0s")["commit"] == played.tip
 
 
-def test_one_thing_has_the_documented_keys_in_every_command(
-    ask: Ask, played: GitRepo, on: Run
-) -> None:
+def test_one_thing_has_the_documented_keys_in_every_command(on: On, played: GitRepo) -> None:
     page = (ROOT / "docs" / "json.md").read_text()
     rows = dict(re.findall(r"^\| (\S[^|]*) \| (`[^|]*) \|$", page, re.MULTILINE))
     keys = {thing: re.findall(r"`(\w+)`", names) for thing, names in rows.items()}
-    told, changed = ask("why", APP), ask("diff", "main~1", "main")
-    back = ask("rollback", "main~1", "--dry-run")
+    told, changed = on.json("why", APP), on.json("diff", "main~1", "main")
+    back = on.json("rollback", "main~1", "--dry-run")
     failed = on("log", "nothing", "--output", "json")
-    assert keys["commit"] == [*ask("log")[0]] == list(told["started"])[:-1]
+    assert keys["commit"] == [*on.json("log")[0]] == list(told["started"])[:-1]
     assert keys["claim"] == [*back["restored"][0]] == [*told["claims"][0]][:-4]
     assert keys["subject"] == [*told["subject"]] == [*told["claims"][0]["subject"]]
-    assert keys["release"] == [*told["releases"][0]] == [*ask("status")["releases"][0]][:-9]
+    assert keys["release"] == [*told["releases"][0]] == [*on.json("status")["releases"][0]][:-9]
     assert keys["changed release"] == [*changed["releases"][0]] == [*back["releases"][0]]
     assert keys["changed entry of the bookkeeping"] == [*changed["bookkeeping"][0]]
     assert keys["fault"] == [*failed.json()["faults"][0]]
 
 
-def test_diff_tells_a_release_that_moved(ask: Ask, request_json: Run) -> None:
+def test_diff_tells_a_release_that_moved(on: On) -> None:
     before, after = (put("a", node=node, connect="none") for node in ("edge", "cloud"))
-    assert request_json(before, after).code == 0
-    found = ask("diff", "main~1", "main")["releases"]
+    assert on.request(before, after).code == 0
+    found = on.json("diff", "main~1", "main")["releases"]
     (moved,) = [one for one in found if one["change"] == "change"]
     assert moved["name"].startswith("of-edge-a-")
     assert moved["file"].startswith("clusters/c-its/perception/cloud/")
@@ -335,15 +324,13 @@ def test_diff_tells_a_release_that_moved(ask: Ask, request_json: Run) -> None:
 
 class TestRollback:
     @pytest.fixture
-    def roll(self, on: Run, played: GitRepo) -> Run:
+    def roll(self, on: On, played: GitRepo) -> Run:
         def back(*args: str) -> Ran:
             return on("rollback", *args, "--output", "json")
 
         return back
 
-    def test_books_and_files_are_what_they_were(
-        self, on: Run, ask: Ask, played: GitRepo, roll: Run
-    ) -> None:
+    def test_books_and_files_are_what_they_were(self, on: On, played: GitRepo, roll: Run) -> None:
         config = played.path / "config"
         person = "[user]\n\tname = Ada <A>\n\temail = ada@example.org\n"
         config.write_text(config.read_text() + person)
@@ -366,7 +353,7 @@ class TestRollback:
         said = git(played, "log", "-1", f"--format=%an|%ae|{trailers}", "main")
         trailers = f"rollback,{found['to']},they left by mistake"
         assert said == f"Ada (A)|ada@example.org|{trailers}"
-        assert [row["commit"] for row in ask("log", "--operation", "rollback")] == [played.tip]
+        assert [row["commit"] for row in on.json("log", "--operation", "rollback")] == [played.tip]
         assert on("verify").code == 0
 
     def test_a_rollback_past_newer_claims_is_refused_and_lists_them(
@@ -385,7 +372,7 @@ class TestRollback:
             ("station00", "vehicle03"),
         }
 
-    def test_what_people_configured_since_stays(self, on: Run, played: GitRepo) -> None:
+    def test_what_people_configured_since_stays(self, on: On, played: GitRepo) -> None:
         newer = newer_images(played)
         played.commit(newer)
         ran = on("rollback", "main~3", "-m", "x")
@@ -394,7 +381,7 @@ class TestRollback:
         assert "2025-05" in played.files()[PATH]
         assert on("verify").code == 0
 
-    def test_it_wants_a_reason_and_a_commit_of_this_history(self, on: Run, played: GitRepo) -> None:
+    def test_it_wants_a_reason_and_a_commit_of_this_history(self, on: On, played: GitRepo) -> None:
         assert on("rollback", "main", "-m", "x").out.endswith("nothing to roll back\n")
         ran = on("rollback", "main~1", "-m", "  ")
         assert ran.code == 2 and "give the reason: -m TEXT" in ran.err
@@ -404,11 +391,11 @@ class TestRollback:
         ran = on("rollback", other, "-m", "x")
         assert ran.code == 1 and f"commit {other} is not in the history" in ran.err
 
-    def test_no_request_file_rolls_back(self, request_json: Run, played: GitRepo) -> None:
+    def test_no_request_file_rolls_back(self, on: On, played: GitRepo) -> None:
         before = played.tip
         made = {"apiVersion": "demandops/v1", "kind": "Rollback", "to": before,
                 "dropNewer": True, "reason": "x", "by": ["x", "x"]}  # fmt: skip
-        ran = request_json(made)
+        ran = on.request(made)
         assert (ran.code, played.tip) == (1, before)
 
 
@@ -420,12 +407,12 @@ class TestVerifyByDifferences:
     """`verify` checks a range of commits by the differences between them."""
 
     @pytest.fixture
-    def verdict(self, on: Run, played: GitRepo, request_json: Run) -> Callable[..., Any]:
+    def verdict(self, on: On, played: GitRepo) -> Callable[..., Any]:
         def of(changed: Changed | Callable[[], Changed], *by: Any) -> Any:
             """Return the row of a commit between demands; `--whole` must give the same rows."""
-            request_json(goal([], [connection("before-1")]), goal([], [connection("before-2")]))
+            on.request(goal([], [connection("before-1")]), goal([], [connection("before-2")]))
             made = played.commit(changed() if callable(changed) else changed, *by)
-            request_json(goal([], [connection("after")]))
+            on.request(goal([], [connection("after")]))
             where = ("verify", "main~4..main", "--output", "json")
             ran = on(*where)
             assert on(*where, "--whole") == ran

@@ -11,7 +11,6 @@ import os
 import re
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ import yaml
 from demandops import __version__
 from demandops.cli.views import bookkeeping
 
+from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run
 from tests.kit.goals import (
     APP,
@@ -34,8 +34,6 @@ from tests.kit.goals import (
     put,
 )
 from tests.kit.repo import FORGER, GitRepo, git
-
-Ask = Callable[..., Any]
 
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 URL = "https://git.example/own.git"
@@ -57,9 +55,9 @@ def read(path: Path) -> Any:
 
 
 @pytest.fixture
-def joined(request_json: Run, state: GitRepo) -> GitRepo:
+def joined(on: On, state: GitRepo) -> GitRepo:
     """A state repo in which ``perception()`` is booked."""
-    assert request_json(perception()).code == 0
+    assert on.request(perception()).code == 0
     return state
 
 
@@ -150,7 +148,7 @@ class TestInit:
 
 class TestRequest:
     def test_json_and_text_tell_the_outcome_of_each(
-        self, demandops: Run, request_json: Run, state: GitRepo, tmp_path: Path
+        self, on: On, demandops: Run, state: GitRepo, tmp_path: Path
     ) -> None:
         asked = goal([application(), application("other")], shutdown=True)
         goals = goal([application()], id="r"), goal([application(node="egde")], id="s"), asked
@@ -158,7 +156,7 @@ class TestRequest:
         other = GitRepo(tmp_path / "other.git")
         before, given = state.tip, text(*goals)
         line = given[: given.index("egde")].count("\n") + 1
-        ran = request_json(*goals)
+        ran = on.request(*goals)
         assert (ran.code, ran.err) == (1, "")
         booked, refused, released = ran.json()
         assert list(booked) == list(refused) == REQUEST_KEYS
@@ -189,7 +187,7 @@ class TestRequest:
         ]
 
     def test_files_and_documents_are_taken_in_order(
-        self, on: Run, state: GitRepo, tmp_path: Path
+        self, on: On, state: GitRepo, tmp_path: Path
     ) -> None:
         for name in "ab":
             documents = (goal([], [connection(name)], id=f"{name}{number}") for number in (1, 2))
@@ -202,7 +200,7 @@ class TestRequest:
         log = git(state, "rev-list", "--reverse", "main~5..main").split()
         assert [row["commit"] for row in rows] == log
 
-    def test_what_documents_demand_is_released(self, on: Run) -> None:
+    def test_what_documents_demand_is_released(self, on: On) -> None:
         link = {"id": "d/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
         link |= {"topics": [{"source": "/d"}]}
         given = text(perception(), put("d", "vehicle00", applications=[], connections=[link],
@@ -215,10 +213,10 @@ class TestRequest:
         assert on("get", "claims", "-o", "name").out.strip() == ""
 
     def test_if_one_cannot_be_parsed_nothing_at_all_is_booked(
-        self, on: Run, request_json: Run, state: GitRepo, tmp_path: Path
+        self, on: On, state: GitRepo, tmp_path: Path
     ) -> None:
         before = state.tip
-        ran = request_json(perception(id="1"), {"id": 5}, perception(id="3"))
+        ran = on.request(perception(id="1"), {"id": 5}, perception(id="3"))
         assert (ran.code, state.tip) == (1, before)
         rows = ran.json()
         assert [(row["index"], row["outcome"], row["commit"]) for row in rows] == [
@@ -247,7 +245,7 @@ class TestRequest:
             assert told.err == text.err == f"error: {fault['message']}\n"
 
     def test_a_dry_run_shows_the_consequence_and_books_nothing(
-        self, on: Run, state: GitRepo, data_home: Path
+        self, on: On, state: GitRepo, data_home: Path
     ) -> None:
         before = state.tip
         ran = on("request", "-", "--dry-run", stdin=GIVEN)
@@ -260,13 +258,11 @@ class TestRequest:
         assert on("request", "-", stdin=GIVEN).code == 0
         assert paths == git(state, "diff", "--name-only", "main~1", "main").splitlines()
 
-    def test_a_dry_run_decides_each_on_top_of_the_one_before(
-        self, request_json: Run, state: GitRepo
-    ) -> None:
+    def test_a_dry_run_decides_each_on_top_of_the_one_before(self, on: On, state: GitRepo) -> None:
         before = state.tip
         join, leave = perception(), perception(shutdown=True)
         goals = (join, join, goal([application(node="egde")], id="x"), leave, leave)
-        ran = request_json(*goals, more=("--dry-run",))
+        ran = on.request(*goals, more=("--dry-run",))
         outcomes = ["booked", "unchanged", "refused", "released", "unchanged"]
         assert [row["outcome"] for row in ran.json()] == outcomes
         keys = [*REQUEST_KEYS, "releases", "files"]
@@ -274,15 +270,15 @@ class TestRequest:
         assert [each["change"] for each in ran.json()[0]["releases"]] == ["start"] * 4
         assert (ran.code, state.tip) == (1, before)
 
-    def test_the_experiments_files_as_they_are(self, on: Run, ask: Ask, state: GitRepo) -> None:
+    def test_the_experiments_files_as_they_are(self, on: On, state: GitRepo) -> None:
         first = state.tip
-        rows = ask("request", *EXPERIMENT)
+        rows = on.json("request", *EXPERIMENT)
         assert [row["outcome"] for row in rows] == ["booked"] * 4 + ["released"] * 4
         assert [row["warnings"] for row in rows] == [[]] * 8
         assert on("bookkeeping").out.count("(nothing)") == 2
-        books = ask("bookkeeping")
+        books = on.json("bookkeeping")
         assert (books["services"], books["connections"]) == ({}, {})
-        verified = ask("verify", f"{first}..main")
+        verified = on.json("verify", f"{first}..main")
         assert [row["holds"] for row in verified] == [True] * 8
         assert [row["commit"] for row in verified] == [row["commit"] for row in rows]
 
@@ -309,14 +305,14 @@ demands:
 
 
 class TestBookkeeping:
-    def test_the_json_is_what_programs_rely_on(self, ask: Ask, joined: GitRepo) -> None:
-        assert ask("bookkeeping") == yaml.safe_load(BOOKS) | {"commit": joined.tip}
+    def test_the_json_is_what_programs_rely_on(self, on: On, joined: GitRepo) -> None:
+        assert on.json("bookkeeping") == yaml.safe_load(BOOKS) | {"commit": joined.tip}
 
-    def test_lists_are_sorted(self, ask: Ask, joined: GitRepo, request_json: Run) -> None:
+    def test_lists_are_sorted(self, on: On, joined: GitRepo) -> None:
         who = ["z", "a"]
         link = connection(who=who, topics=["/z", "/a"])
-        request_json(goal([application("a/first", who=who)], [link]))
-        found = ask("bookkeeping")
+        on.request(goal([application("a/first", who=who)], [link]))
+        found = on.json("bookkeeping")
         detection = found["services"]["od-edge-vehicle00"]
         assert detection["applications"] == ["a/first", APP]
         assert detection["requesters"] == ["a", "vehicle00", "z"]
@@ -325,9 +321,9 @@ class TestBookkeeping:
         assert entry["requesters"] == ["a", "vehicle00", "z"]
 
 
-def test_an_id_is_shown_as_it_is(on: Run, request_json: Run) -> None:
+def test_an_id_is_shown_as_it_is(on: On) -> None:
     ids = ["a:car:b", "[red]a[/red]", "[/]", "a\\[b"]
-    assert request_json(*(goal([application(id)], [connection(id)]) for id in ids)).code == 0
+    assert on.request(*(goal([application(id)], [connection(id)]) for id in ids)).code == 0
     for command in ("bookkeeping", "log", "diff main~4 main", "verify main~4.."):
         ran = on(*command.split())
         assert (ran.code, ran.err) == (0, "")
@@ -335,11 +331,9 @@ def test_an_id_is_shown_as_it_is(on: Run, request_json: Run) -> None:
 
 
 class TestLog:
-    def test_the_json_tells_all_that_the_trailers_say(
-        self, ask: Ask, on: Run, joined: GitRepo
-    ) -> None:
+    def test_the_json_tells_all_that_the_trailers_say(self, on: On, joined: GitRepo) -> None:
         joined.commit({"inventory/README.md": "hello\n"})
-        by_hand, join, init = ask("log")
+        by_hand, join, init = on.json("log")
         assert [*by_hand] == [*join] == [*init]
         assert (join["operation"], join["request"]) == ("join", "request")
         assert (join["author"], join["requesters"]) == ("vehicle00 (requester)", ["vehicle00"])
@@ -353,10 +347,8 @@ class TestLog:
             "request",
         ]
 
-    def test_as_many_and_from_where_one_says(
-        self, ask: Ask, state: GitRepo, request_json: Run
-    ) -> None:
-        request_json(*(goal([], [connection(f"c{number}")]) for number in range(3)))
+    def test_as_many_and_from_where_one_says(self, on: On, state: GitRepo) -> None:
+        on.request(*(goal([], [connection(f"c{number}")]) for number in range(3)))
         commits = git(state, "rev-list", "main").split()
         for args, wanted in (
             ("", commits),
@@ -366,10 +358,10 @@ class TestLog:
             (f"{commits[2]}..", commits[:2]),
             ("main..main", []),
         ):
-            assert [row["commit"] for row in ask("log", *args.split())] == wanted
+            assert [row["commit"] for row in on.json("log", *args.split())] == wanted
 
 
-def test_a_revision_that_does_not_exist_is_told(on: Run) -> None:
+def test_a_revision_that_does_not_exist_is_told(on: On) -> None:
     for command in ("bookkeeping --at nope", "log nope", "log nope..main", "log main..nope",
                     "diff main nope", "verify nope"):  # fmt: skip
         ran = on(*command.split())
@@ -378,10 +370,10 @@ def test_a_revision_that_does_not_exist_is_told(on: Run) -> None:
 
 
 class TestDiff:
-    def test_the_text_tells_what_differs(self, on: Run, joined: GitRepo, request_json: Run) -> None:
+    def test_the_text_tells_what_differs(self, on: On, joined: GitRepo) -> None:
         who = ["vehicle01"]
         app = application(who=who, ego=[("/ego", "vehicle01")])
-        request_json(goal([app], [connection("vehicle01/edge", who=who, topics=["/ego"])]))
+        on.request(goal([app], [connection("vehicle01/edge", who=who, topics=["/ego"])]))
         source = "mqtt-vehicle01-edge-source-092a70a6cc97"
         target = "mqtt-vehicle01-edge-target-f918b3fb6980"
         assert on("diff", "main~1", "main").out.splitlines() == [
@@ -401,13 +393,13 @@ class TestDiff:
         assert "- connection vehicle01/edge for vehicle01" in back
         assert back[-1].startswith(f"- release {target} (")
 
-    def test_who_holds_a_topic_no_longer_is_told(self, on: Run, request_json: Run) -> None:
+    def test_who_holds_a_topic_no_longer_is_told(self, on: On) -> None:
         ego = [("/a", "vehicle00"), ("/b", "vehicle00")]
         both = ["vehicle00", "station00"]
         app = application(who=both, ego=ego, clouds=[])
-        request_json(goal([app], [connection(who=both, topics=["/a", "/b"])]))
+        on.request(goal([app], [connection(who=both, topics=["/a", "/b"])]))
         app = application(ego=ego[:1], clouds=[])
-        request_json(goal([app], [connection(topics=["/a"])], shutdown=True))
+        on.request(goal([app], [connection(topics=["/a"])], shutdown=True))
         assert on("diff", "main~1", "main").out.splitlines() == [
             f"~ service {FUSION}",
             "    - ego_data /a for vehicle00",
@@ -418,8 +410,8 @@ class TestDiff:
         held = [cells[-2:] for cells in cells_of(on("bookkeeping").out) if "/a" in str(cells)]
         assert held == [["/a (station00), /b", "station00, vehicle00"]] * 2
 
-    def test_the_json_tells_the_same(self, ask: Ask, on: Run, joined: GitRepo) -> None:
-        found = ask("diff", "main~1", "main")
+    def test_the_json_tells_the_same(self, on: On, joined: GitRepo) -> None:
+        found = on.json("diff", "main~1", "main")
         assert found.keys() == {"bookkeeping", "releases", "other_files"}
         *services, made = found["bookkeeping"]
         assert [each["name"] for each in services] == ["od-edge-vehicle00", FUSION]
@@ -430,7 +422,7 @@ class TestDiff:
 
 
 class TestVerify:
-    def test_what_was_tampered_with_does_not_hold(self, on: Run, joined: GitRepo) -> None:
+    def test_what_was_tampered_with_does_not_hold(self, on: On, joined: GitRepo) -> None:
         (path,) = (path for path in joined.manifests() if "/od-" in path)
         changed = {path: joined.files()[path] + "# changed\n"}
         joined.commit(changed, "Forged\n\nOperation: join\nRender-Version: 2\n", FORGER)
@@ -448,9 +440,9 @@ class TestVerify:
             "signed": False, "signer": None, "signature": None,
         }  # fmt: skip
 
-    def test_a_commit_of_a_person_is_skipped(self, ask: Ask, joined: GitRepo) -> None:
+    def test_a_commit_of_a_person_is_skipped(self, on: On, joined: GitRepo) -> None:
         joined.commit({"inventory/README.md": "hello\n"})
-        (row,) = ask("verify")
+        (row,) = on.json("verify")
         assert row["skipped"] == "made by a person"
 
 
@@ -532,7 +524,7 @@ def test_wrong_usage_is_told(
 
 
 def test_a_fault_of_the_program_has_a_code_of_its_own(
-    on: Run, monkeypatch: pytest.MonkeyPatch
+    on: On, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*args: object) -> None:
         raise RuntimeError("boom")

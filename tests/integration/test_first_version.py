@@ -10,7 +10,7 @@ import pytest
 import yaml
 from demandops.base.settings import LEDGER_API_VERSION
 
-from tests.kit.cli import Run
+from tests.integration.conftest import On
 from tests.kit.repo import GitRepo, first_version, git
 
 EXPERIMENT = Path(__file__).parents[2] / "examples" / "experiment"
@@ -50,7 +50,7 @@ def ledger(state: GitRepo) -> dict[str, Any]:
 
 
 def test_commands_that_read_work_before_the_upgrade_and_others_say_what_to_do(
-    on: Run, state: GitRepo
+    on: On, state: GitRepo
 ) -> None:
     tip = state.tip
     services = on("bookkeeping", "--output", "json").json()["services"]
@@ -62,7 +62,7 @@ def test_commands_that_read_work_before_the_upgrade_and_others_say_what_to_do(
 
 
 def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_outputs_alone(
-    on: Run, state: GitRepo
+    on: On, state: GitRepo
 ) -> None:
     books = on("bookkeeping", "--output", "json").json()
     old, old_ledger = state.files(), ledger(state)
@@ -93,7 +93,7 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
 
 
 def test_demands_of_before_are_given_up_and_restored_after_the_upgrade(
-    on: Run, state: GitRepo
+    on: On, state: GitRepo
 ) -> None:
     before = state.tip
     assert on("upgrade").code == 0
