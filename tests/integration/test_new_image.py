@@ -30,14 +30,14 @@ def package(tmp_path: Path, demandops: Run) -> Path:
     return folder
 
 
+GITLAB = ["--builtin-schema", "vendor.gitlab-ci", "--data-transform", "gitlab-ci"]
+
+
 @pytest.mark.parametrize(
     ("path", "options"),
     [
         (".github/workflows/image.yml", ["--builtin-schema", "vendor.github-workflows"]),
-        (
-            ".gitlab-ci.yml",
-            ["--builtin-schema", "vendor.gitlab-ci", "--data-transform", "gitlab-ci"],
-        ),
+        (".gitlab-ci.yml", GITLAB),
     ],
     ids=["github", "gitlab"],
 )
@@ -101,26 +101,10 @@ def test_an_invalid_tag_or_digest_is_refused(
 @pytest.mark.parametrize(
     ("name", "repository", "url", "told"),
     [
-        ("Big", "ghcr.io/x/y", "https://h/x", "error: NAME: 'Big' is no valid name"),
-        (
-            "x",
-            "ghcr.io/x:1",
-            "https://h/x",
-            "error: --repository: 'ghcr.io/x:1' is no valid repository",
-        ),
-        (
-            "x",
-            "ghcr.io/X/y",
-            "https://h/x",
-            "error: --repository: 'ghcr.io/X/y' is no valid repository; write HOST/PATH in lower "
-            "case, without a tag",
-        ),
-        (
-            "x",
-            "ghcr.io/x/y",
-            "https://h/$(x)",
-            "error: --state-repo: 'https://h/$(x)' is no valid URL",
-        ),
+        ("Big", "ghcr.io/x/y", "https://h/x", "NAME: 'Big' is no valid name"),
+        ("x", "ghcr.io/x:1", "https://h/x", "--repository: 'ghcr.io/x:1' is no valid"),
+        ("x", "ghcr.io/X/y", "https://h/x", "--repository: 'ghcr.io/X/y' is no valid"),
+        ("x", "ghcr.io/x/y", "https://h/$(x)", "--state-repo: 'https://h/$(x)' is no valid URL"),
     ],
 )
 def test_what_cannot_be_written_is_refused(
@@ -129,5 +113,5 @@ def test_what_cannot_be_written_is_refused(
     options = ["--repository", repository, "--state-repo", url, "-C", tmp_path]
     ran = demandops("new", "image", name, *options)
     assert ran.code == 1
-    assert ran.err.startswith(told)
+    assert ran.err.startswith(f"error: {told}")
     assert not (tmp_path / "Containerfile").exists()

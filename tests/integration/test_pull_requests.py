@@ -157,6 +157,7 @@ def test_an_edit_becomes_an_override_to_paste(branch: Path, check: Run, found: F
     for path, replaced, effects, left in EDITS:
         before = (branch / path).read_text()
         edit(branch / path, *replaced)
+        commit(branch)
         (suggested,) = found()["suggestions"]
         ran, name = check(), f"overrides/{Path(path).name}"
         (branch / path).write_text(before)
