@@ -15,7 +15,7 @@ from demandops.model.ledger.claim_file import read
 
 from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run
-from tests.kit.goals import APP, EXPERIMENT, application, connection, goal, perception, put
+from tests.kit.goals import APP, EXPERIMENT, connection, goal, put
 from tests.kit.golden import GOLDEN, requests_of
 from tests.kit.repo import FORGER, GitRepo, git
 
@@ -115,52 +115,6 @@ class TestWhy:
         assert bounded["more_changes"] == len(said) - 2
         assert bounded["started"]["commit"] == said[-1]
 
-    def test_a_release_that_stopped(self, on: On, played: GitRepo) -> None:
-        found = on.json("why", DETECTION)
-        stopped, started = git(played, "log", "--format=%H", "main", "--", PATH).splitlines()
-        assert (found["runs"], found["file"]) == (False, PATH)
-        assert (found["stopped"]["commit"], found["started"]["commit"]) == (stopped, started)
-        assert found["stopped"]["operation"] == "shutdown"
-        assert on.json("why", PATH)["stopped"] == found["stopped"]
-        assert on.json("why", DETECTION[:-1])["name"] == DETECTION
-        before = on.json("why", DETECTION, "--at", "main~2")
-        assert (before["runs"], before["requesters"]) == (True, ["station00", "vehicle00"])
-        out = on("why", DETECTION).out.splitlines()
-        headings = [line for line in out if not line.startswith(" ")]
-        at = played.tip[:10]
-        assert headings == [f"release {DETECTION} does not run at {at}", "stopped by", "started by"]
-        assert out[1] == f"  file        {PATH}"
-
-    def test_what_is_no_release(self, on: On, played: GitRepo) -> None:
-        found = on.json("why", "vehicle02/edge")
-        assert (found["kind"], found["runs"]) == ("connection", True)
-        assert {one["node"] for one in found["releases"]} == {"vehicle02", "edge"}
-        assert on.json("why", APP)["requesters"] == ["station00", "vehicle02", "vehicle03"]
-        gone = on.json("why", "vehicle00/edge")
-        assert (gone["kind"], gone["runs"]) == ("connection", False)
-        assert gone["stopped"]["requesters"] == ["vehicle00", "station00"]
-        found = on.json("why", "object-detection-fusion")
-        assert (found["kind"], found["runs"]) == ("appdef", True)
-        assert found["file"] == "appdefs/object-detection-fusion/appdef.yaml"
-        assert FUSION in [one["name"] for one in found["releases"]]
-        assert {one["subject"]["id"] for one in found["claims"]} == {APP}
-        found = on.json("why", "vehicle02", "--kind", "requester")
-        assert found["runs"]
-        assert {who for one in found["claims"] for who in one["requesters"]} >= {"vehicle02"}
-        select = ["--service", "object-fusion", "--replicas", "0", "-m", "a test"]
-        assert on("override", "create", "quiet", *select).code == 0
-        found = on.json("why", "quiet")
-        assert (found["kind"], found["file"]) == ("override", "overrides/quiet.yaml")
-        assert [one["name"] for one in found["releases"]] == [FUSION]
-        told = f"override quiet is not rendered yet at {played.tip[:10]}\n"
-        assert on("why", "quiet").out.startswith(told)
-        path = next(iter(played.files("ledger/connections/")))
-        found = on.json("why", path)
-        assert (found["kind"], found["file"], found["runs"]) == ("claim", path, True)
-        played.commit({path: None}, "Nobody needs it\n")
-        gone = on.json("why", path)
-        assert (gone["runs"], gone["stopped"]["author"]) == (False, "A person")
-
     @pytest.mark.parametrize("case", ["zenoh", "ros"])
     def test_every_release_of_other_carriers(self, on: On, state: GitRepo, case: str) -> None:
         overlay = GOLDEN / case / "state-repo"
@@ -176,40 +130,7 @@ class TestWhy:
             assert {claim["file"] for claim in found["claims"]} <= set(state.files("ledger/"))
             assert found["started"]["operation"] == "join"
 
-    def test_what_a_person_changed_is_named(self, on: On, played: GitRepo) -> None:
-        by_hand = played.commit(newer_images(played), "Newer images\n")
-        on.request(goal([], [connection("another")]))
-        change = on.json("why", FUSION)["changes"][0]
-        assert change["operation"] == "follow"
-        (behind,) = change["carries_out"]
-        told = (behind["commit"], behind["author"], behind["summary"])
-        assert told == (by_hand, "A person", "Newer images")
-        assert behind == on.json("log", "--operation", "by-hand", "-n", "1")[0]
-        found = on.json("diff", "main~2", "main~1")
-        assert found["bookkeeping"] == []
-        details = {one["name"]: one["details"] for one in found["releases"]}
-        assert any("'2025-04' → '2025-05'" in line for line in details[FUSION])
-
-    def test_an_application_and_a_connection_of_one_id(self, on: On) -> None:
-        on.request(goal([application("twin")], [connection("twin")]))
-        ran = on("why", "twin")
-        assert (ran.code, ran.out) == (1, "")
-        assert "application, connection; choose one with --kind" in ran.err
-        assert on.json("why", "twin", "--kind", "connection")["kind"] == "connection"
-
-    def test_what_there_is_not(self, on: On, demandops: Run, played: GitRepo) -> None:
-        for name, kind, hint in (
-            ("od-edge-vehicle09", "", f"did you mean '{DETECTION}'?"),  # it ran once
-            ("vehicle02/edgy", "", "did you mean 'vehicle02/edge'?"),
-            (f"{FUSION[:-1]}x", "", f"did you mean '{FUSION}'?"),
-            ("fuson", "", "did you mean 'fusion'?"),  # part of a release's name is enough
-            (FUSION, "node", "leave out --kind"),
-            ("fusion", "node", "leave out --kind"),
-            ("cloudd", "node", "did you mean 'cloud'?"),
-        ):
-            ran = on("why", name, *(("--kind", kind) if kind else ()))
-            assert (ran.code, ran.out, ran.err.count("\n")) == (1, "", 1)
-            assert f"'{name}'" in ran.err and ran.err.endswith(f"; {hint}\n")
+    def test_rubbish_is_refused(self, demandops: Run, played: GitRepo) -> None:
         for name in ("", "-", "..", "*", ":(glob)**", "clusters/", "clusters/../x", "ledger//x",
                      "\x1b[1m"):  # fmt: skip
             ran = demandops("why", "--state-repo", played.path, "--", name)
@@ -227,74 +148,6 @@ class TestWhy:
         assert (ran.code, ran.err) == (0, "")
         assert ran.out.startswith("demand patrol-7 holds claims at ")
 
-    def test_a_file_that_people_broke_is_told_and_does_not_hide_the_answer(
-        self, on: On, played: GitRepo
-    ) -> None:
-        played.commit({"inventory/nodes.yaml": "nodes: [\n"})
-        ran = on("why", FUSION)
-        assert ran.code == 0
-        assert ran.err.startswith("warning: inventory/nodes.yaml: ")
-        assert ran.out.startswith(f"release {FUSION} runs at ")
-
-
-class TestLogFilters:
-    def test_what_fits(self, on: On, played: GitRepo) -> None:
-        for filters, operations in (
-            ("--requester vehicle01", ["shutdown", "join"]),
-            ("--requester vehicle01 --operation join", ["join"]),
-            ("--requester vehicle01 main~6", []),
-            ("--connection vehicle03/edge", ["join"]),
-            (f"--application {APP} -n 3", ["shutdown", "shutdown", "join"]),
-            ("--operation init", ["init"]),
-            (f"--release {DETECTION}", ["shutdown", "join"]),
-            (f"--release {PATH} main~2", ["join"]),
-            (f"--release {DETECTION} main~3..main", ["shutdown"]),
-            ("--node vehicle03", ["join"]),
-            ("--node vehicle00", ["shutdown", "join"]),
-            ("--node cloud", []),
-            ("--since 1h --operation shutdown", ["shutdown", "shutdown"]),
-            ("--until 2020-01-01", []),
-            ("--operation by-hand", []),
-        ):
-            found = [row["operation"] for row in on.json("log", *filters.split())]
-            assert found == operations, filters
-        rows = on.json("log")
-        assert [row["commit"] for row in on.json("log", "--demand", rows[0]["demands"][0])] == [
-            row["commit"] for row in rows if row["demands"] == rows[0]["demands"]
-        ]
-        ran = on("log", "--requester", "vehicle01", "main~6")
-        assert (ran.code, ran.out) == (0, "no commit matches\n")
-
-    def test_a_node_that_only_a_claim_names(self, on: On, played: GitRepo) -> None:
-        """The second demand needs what already runs, so its commit changes only the ledger."""
-        on.request(perception(id="first"))
-        before = played.tip
-        on.request(perception(id="second"))
-        assert git(played, "diff", "--name-only", before, "main", "--", "clusters") == ""
-        assert on.json("log", "--node", "vehicle00", f"{before}..main")[0]["request"] == "second"
-
-    def test_what_no_commit_can_be_about_is_refused(self, on: On, played: GitRepo) -> None:
-        options = ("--requester", "vehicle1", "--node", "egde", "--application", "nothing")
-        ran = on("log", *options)
-        assert (ran.code, ran.out) == (1, "")
-        assert [line.split(": ")[1] for line in ran.err.splitlines()] == [
-            "--requester",
-            "--application",
-            "--node",
-        ]
-        assert re.findall("(?:mean|known:) '?([^'?\n]*)", ran.err) == ["vehicle01", APP, "edge"]
-        for option, value in (("--operation", "joyn"), ("--since", "soon")):
-            ran = on("log", option, value)
-            assert ran.code == 2 and f"'{value}' is not " in ran.err
-
-
-def test_bookkeeping_at_a_time(on: On, played: GitRepo) -> None:
-    """The first commit has a date in January; all other commits are made during the test."""
-    first = git(played, "rev-list", "--max-parents=0", "main")
-    assert on.json("bookkeeping", "--at", "2026-01-31")["commit"] == first
-    assert on.json("bookkeeping", "--at", "1d")["commit"] == first
-    assert on.json("bookkeeping", "--at", "0s")["commit"] == played.tip
-
 
 def test_one_thing_has_the_documented_keys_in_every_command(on: On, played: GitRepo) -> None:
     page = (ROOT / "docs" / "json.md").read_text()
@@ -310,16 +163,6 @@ def test_one_thing_has_the_documented_keys_in_every_command(on: On, played: GitR
     assert keys["changed release"] == [*changed["releases"][0]] == [*back["releases"][0]]
     assert keys["changed entry of the bookkeeping"] == [*changed["bookkeeping"][0]]
     assert keys["fault"] == [*failed.json()["faults"][0]]
-
-
-def test_diff_tells_a_release_that_moved(on: On) -> None:
-    before, after = (put("a", node=node, connect="none") for node in ("edge", "cloud"))
-    assert on.request(before, after).code == 0
-    found = on.json("diff", "main~1", "main")["releases"]
-    (moved,) = [one for one in found if one["change"] == "change"]
-    assert moved["name"].startswith("of-edge-a-")
-    assert moved["file"].startswith("clusters/c-its/perception/cloud/")
-    assert any(line.startswith(f"- {EDGE}/") for line in moved["details"])
 
 
 class TestRollback:
