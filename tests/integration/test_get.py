@@ -21,8 +21,7 @@ from demandops.repo.reader import Reader
 
 from tests.integration.conftest import On
 from tests.kit.cli import Run
-from tests.kit.config import override
-from tests.kit.goals import APP, EXPERIMENT, perception, put
+from tests.kit.goals import EXPERIMENT, perception, put
 from tests.kit.http import kubeconfig
 from tests.kit.kube_api import kube_api
 from tests.kit.repo import GitRepo, git
@@ -55,24 +54,6 @@ def test_every_kind_in_every_form(on: On, fleet: GitRepo, kind: str) -> None:
         assert (ran.code, ran.err) == (0, "")
 
 
-def test_what_is_listed(on: On) -> None:
-    def names(*args: str) -> list[str]:
-        return on("get", *args, "-o", "name").out.split()
-
-    assert names("nodes", "--application", APP) == ["edge", "station00", "vehicle00", "vehicle01"]
-    services = names("services", "--node", "edge", "--requester", "vehicle01")
-    assert services == ["od-edge-station00", FUSION]
-    links = names("connections", "--node", "vehicle0*", "--domain", "perception")
-    assert links == ["patrol/link", "vehicle00/edge", "vehicle01/edge"]
-    assert names("leases") == names("demands", "patrol") == ["patrol"]
-    assert len(names("demands")) == 3
-    assert len(names("claims", "--requester", "vehicle01")) == 3
-    (item,) = on.json("get", "demands", "patrol")["items"]
-    assert (item["state"], item["lease"]["seconds"]) == ("held", 600)
-    assert (item["connections"], item["applications"]) == (["patrol/link"], [])
-    assert "10m   in 9m" in on("get", "leases").out
-
-
 @pytest.mark.parametrize(
     ("later", "word", "told"),
     [
@@ -91,59 +72,6 @@ def test_a_lease_that_is_over_and_not_booked_yet(
     assert word in ran.out.splitlines()[1].split()
     overdue = "a generator has yet to release the claim" in on("why", "patrol").out
     assert overdue == (word == "overdue")
-
-
-def test_a_node_that_claims_use_and_a_drained_one(on: On, fleet: GitRepo) -> None:
-    nodes = fleet.files()["inventory/nodes.yaml"]
-    more = "id: cloud\n    drained: true\n    properties: {gpu: true}"
-    fleet.commit({"inventory/nodes.yaml": nodes.replace("id: cloud", more)})
-    assert "gpu: true" in on("get", "nodes", "-o", "wide").out
-    rows = {line.split()[0]: line.split() for line in on("get", "nodes").out.splitlines()}
-    assert rows["cloud"][4] == "drained"
-    assert rows["edge"][4:6] == ["open", "7"]
-
-
-@pytest.mark.parametrize(
-    ("args", "code", "told"),
-    [
-        ("services --node egde --requester vehicle1", 1, ["--node: ", "'edge'?", "'vehicle01'?"]),
-        ("demands patrl", 1, ["nothing is called 'patrl'; did you mean 'patrol'?"]),
-        ("proposals --node edge", 2, ["they can be filtered by --requester"]),
-        ("vehicles", 2, ["there is no kind 'vehicles'; did you mean 'services'?"]),
-        ("", 2, ["Missing argument 'KIND': one of claims, connections, demands, "]),
-    ],
-    ids=lambda value: value or "nothing" if isinstance(value, str) else "",
-)
-def test_names_and_filters_that_fit_nothing_known_are_refused(
-    on: On, args: str, code: int, told: list[str]
-) -> None:
-    ran = on("get", *args.split())
-    assert (ran.code, ran.out) == (code, "")
-    assert [part for part in told if part not in ran.err] == []
-
-
-def test_an_override_that_a_hold_keeps_back_is_not_said_to_be_in_force(
-    on: On, fleet: GitRepo
-) -> None:
-    select = {"services": ["object-fusion"]}
-    fleet.commit(
-        {
-            "overrides/calm.yaml": override(select, priority=5, hold=True),
-            "overrides/more.yaml": override(select, replicas=2),
-        }
-    )
-    ran = on("get", "overrides", "-o", "json")
-    states = {one["name"]: one["state"] for one in ran.json()["items"]}
-    assert states == {"calm": "not rendered yet", "more": "held back"}
-    assert "has yet to write or remove 1 generated file: clusters/" in ran.err
-    waiting = on("why", FUSION, "-o", "json").json()["not_rendered"]
-    assert [Path(path).stem for path in waiting] == [FUSION]
-    status = on("status")
-    assert status.code == 1
-    assert "not well: files that a generator has yet to write or remove: 1\n" in status.err
-    assert on("request", EXPERIMENT[2]).code == 0
-    (item,) = on.json("get", "overrides", "calm")["items"]
-    assert item["state"] == "in force"
 
 
 def test_no_name_is_cut_on_a_terminal_and_colors_can_be_turned_off(
@@ -181,17 +109,6 @@ class TestWhichStateRepo:
     @pytest.fixture(autouse=True)
     def _no_contexts(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-
-    def test_in_a_checkout_no_option_is_needed(
-        self, demandops: Run, clone: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.chdir(clone / "inventory")
-        for command in ("get demands", "bookkeeping", f"why {FUSION}", "log", "status", "verify"):
-            ran = demandops(*command.split())
-            assert ran.code == 0, ran.err
-        git(clone, "checkout", "--quiet", "HEAD~1")
-        assert demandops("get", "leases").out == "no leases\n"
-        assert demandops("get", "proposals").out == "no proposals\n"
 
     def test_what_writes_there_writes_to_its_remote(
         self, on: On, demandops: Run, fleet: GitRepo, clone: Path, monkeypatch: pytest.MonkeyPatch
@@ -302,11 +219,6 @@ class TestStatus:
 
         return to
 
-    def test_a_cluster_that_is_misspelled_is_told(self, on: On, access: Any) -> None:
-        ran = on("status", *access(**{"c-itz": {"receiver": f"{NOBODY}/hook"}}))
-        assert ran.code == 0
-        assert "no cluster 'c-itz'; did you mean 'c-its'?" in ran.err
-
     def test_status_wait_lists_unhealthy_releases_when_the_time_is_over(
         self, on: On, access: Any
     ) -> None:
@@ -332,24 +244,6 @@ class TestStatus:
         assert ran.code == 1
         assert "warning: the remote is away\n" in ran.err
         assert ran.err.splitlines()[-1].startswith("not well: releases not healthy yet: ")
-
-    def test_an_input_that_no_longer_arrives(self, on: On) -> None:
-        assert on.json("status")["missing_inputs"] == []
-        assert on("suspend", "--connection", "vehicle00/edge", "-m", "in the workshop").code == 0
-
-        def state() -> str:
-            (item,) = on("get", "overrides", "-o", "json").json()["items"]
-            return str(item["state"])
-
-        assert state() == "not rendered yet", "the files must be those of stopped clients"
-        assert on("request", EXPERIMENT[2]).code == 0
-        assert state() == "in force"
-        told = on("why", FUSION, "-o", "json").json()["missing_inputs"]
-        lost = [one.partition(" does not")[0].rpartition("/vehicle00/")[2] for one in told]
-        assert lost == ["ego_data", "drivers/lidar/pointcloud"]
-        ran = on("status")
-        assert ran.err.splitlines()[:2] == [f"warning: {each}" for each in told]
-        assert ran.code == 0
 
     def test_a_cluster_with_an_old_bootstrap_file_is_named(
         self, on: On, fleet: GitRepo, access: Any

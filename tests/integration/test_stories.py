@@ -23,7 +23,7 @@ from pydantic import Field
 from tests.kit import plain_yaml
 from tests.kit.cli import Run
 from tests.kit.goals import EXPERIMENT
-from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, git, root
+from tests.kit.repo import GIT_ENVIRONMENT, GitRepo, branches, git, root
 
 Edits = Mapping[str, str | dict[str, str] | None]
 """Paths and their new texts: a whole text, old and new parts of it, or None to remove the file."""
@@ -61,6 +61,8 @@ class Step(FrozenModel):
     """Parts of the standard output. A command that fails prints nothing else."""
     tells: list[str] = Field(default_factory=list)
     """Parts of the errors and warnings; without any, the command must have none."""
+    leaves: dict[str, str | None] = Field(default_factory=dict)
+    """A part of the text of each of these files on main afterwards; None if it must not exist."""
     hides: list[str] = Field(default_factory=list)
     """What the command must not print."""
 
@@ -113,6 +115,7 @@ class Teller:
     def take(self, told: Any, patch: pytest.MonkeyPatch) -> None:
         repo = self.repo.path
         words = {"repo": str(repo), "url": repo.as_uri(), "first": root(repo)}
+        words["branch"] = next(iter(branches(repo)), "")
         words |= {"tip": self.repo.tip, "clone": str(self.clone), "folder": str(self._folder)}
         step = Step.model_validate(_filled(told, words | self._names))
         send(repo, step.sends)
@@ -153,7 +156,12 @@ class Teller:
         assert step.tells or not ran.err, (step.run, ran.err)
         assert not step.exit or step.prints or step.gives or not ran.out, (step.run, ran.out)
         for path, wanted in step.gives.items():
-            assert _fits(wanted, _at(ran.json(), path.split("."))), (step.run, path, ran.out)
+            found = _at(ran.json(), path.split("."))
+            assert _fits(wanted, found), (step.run, path, found)
+        files = self.repo.files() if step.leaves else {}
+        for path, part in step.leaves.items():
+            text = files.get(path)
+            assert part in (text or '') if part else text is None, (step.run, path, text)
         writes = False if step.exit else step.writes
         assert writes in (None, self.repo.tip != before), step.run
 
