@@ -1,4 +1,7 @@
-"""`demandops check` on pull requests: branches of a state repo in which a demand is booked."""
+"""`demandops check` on pull requests: branches of a state repo in which a demand is booked.
+
+More is in ``stories/check.yaml``.
+"""
 
 from __future__ import annotations
 
@@ -246,62 +249,6 @@ def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, che
     assert topics == ["ego_data", "drivers/lidar/pointcloud"]
 
 
-def test_an_edited_claim_is_judged_as_a_claim(branch: Path, check: Run, found: Found) -> None:
-    edited = claim(branch)
-    sound, path = edited.read_text(), edited.relative_to(branch).as_posix()
-    edit(edited, ("- station00\n", "- station00\n- tram07\n"))
-    ran = check()
-    assert ran.code == 0
-    assert "~ service od-edge-station00\n      + requester tram07\n" in ran.out
-    assert found()["files"] == []
-    for mistake in ("node: moon", "nodes: edge"):
-        edited.write_text(sound.replace("node: edge", mistake))
-        assert {one["file"] for one in found()["faults"]} == {path}
-
-
-def test_all_faults_of_claims_configuration_and_hand_edits_are_told_together(
-    branch: Path, found: Found
-) -> None:
-    edit(claim(branch), ("node: edge", "nodes: edge"))
-    edit(branch / "inventory" / "brokers.yaml", ("node: edge", "node: egde"))
-    edit(branch / "policy" / "access-domains.yaml", ("kind: AccessDomains", "kind: Domains"))
-    edit(branch / FUSION, ("replicas: 1", "replicas: 3"))
-    data = found()
-    places = {one["file"].split("/")[0] for one in data["faults"]}
-    assert places == {"ledger", "inventory", "policy", "clusters"}
-    assert len(data["suggestions"]) == 1
-
-
-def test_a_node_in_use_that_is_taken_away_is_told_with_how_to_give_it_up(
-    branch: Path, found: Found
-) -> None:
-    edit(branch / "inventory" / "nodes.yaml", ("- id: vehicle00\n", "- id: vehicle99\n"))
-    told = [each["message"] for each in found()["faults"] if each["file"] == "inventory/nodes.yaml"]
-    in_use = [text for text in told if text.startswith("'vehicle00' is in use")]
-    assert in_use and in_use[0].endswith(": demandops decommission vehicle00")
-
-
-def test_configuration_shows_in_which_fields_releases_change(branch: Path, found: Found) -> None:
-    newer_images(branch)
-    data = found()
-    names = ["od-edge-station00", "od-edge-vehicle00", Path(FUSION).stem]
-    assert [one["name"] for one in data["releases"]] == names
-    assert data["releases"][0]["details"] == ["spec.values.image.tag: '2025-04' → '2025-09'"]
-    assert '-      tag: "2025-04"\n+      tag: "2025-09"\n' in data["files"][0]["diff"]
-    assert data["bookkeeping"] == []
-
-
-def test_a_base_that_was_broken_is_mended_by_the_branch(branch: Path, found: Found) -> None:
-    git(branch, "checkout", "--quiet", "main")
-    edit(branch / "inventory" / "brokers.yaml", ("node: edge", "node: egde"))
-    commit(branch, "A merge gone wrong")
-    git(branch, "push", "--quiet", "origin", "main")
-    git(branch, "checkout", "--quiet", "-b", "mend")
-    edit(branch / "inventory" / "brokers.yaml", ("node: egde", "node: edge"))
-    data = found()
-    assert (data["faults"], data["base_valid"], data["files"]) == ([], False, [])
-
-
 def test_a_symbolic_link_is_not_followed(branch: Path, tmp_path: Path, found: Found) -> None:
     secret = tmp_path / "secret"
     secret.write_text("password: hunter2\n")
@@ -344,25 +291,6 @@ def test_a_branch_of_several_commits_is_seen_whole_while_main_moves_on(
     assert not [one for one in after["bookkeeping"] if one["change"] == "added"]
 
 
-def test_what_the_generator_wrote_itself_is_no_hand_edit(
-    bare: Path, branch: Path, found: Found
-) -> None:
-    old = git(branch, "rev-parse", "HEAD")
-    book(bare, 2)
-    git(branch, "pull", "--quiet", "origin", "main")
-    data = found("--base", old)
-    assert data["faults"] == []
-    assert "start" in {one["change"] for one in data["releases"]}
-
-
-def test_without_a_remote_main_is_compared_with(branch: Path, found: Found) -> None:
-    git(branch, "remote", "remove", "origin")
-    newer_images(branch)
-    commit(branch)
-    assert len(found()["releases"]) == 3
-    assert found("--base", "HEAD")["releases"] == found()["releases"]  # no generator has followed
-
-
 @pytest.mark.parametrize("base", [[], ["--base", "origin/main"]], ids=["default", "named"])
 def test_a_shallow_clone_is_told_how_to_become_whole(
     bare: Path, branch: Path, tmp_path: Path, demandops: Run, base: list[str]
@@ -382,13 +310,14 @@ def test_a_shallow_clone_is_told_how_to_become_whole(
         assert ("fetch all commits: git fetch --unshallow origin " in ran.err) == shallow
 
 
-def test_a_sparse_checkout_is_told_how_to_become_whole(branch: Path, check: Run) -> None:
-    git(branch, "sparse-checkout", "set", "policy")
-    ran = check()
-    assert (ran.code, ran.out) == (1, "")
-    assert ran.err.endswith("with `git sparse-checkout disable`\n")
-    git(branch, "sparse-checkout", "disable")
+def test_a_folder_that_is_no_git_checkout_is_checked_all_the_same(branch: Path, check: Run) -> None:
+    shutil.rmtree(branch / ".git")
     assert check().code == 0
+    edit(branch / "inventory" / "nodes.yaml", ("cluster: c-its", "cluster: c-itz"))
+    assert check().code == 1
+    ran = check("--base", "HEAD")
+    assert (ran.code, ran.out) == (1, "")
+    assert "is not a Git checkout; leave out --base" in ran.err
 
 
 def test_a_checkout_that_git_cannot_open_is_not_taken_for_files_without_git(
@@ -403,16 +332,6 @@ def test_a_checkout_that_git_cannot_open_is_not_taken_for_files_without_git(
         assert ran.err.startswith(f"error: {branch} is a Git repository that cannot be opened: ")
         remedy = f"run `git config --global --add safe.directory {branch}`"
         assert ran.err.rstrip().endswith(remedy)
-
-
-def test_a_base_of_another_kind_is_refused(branch: Path, check: Run) -> None:
-    for base in ("nowhere", ":/", "HEAD^{/(.*)*}", "origin/main@{1}", "-x", "\udcff"):
-        ran = check("--base", base)
-        assert (ran.code, ran.out) == (1, ""), base
-        assert "is neither a commit of the state repo nor a time" in ran.err
-    git(branch, "checkout", "--quiet", "--orphan", "alone")
-    commit(branch)
-    assert "have no commit in common; name the merge target with --base" in check().err
 
 
 # ---- Markdown ----
