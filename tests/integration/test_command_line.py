@@ -1,14 +1,13 @@
 """The command line: text, JSON and exit codes of every command.
 
 Exit codes: 0 done, 1 a fault that the user can fix, 2 wrong usage, 3 a fault of the program.
-What commands print on a terminal is in ``tests/terminal/expected``.
+More is in ``stories``; what commands print on a terminal is in ``tests/terminal/expected``.
 """
 
 from __future__ import annotations
 
 import json
 import os
-import re
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +16,6 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
-from demandops import __version__
 from demandops.cli.views import bookkeeping
 
 from tests.integration.conftest import On
@@ -25,13 +23,11 @@ from tests.kit.cli import Ran, Run
 from tests.kit.goals import (
     APP,
     CLOUD,
-    EXPERIMENT,
     Goal,
     application,
     connection,
     goal,
     perception,
-    put,
 )
 from tests.kit.repo import FORGER, GitRepo, git
 
@@ -39,11 +35,6 @@ FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
 URL = "https://git.example/own.git"
 REQUEST_KEYS = ["index", "request", "outcome", "commit", "faults", "warnings", "not_held", "placed"]
 GIVEN = yaml.safe_dump(perception())
-
-
-def cells_of(table: str) -> list[list[str]]:
-    """Return the cells of each line of a table; the table has no empty cells."""
-    return [re.split(r"\s{2,}", line) for line in table.splitlines()]
 
 
 def text(*goals: Goal) -> str:
@@ -85,33 +76,6 @@ class TestInit:
         root.write_text(root.read_text().replace("# url: https://git.example", f"url: {URL}#"))
         assert "write  bootstrap/c-its.yaml" in demandops("check", folder).out
 
-    def test_a_state_repo_for_argo_cd(self, demandops: Run, folder: Path) -> None:
-        argocd = ("init", folder, "--gitops", "argocd")
-        ran = demandops(*argocd)
-        assert (ran.code, folder.exists()) == (1, False)
-        assert ran.err.startswith("error: --gitops argocd needs --url")
-        assert demandops(*argocd, "--url", URL, "-o", "json").json()["gitops"] == "argocd"
-        assert demandops("check", folder).code == 0
-        assert not (folder / "demandops.argocd.yaml").exists()
-        root = read(folder / "demandops.yaml")
-        assert (root["gitops"], root["argocd"]) == ("argocd", {"url": URL})
-        found = yaml.safe_load_all((folder / "bootstrap" / "c-its.yaml").read_text())
-        kinds = [item["kind"] for item in found]
-        assert kinds[-2:] == ["AppProject", "Application"]
-        assert "GitRepository" not in kinds
-
-    def test_an_address_as_git_writes_it(self, demandops: Run, folder: Path) -> None:
-        ran = demandops("init", folder, "--url", "git@git.example:fleet/state.git")
-        assert ran.code == 0
-        assert f"git -C {folder} show main:bootstrap/c-its.yaml | kubectl apply -f -" in ran.out
-        url, root = "ssh://git@git.example/fleet/state.git", folder / "demandops.yaml"
-        assert read(root)["flux"]["url"] == url
-        assert url in (folder / "bootstrap" / "c-its.yaml").read_text()
-        root.write_text(root.read_text().replace(url, "git@git.example:fleet/state.git"))
-        told = demandops("check", folder).err
-        assert told.startswith("error: demandops.yaml:12: flux.url: ")
-        assert told.endswith(f"; write {url}\n")
-
     @pytest.mark.parametrize("gitops", ["flux", "argocd"])
     def test_an_empty_fleet(self, demandops: Run, folder: Path, gitops: str) -> None:
         options = ["--url", URL, "--gitops", gitops, "--example", "none"]
@@ -134,16 +98,6 @@ class TestInit:
         monkeypatch.chdir(folder / "inner")
         assert demandops("init", ".").code == 0
         assert (folder / "inner" / "demandops.yaml").is_file()
-
-    def test_what_is_in_use_is_refused_and_left_alone(self, demandops: Run, folder: Path) -> None:
-        folder.mkdir()
-        (folder / "mine").write_text("precious")
-        for place, told in ((folder, True), (folder / "mine", False), (folder / "mine/x", False)):
-            ran = demandops("init", place)
-            assert (ran.code, ran.out) == (1, "")
-            assert ("is not empty" in ran.err, str(folder) in ran.err) == (told, True)
-        assert [path.name for path in folder.iterdir()] == ["mine"]
-        assert (folder / "mine").read_text() == "precious"
 
 
 class TestRequest:
@@ -199,36 +153,11 @@ class TestRequest:
         assert [row["index"] for row in rows] == [0, 1, 2, 3, 4]
         log = git(state, "rev-list", "--reverse", "main~5..main").split()
         assert [row["commit"] for row in rows] == log
-
-    def test_what_documents_demand_is_released(self, on: On) -> None:
-        link = {"id": "d/link", "type": "mqtt", "source": "vehicle00", "target": "edge"}
-        link |= {"topics": [{"source": "/d"}]}
-        given = text(perception(), put("d", "vehicle00", applications=[], connections=[link],
-                                       lease=600))  # fmt: skip
-        ran = on("request", "-", stdin=given)
-        assert ran.code == 0
-        assert ran.err.startswith("  warning: lease: 600 is 600 seconds; write the unit")
-        ran = on("request", "-", "--release", "-o", "json", stdin=given)
-        assert [row["outcome"] for row in ran.json()] == ["released", "released"]
-        assert on("get", "claims", "-o", "name").out.strip() == ""
-
-    def test_if_one_cannot_be_parsed_nothing_at_all_is_booked(
-        self, on: On, state: GitRepo, tmp_path: Path
-    ) -> None:
-        before = state.tip
-        ran = on.request(perception(id="1"), {"id": 5}, perception(id="3"))
-        assert (ran.code, state.tip) == (1, before)
-        rows = ran.json()
-        assert [(row["index"], row["outcome"], row["commit"]) for row in rows] == [
-            (index, "refused", None) for index in range(3)
-        ]
-        assert [[each["field"] for each in row["faults"]] for row in rows] == [[""], ["id"], [""]]
-        good, bad = tmp_path / "good.yaml", tmp_path / "bad.yaml"
-        good.write_text(GIVEN)
+        bad = tmp_path / "bad.yaml"
         bad.write_text(f"{GIVEN}---\nid: [\n")
-        ran = on("request", good, bad, "--output", "json")
+        ran = on("request", tmp_path / "a.yaml", bad, "--output", "json")
         (fault,) = ran.json()["faults"]
-        assert (ran.code, fault["file"], state.tip) == (1, str(bad), before)
+        assert (ran.code, fault["file"], state.tip) == (1, str(bad), log[-1])
 
     def test_a_command_that_fails_prints_its_faults_as_json(
         self, demandops: Run, tmp_path: Path
@@ -258,168 +187,6 @@ class TestRequest:
         assert on("request", "-", stdin=GIVEN).code == 0
         assert paths == git(state, "diff", "--name-only", "main~1", "main").splitlines()
 
-    def test_a_dry_run_decides_each_on_top_of_the_one_before(self, on: On, state: GitRepo) -> None:
-        before = state.tip
-        join, leave = perception(), perception(shutdown=True)
-        goals = (join, join, goal([application(node="egde")], id="x"), leave, leave)
-        ran = on.request(*goals, more=("--dry-run",))
-        outcomes = ["booked", "unchanged", "refused", "released", "unchanged"]
-        assert [row["outcome"] for row in ran.json()] == outcomes
-        keys = [*REQUEST_KEYS, "releases", "files"]
-        assert all(list(row) == keys for row in ran.json() if row["outcome"] != "refused")
-        assert [each["change"] for each in ran.json()[0]["releases"]] == ["start"] * 4
-        assert (ran.code, state.tip) == (1, before)
-
-    def test_the_experiments_files_as_they_are(self, on: On, state: GitRepo) -> None:
-        first = state.tip
-        rows = on.json("request", *EXPERIMENT)
-        assert [row["outcome"] for row in rows] == ["booked"] * 4 + ["released"] * 4
-        assert [row["warnings"] for row in rows] == [[]] * 8
-        assert on("bookkeeping").out.count("(nothing)") == 2
-        books = on.json("bookkeeping")
-        assert (books["services"], books["connections"]) == ({}, {})
-        verified = on.json("verify", f"{first}..main")
-        assert [row["holds"] for row in verified] == [True] * 8
-        assert [row["commit"] for row in verified] == [row["commit"] for row in rows]
-
-
-BOOKS = f"""
-services:
-  od-edge-vehicle00: &service
-    {{applications: [{APP}], service: object-detection, node: edge, source: vehicle00,
-     source_topic: {CLOUD[0]}, version: 0.1.0, application_version: null, versions_asked: {{}},
-     parameters: {{}}, inputs: {{point_cloud: {{{CLOUD[0]}: [vehicle00]}}}},
-     requesters: [vehicle00]}}
-  {FUSION}:
-    <<: *service
-    service: object-fusion
-    source: null
-    source_topic: null
-    inputs: {{ego_data: {{}}, object_list: {{/vehicle00_local_objectlist: [vehicle00]}}}}
-connections:
-  vehicle00/edge: {{type: mqtt, source: vehicle00, target: edge, requesters: [vehicle00],
-                    topics: {{{CLOUD[0]}: [vehicle00]}}}}
-demands:
-  f55dfde4475a5cd804f0: {{action: DeploymentRequest, request: request, requesters: [vehicle00]}}
-"""
-
-
-class TestBookkeeping:
-    def test_the_json_is_what_programs_rely_on(self, on: On, joined: GitRepo) -> None:
-        assert on.json("bookkeeping") == yaml.safe_load(BOOKS) | {"commit": joined.tip}
-
-    def test_lists_are_sorted(self, on: On, joined: GitRepo) -> None:
-        who = ["z", "a"]
-        link = connection(who=who, topics=["/z", "/a"])
-        on.request(goal([application("a/first", who=who)], [link]))
-        found = on.json("bookkeeping")
-        detection = found["services"]["od-edge-vehicle00"]
-        assert detection["applications"] == ["a/first", APP]
-        assert detection["requesters"] == ["a", "vehicle00", "z"]
-        entry = found["connections"]["vehicle00/edge"]
-        assert [*entry["topics"]] == ["/a", CLOUD[0], "/z"]
-        assert entry["requesters"] == ["a", "vehicle00", "z"]
-
-
-def test_an_id_is_shown_as_it_is(on: On) -> None:
-    ids = ["a:car:b", "[red]a[/red]", "[/]", "a\\[b"]
-    assert on.request(*(goal([application(id)], [connection(id)]) for id in ids)).code == 0
-    for command in ("bookkeeping", "log", "diff main~4 main", "verify main~4.."):
-        ran = on(*command.split())
-        assert (ran.code, ran.err) == (0, "")
-        assert [id for id in ids if id not in ran.out] == []
-
-
-class TestLog:
-    def test_the_json_tells_all_that_the_trailers_say(self, on: On, joined: GitRepo) -> None:
-        joined.commit({"inventory/README.md": "hello\n"})
-        by_hand, join, init = on.json("log")
-        assert [*by_hand] == [*join] == [*init]
-        assert (join["operation"], join["request"]) == ("join", "request")
-        assert (join["author"], join["requesters"]) == ("vehicle00 (requester)", ["vehicle00"])
-        assert (join["applications"], join["connections"]) == ([APP], ["vehicle00/edge"])
-        assert len(join["demands"]) == 1
-        assert init["operation"] == "init"
-        assert (by_hand["operation"], by_hand["author"]) == (None, "A person")
-        assert cells_of(on("log", "-o", "wide").out)[2][5:] == [
-            "join",
-            "vehicle00 (requester)",
-            "request",
-        ]
-
-    def test_as_many_and_from_where_one_says(self, on: On, state: GitRepo) -> None:
-        on.request(*(goal([], [connection(f"c{number}")]) for number in range(3)))
-        commits = git(state, "rev-list", "main").split()
-        for args, wanted in (
-            ("", commits),
-            ("-n 2", commits[:2]),
-            ("main~1", commits[1:]),
-            (f"{commits[2]}..main", commits[:2]),
-            (f"{commits[2]}..", commits[:2]),
-            ("main..main", []),
-        ):
-            assert [row["commit"] for row in on.json("log", *args.split())] == wanted
-
-
-def test_a_revision_that_does_not_exist_is_told(on: On) -> None:
-    for command in ("bookkeeping --at nope", "log nope", "log nope..main", "log main..nope",
-                    "diff main nope", "verify nope"):  # fmt: skip
-        ran = on(*command.split())
-        assert (ran.code, ran.out) == (1, "")
-        assert ran.err.startswith("error: 'nope' is neither a commit of the state repo nor a time")
-
-
-class TestDiff:
-    def test_the_text_tells_what_differs(self, on: On, joined: GitRepo) -> None:
-        who = ["vehicle01"]
-        app = application(who=who, ego=[("/ego", "vehicle01")])
-        on.request(goal([app], [connection("vehicle01/edge", who=who, topics=["/ego"])]))
-        source = "mqtt-vehicle01-edge-source-092a70a6cc97"
-        target = "mqtt-vehicle01-edge-target-f918b3fb6980"
-        assert on("diff", "main~1", "main").out.splitlines() == [
-            "~ service od-edge-vehicle00",
-            "    + requester vehicle01",
-            f"~ service {FUSION}",
-            "    + requester vehicle01",
-            "    + ego_data /ego",
-            "+ connection vehicle01/edge for vehicle01",
-            f"+ release {source} (MQTT source of connection vehicle01/edge on vehicle00)",
-            f"+ release {target} (MQTT target of connection vehicle01/edge on edge)",
-            f"~ release {FUSION} (object-fusion on edge for {APP})",
-            "    + ego_data /ego",
-        ]
-        back = on("diff", "main", "main~1").out.splitlines()
-        assert back[1] == "    - requester vehicle01"
-        assert "- connection vehicle01/edge for vehicle01" in back
-        assert back[-1].startswith(f"- release {target} (")
-
-    def test_who_holds_a_topic_no_longer_is_told(self, on: On) -> None:
-        ego = [("/a", "vehicle00"), ("/b", "vehicle00")]
-        both = ["vehicle00", "station00"]
-        app = application(who=both, ego=ego, clouds=[])
-        on.request(goal([app], [connection(who=both, topics=["/a", "/b"])]))
-        app = application(ego=ego[:1], clouds=[])
-        on.request(goal([app], [connection(topics=["/a"])], shutdown=True))
-        assert on("diff", "main~1", "main").out.splitlines() == [
-            f"~ service {FUSION}",
-            "    - ego_data /a for vehicle00",
-            "~ connection vehicle00/edge",
-            "    - topic /a for vehicle00",
-            "no difference in releases",
-        ]
-        held = [cells[-2:] for cells in cells_of(on("bookkeeping").out) if "/a" in str(cells)]
-        assert held == [["/a (station00), /b", "station00, vehicle00"]] * 2
-
-    def test_the_json_tells_the_same(self, on: On, joined: GitRepo) -> None:
-        found = on.json("diff", "main~1", "main")
-        assert found.keys() == {"bookkeeping", "releases", "other_files"}
-        *services, made = found["bookkeeping"]
-        assert [each["name"] for each in services] == ["od-edge-vehicle00", FUSION]
-        assert made == {"kind": "connection", "name": "vehicle00/edge", "change": "added",
-                        "requesters": ["vehicle00"], "lost": [], "gained": []}  # fmt: skip
-        ran = on("diff", "main", "main")
-        assert ran == (0, "no difference in bookkeeping\nno difference in releases\n", "")
-
 
 class TestVerify:
     def test_what_was_tampered_with_does_not_hold(self, on: On, joined: GitRepo) -> None:
@@ -439,11 +206,6 @@ class TestVerify:
             "faults": [], "differing": [path], "touched": [],
             "signed": False, "signer": None, "signature": None,
         }  # fmt: skip
-
-    def test_a_commit_of_a_person_is_skipped(self, on: On, joined: GitRepo) -> None:
-        joined.commit({"inventory/README.md": "hello\n"})
-        (row,) = on.json("verify")
-        assert row["skipped"] == "made by a person"
 
 
 class TestStateRepo:
@@ -465,14 +227,6 @@ class TestStateRepo:
         assert (ran.code, ran.out) == (1, "")
         return ran.err
 
-    def test_one_that_is_checked_out_is_not_written(self, demandops: Run, checkout: Path) -> None:
-        for command in ("request -", "decommission edge", "rollback main -m why"):
-            told = self.refused(demandops, command, checkout)
-            assert "has 'main' checked out" in told
-            assert told.endswith(
-                f"; use a bare clone: git clone --bare {checkout} {checkout}.git\n"
-            )
-
     @pytest.mark.parametrize("command", ["bookkeeping", "request -"])
     def test_a_password_in_its_address_is_refused_and_not_shown(
         self, demandops: Run, data_home: Path, command: str
@@ -483,16 +237,6 @@ class TestStateRepo:
         for path in data_home.rglob("*"):
             assert "hunter2" not in path.name
             assert not path.is_file() or "hunter2" not in path.read_text()
-
-    def test_a_repository_of_something_else_is_told(self, demandops: Run, tmp_path: Path) -> None:
-        folder = tmp_path / "other.git"
-        repo = pygit2.init_repository(str(folder), bare=True, initial_head="main")
-        who = pygit2.Signature("A person", "person@example.org", 1_770_000_000, 0)
-        tree = repo.TreeBuilder().write()
-        repo.create_commit("refs/heads/main", who, who, "Empty\n", tree, [])
-        for command in ("bookkeeping", "request -"):
-            told = self.refused(demandops, command, folder)
-            assert "is not a state repo, because it has no demandops.yaml" in told
 
     def test_a_newer_generators_state_repo_is_refused(self, demandops: Run, state: GitRepo) -> None:
         root = state.files()["demandops.yaml"].replace("renderVersion: 2", "renderVersion: 99")
@@ -507,20 +251,6 @@ class TestStateRepo:
         (tmp_path / "file").write_text("")
         monkeypatch.setenv("DEMANDOPS_DATA_HOME", str(tmp_path / "file" / "home"))
         assert str(tmp_path / "file") in self.refused(demandops, "request -", state.path)
-
-
-def test_wrong_usage_is_told(
-    demandops: Run, state: GitRepo, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("DEMANDOPS_STATE_REPO", str(state.path))
-    for command in (
-        "nonsense", "request", "init", "init x --gitops helm", "diff main", "log -n 0",
-        "log -n many", "bookkeeping --output xml", "--nonsense", "verify a b",
-    ):  # fmt: skip
-        ran = demandops(*command.split())
-        assert (ran.code, ran.out) == (2, ""), command
-        assert ran.err.startswith("Usage: demandops "), command
-    assert demandops("--version").out == f"demandops, version {__version__}\n"
 
 
 def test_a_fault_of_the_program_has_a_code_of_its_own(

@@ -156,7 +156,7 @@ class Teller:
         assert step.tells or not ran.err, (step.run, ran.err)
         assert not step.exit or step.prints or step.gives or not ran.out, (step.run, ran.out)
         for path, wanted in step.gives.items():
-            found = _at(ran.json(), path.split("."))
+            found = _at(ran.json(), path.split(".") if path else [])
             assert _fits(wanted, found), (step.run, path, found)
         files = self.repo.files() if step.leaves else {}
         for path, part in step.leaves.items():
