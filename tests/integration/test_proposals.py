@@ -1,4 +1,4 @@
-"""Demands that need approval are proposed, listed, awaited, approved and rejected by commands."""
+"""Demands that need approval are awaited, approved and rejected; see ``stories/people.yaml``."""
 
 from __future__ import annotations
 
@@ -40,38 +40,6 @@ def at(state: GitRepo, branch: str) -> str:
     return git(state, "rev-parse", branch)
 
 
-def test_a_demand_that_needs_approval_is_proposed_and_listed(
-    demandops: Run, on: On, strict: GitRepo
-) -> None:
-    before = strict.tip
-    assert on.json("get", "proposals")["items"] == []
-    [row] = on.request(perception()).json()
-    [branch] = branches(strict.path)
-    assert (row["outcome"], row["commit"], row["faults"]) == ("proposed", None, [])
-    assert row["proposal"] == {"branch": branch, "link": ""}
-    assert on.book(perception()).out.endswith(f" awaiting approval {branch}\n")
-    assert strict.tip == before
-    [row] = on.json("get", "proposals")["items"]
-    assert row["branch"] == branch
-    assert row["requesters"] == ["vehicle00"]
-    assert row["summary"] == "Join edge/object_detection_fusion, vehicle00/edge"
-    assert row["commit"] == at(strict, branch)
-    assert (row["link"], len(row["operations"])) == (None, 1)
-    mine = on.json("get", "proposals", "--requester", "vehicle00")
-    assert mine["items"] == [row]  # although this requester holds nothing yet
-    url = strict.path.as_uri()
-    by_url = demandops("get", "proposals", "--state-repo", url, "--output", "json")
-    assert by_url.json()["items"] == [row]
-
-
-def test_a_lease_that_has_not_started_is_explained(on: On, strict: GitRepo) -> None:
-    on.book(put("patrol") | {"lease": "1h"})
-    git(strict, "branch", "--force", "main", *branches(strict.path))  # no generator runs
-    ran = on("why", "patrol")
-    assert (ran.code, ran.err) == (0, "")
-    assert ", lease of 1h, not started\n" in ran.out
-
-
 @contextmanager
 def decided(state: GitRepo, *command: str) -> Iterator[None]:
     """During the block, a person runs a git command on the branch of the first proposal."""
@@ -96,30 +64,6 @@ def test_wait_waits_for_the_decision(on: On, strict: GitRepo) -> None:
         ran = on.book(perception(), more=("--wait",))
     assert "awaiting approval: demand/request-" in ran.err
     assert ran.out == f"standard input: request 0 'request' booked in {strict.tip}\n"
-
-
-def test_a_dry_run_says_that_approval_is_needed(on: On, strict: GitRepo) -> None:
-    dry = ("--dry-run",)
-    told = on.book(perception(), more=dry).out
-    assert "  needs approval: access domain 'perception' requires it\n" in told
-    [row] = on.request(perception(), more=dry).json()
-    assert (row["outcome"], row["approval"]) == ("proposed", ["access domain 'perception'"])
-    assert branches(strict.path) == []
-
-
-def test_a_release_of_what_waits_is_done_by_a_later_call(on: On, strict: GitRepo) -> None:
-    on.book(perception())
-    assert " released in " in on.book(perception(shutdown=True)).out
-    assert branches(strict.path) == []
-
-
-def test_verify_and_log_take_a_merged_proposal(on: On, strict: GitRepo, branch: str) -> None:
-    git(strict, "update-ref", "refs/heads/main", f"refs/heads/{branch}")
-    ran = on("verify")
-    assert ran.code == 0
-    assert "merged by a person" in ran.out
-    [entry] = on.json("log", "-n", "1")
-    assert entry["commit"] == strict.tip
 
 
 def test_a_branch_of_a_time_that_no_calendar_has_is_listed(on: On, state: GitRepo) -> None:
@@ -254,13 +198,6 @@ def test_a_proposal_that_has_changed_since_it_was_seen_is_left_alone(
     assert ran.code == 0, ran.err
     assert command == "reject" or at(strict, "main^2") == now
     assert "changed: it replaces demand/visit-" in ran.err and seen in ran.err
-
-
-@pytest.mark.parametrize("more", [(), ("--yes",), ("--output", "json"), ("--commit", "")])
-def test_without_a_terminal_nothing_is_approved_that_was_not_seen(
-    on: On, branch: str, more: tuple[str, ...]
-) -> None:
-    assert "--commit ID" in on.refused("approve", branch, *more, code=2)
 
 
 @pytest.mark.parametrize("typed", ["n", "y"])
