@@ -31,7 +31,6 @@ DETECTION = f"{EDGE}/od-edge-station00.yaml"
 CLIENT = "clusters/c-its/perception/vehicle00/mqtt-vehicle00-edge-source-d3ca91c2df6c.yaml"
 TARGET = f"{EDGE}/mqtt-vehicle00-edge-target-3c0f22bda69b.yaml"
 LOST = "is generated, so a manual edit is lost; revert it"
-Replaced = list[tuple[str, str]]
 Found = Callable[..., dict[str, Any]]
 
 NEWER_PERCEPTION = [
@@ -106,60 +105,14 @@ def with_requesters(branch: Path, names: list[str]) -> None:
 
 # # ---- manual edits ----
 
-DIGEST = f"sha256:{'0' * 64}"
-IMAGE = "docker.io/rwthika/robotkube-mqtt-client:2025-04"
-EDITS: list[tuple[str, Replaced, dict[str, Any], list[str]]] = [
-    (
-        FUSION,
-        [
-            ("replicas: 1", "replicas: 3"),
-            ("domainId: 0", "domainId: 7"),
-            ('object-fusion\n      tag: "2025-04"', 'object-fusion\n      tag: "2025-05"'),
-        ],
-        {
-            "values": {"ros": {"domainId": 7}},
-            "images": {"object-fusion": {"tag": "2025-05"}},
-            "replicas": 3,
-        },
-        [],
-    ),
-    (
-        DETECTION,
-        [("tolerations: []", "tolerations: [{key: gpu}]"), ("interval: 10m", "interval: 1m")],
-        {"values": {"tolerations": [{"key": "gpu"}]}},
-        ["spec.interval"],
-    ),
-    (
-        DETECTION,
-        [("tolerations: []", "tolerations: []\n    podAnnotations: {example.org/port: metrics}")],
-        {"values": {"podAnnotations": {"example.org/port": "metrics"}}},
-        [],
-    ),
-    (
-        DETECTION,
-        [('      digest: ""\n', ""), ("      rmwImplementation: ", "      other: ")],
-        {"values": {"image": {"digest": None}, "ros": {"rmwImplementation": None, "other": ""}}},
-        [],
-    ),
-    (
-        CLIENT,
-        [("mqtt-client:2025-04", "mqtt-client:2026-01"), ("replicas: 1", "replicas: 2")],
-        {"images": {"mqtt-client": {"tag": "2026-01"}}},
-        ["Deployment spec.replicas"],
-    ),
-    (
-        CLIENT,
-        [(IMAGE, f"mirror.example:5000/mqtt@{DIGEST}")],
-        {"images": {"mqtt-client": {"digest": DIGEST, "repository": "mirror.example:5000/mqtt"}}},
-        [],
-    ),
-]
+EDITS = yaml.safe_load(Path(__file__).with_name("edits.yaml").read_text())
 
 
 def test_an_edit_becomes_an_override_to_paste(branch: Path, check: Run, found: Found) -> None:
-    for path, replaced, effects, left in EDITS:
+    for case in EDITS:
+        path = case["path"]
         before = (branch / path).read_text()
-        edit(branch / path, *replaced)
+        edit(branch / path, *case["edit"].items())
         commit(branch)
         (suggested,) = found()["suggestions"]
         ran, name = check(), f"overrides/{Path(path).name}"
@@ -169,14 +122,13 @@ def test_an_edit_becomes_an_override_to_paste(branch: Path, check: Run, found: F
         assert ran.out.startswith(f"\ninstead of editing {path}, write {name}:\n\n")
         assert suggested["text"] in ran.out
         made = yaml.safe_load(suggested["text"])
-        head = ("apiVersion", "kind", "reason", "owner", "select")
-        assert {key: made[key] for key in made if key not in head} == effects
+        effects = {key: made[key] for key in ("values", "images", "replicas") if key in made}
+        assert effects == case["effects"]
         assert (made["kind"], made["owner"]) == ("Override", "Petra Platform")
-        assert (suggested["instead_of"], suggested["not_covered"]) == (path, left)
-        also = ["od-edge-vehicle00"] if path == DETECTION else []
-        assert suggested["other_releases"] == also
-        if path == FUSION:
-            assert made["select"] == [{"applications": [APP], "services": ["object-fusion"]}]
+        assert made["select"] == case.get("select", made["select"])
+        for key in ("not_covered", "other_releases"):
+            assert suggested[key] == case.get(key, [])
+        assert suggested["instead_of"] == path
 
 
 def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, check: Run) -> None:
