@@ -97,48 +97,6 @@ def test_the_example_is_demanded_by_whom_the_rules_allow(
     assert read(checkout / "appdefs/tracking/demand.yaml")["requesters"] == ["vehicle00"]
 
 
-def test_an_override(checkout: Path, demandops: Run) -> None:
-    select = ["--service", "object-detection", "--node", "edge"]
-    why = ["--reason", "a test", "--owner", "petra", "-C", checkout]
-    assert demandops("new", "override", "quiet", *select, "--deny", *why).code == 0
-    assert demandops("new", "override", "none", *select, "--replicas", "0", *why).code == 0
-    found = read(checkout / "overrides" / "quiet.yaml")
-    assert found["select"] == [{"services": ["object-detection"], "nodes": ["edge"]}]
-    assert found["deny"] is True
-    assert demandops("check", checkout).code == 0
-
-
-@pytest.mark.parametrize(
-    ("args", "code", "told"),
-    [
-        (
-            f"application object-detection-fusion {OPTIONS}",
-            1,
-            "NAME: 'object-detection-fusion' exi",
-        ),
-        (f"application ../x {OPTIONS}", 1, "NAME: '../x' cannot be used here"),
-        (
-            f"application Big_Name {OPTIONS}",
-            1,
-            "NAME: 'Big_Name' cannot be used here; write lower-",
-        ),
-        (f"application x {OPTIONS} --service a=b", 2, "'a=b' is not NAME=PACKAGE/FILE"),
-        ("application x", 2, "Missing options '--input', '--service', '--image'."),
-        ("application object-detection-fusion", 1, "NAME: 'object-detection-fusion' exists"),
-        (f"application x {OPTIONS} --input a=b/C", 2, "write a=b/msg/C"),
-        ("override ../x --reason r --owner o --node edge --hold", 1, "error: "),
-    ],
-)
-def test_what_cannot_be_is_refused_and_nothing_is_written(
-    checkout: Path, demandops: Run, args: str, code: int, told: str
-) -> None:
-    ran = demandops("new", *args.split(), "-C", checkout)
-    assert (ran.code, ran.out) == (code, "")
-    assert told in ran.err
-    assert git(checkout, "status", "--porcelain") == ""
-    assert not (checkout.parent / "x.yaml").exists()
-
-
 def test_every_file_that_people_write_names_its_schema(demandops: Run, tmp_path: Path) -> None:
     repo = tmp_path / "fleet"
     assert demandops("init", repo).code == 0

@@ -20,6 +20,7 @@ import yaml
 from click.testing import CliRunner
 from demandops.cli.repo.check import MARK
 
+from tests.kit.cli import Run
 from tests.kit.config import skeleton
 from tests.kit.repo import git
 
@@ -58,18 +59,29 @@ def bash(script: str, **options: Any) -> subprocess.CompletedProcess[str]:
     )
 
 
-@pytest.mark.parametrize(
-    ("path", "options"),
-    [
-        (GITHUB, ["--builtin-schema", "vendor.github-workflows"]),
-        (COMMENT, ["--builtin-schema", "vendor.github-workflows"]),
-        (GITLAB, ["--builtin-schema", "vendor.gitlab-ci", "--data-transform", "gitlab-ci"]),
-    ],
-    ids=["github", "github-comment", "gitlab"],
-)
-def test_a_pipeline_is_valid_by_its_schema(checkout: Path, path: str, options: list[str]) -> None:
-    ran = CliRunner().invoke(check_jsonschema.main, [*options, str(checkout / path)])
-    assert ran.exit_code == 0, ran.output
+@pytest.fixture
+def package(tmp_path: Path, demandops: Run) -> Path:
+    """A folder with what `demandops new image` writes."""
+    folder = tmp_path / "package"
+    folder.mkdir()
+    where = ("--state-repo", "git@github.example:example/fleet.git", "-C", folder)
+    ran = demandops("new", "image", "tracking", "--repository", "ghcr.io/example/tracking", *where)
+    assert (ran.code, ran.err) == (0, "")
+    return folder
+
+
+def test_a_pipeline_is_valid_by_its_schema(checkout: Path, package: Path) -> None:
+    forge = ["--builtin-schema", "vendor.github-workflows"]
+    lab = ["--builtin-schema", "vendor.gitlab-ci", "--data-transform", "gitlab-ci"]
+    for file, options in (
+        (checkout / GITHUB, forge),
+        (checkout / COMMENT, forge),
+        (checkout / GITLAB, lab),
+        (package / ".github/workflows/image.yml", forge),
+        (package / ".gitlab-ci.yml", lab),
+    ):
+        ran = CliRunner().invoke(check_jsonschema.main, [*options, str(file)])
+        assert ran.exit_code == 0, ran.output
 
 
 def test_what_pipelines_run_is_named_by_its_digest() -> None:
@@ -119,12 +131,16 @@ def test_the_token_for_the_state_repo_is_only_where_a_protected_tag_runs() -> No
     ]
 
 
-def test_no_text_of_a_pull_request_reaches_a_shell(github: Pipeline, comment: Pipeline) -> None:
+def test_no_text_of_a_pull_request_reaches_a_shell(
+    github: Pipeline, comment: Pipeline, package: Path
+) -> None:
     checkout = github["jobs"]["check"]["steps"][0]["with"]
     assert (checkout["persist-credentials"], checkout["fetch-depth"]) == (False, 0)
-    jobs = [*github["jobs"].values(), *comment["jobs"].values()]
+    image = yaml.safe_load((package / ".github/workflows/image.yml").read_text())
+    assert image["permissions"] == {"contents": "read"}
+    jobs = [job for workflow in (github, comment, image) for job in workflow["jobs"].values()]
     scripts = [step["run"] for job in jobs for step in job["steps"] if "run" in step]
-    assert len(scripts) == 4
+    assert len(scripts) > 4
     # no script contains names from a pull request, like a branch or a title, as text
     assert not [script for script in scripts if "${{" in script]
     for script in scripts:
@@ -376,3 +392,47 @@ def test_an_artifact_that_is_no_report_is_refused(
     commenting: Commenting, entries: dict[str | zipfile.ZipInfo, str]
 ) -> None:
     assert commenting.run(entries) == (1, "")
+
+
+# ---- what `demandops new image` writes ----
+
+DIGEST = f"sha256:{64 * 'a'}"
+
+
+def propose(package: Path, remote: Path, tag: str, digest: str) -> subprocess.CompletedProcess[str]:
+    script = f'"{package}/ci/propose-image" "$TAG" "$DIGEST"'
+    words = {"STATE_REPO": remote.as_uri(), "TAG": tag, "DIGEST": digest}
+    return bash(f"{BASH} {script}", env={**os.environ, **words})
+
+
+def test_the_proposed_image_passes_check(
+    package: Path, checkout: Path, demandops: Run, tmp_path: Path
+) -> None:
+    texts = [path.read_text() for path in package.rglob("*") if path.is_file()]
+    assert not [text for text in texts if "@NAME@" in text or "@STATE_REPO@" in text]
+    remote = tmp_path / "remote.git"
+    git(tmp_path, "clone", "--quiet", "--bare", str(checkout), str(remote))
+    ran = propose(package, remote, "1.2.0", DIGEST)
+    assert (ran.returncode, ran.stdout) == (0, "image/tracking-1.2.0\n"), ran.stderr
+    git(checkout, "fetch", "--quiet", str(remote), "image/tracking-1.2.0")
+    git(checkout, "checkout", "--quiet", "FETCH_HEAD")
+    assert git(checkout, "log", "-1", "--format=%s") == "Run tracking 1.2.0"
+    entry = yaml.safe_load((checkout / "registry/images/tracking.yaml").read_text())
+    pinned = {"repository": "ghcr.io/example/tracking", "tag": "1.2.0", "digest": DIGEST}
+    assert entry["images"]["tracking"] == pinned
+    assert demandops("check", checkout).code == 0
+    git(remote, "branch", "--force", "main", "image/tracking-1.2.0")
+    again = propose(package, remote, "1.2.0", DIGEST)
+    assert (again.returncode, again.stdout) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("tag", "digest", "wrong"),
+    [("1; reboot", DIGEST, "1; reboot"), ("1.0", "latest", "latest"), ("$(x)", DIGEST, "$(x)")],
+)
+def test_an_invalid_tag_or_digest_is_refused(
+    package: Path, tmp_path: Path, tag: str, digest: str, wrong: str
+) -> None:
+    ran = propose(package, tmp_path / "unused.git", tag, digest)
+    assert ran.returncode == 1
+    assert ran.stderr.startswith(f"'{wrong}' is not a ")
