@@ -209,19 +209,6 @@ class TestVerify:
 
 
 class TestStateRepo:
-    """An option or the environment names the state repo; a wrong name is refused with a remedy."""
-
-    def test_it_may_be_named_by_the_environment(
-        self, demandops: Run, state: GitRepo, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        for command in ("bookkeeping", "log", "diff main main", "verify", "request -"):
-            ran = demandops(*command.split(), stdin=GIVEN)
-            assert (ran.code, ran.out) == (2, "")
-            assert "--state-repo" in ran.err
-        monkeypatch.setenv("DEMANDOPS_STATE_REPO", str(state.path))
-        for command in ("bookkeeping", "request -"):
-            assert demandops(*command.split(), stdin=GIVEN).code == 0
-
     def refused(self, demandops: Run, command: str, where: str | Path) -> str:
         ran: Ran = demandops(*command.split(), "--state-repo", where, stdin=GIVEN)
         assert (ran.code, ran.out) == (1, "")

@@ -20,11 +20,10 @@ from demandops.repo.git.repository import RemoteAway
 from demandops.repo.reader import Reader
 
 from tests.integration.conftest import On
-from tests.kit.cli import Run
-from tests.kit.goals import EXPERIMENT, perception, put
+from tests.kit.goals import EXPERIMENT, put
 from tests.kit.http import kubeconfig
 from tests.kit.kube_api import kube_api
-from tests.kit.repo import GitRepo, git
+from tests.kit.repo import GitRepo
 from tests.kit.terminal import terminal
 
 FUSION = "of-edge-object-detection-fusion-cf7e0180a8bb"
@@ -98,111 +97,6 @@ def test_watch_prints_the_list_again_when_it_changes(on: On, fleet: GitRepo) -> 
         second = json.loads(watching.stdout.readline())
         watching.terminate()
     assert (second["items"], second["commit"]) == ([], fleet.tip)
-
-
-class TestWhichStateRepo:
-    @pytest.fixture
-    def clone(self, fleet: GitRepo, tmp_path: Path) -> Path:
-        git(tmp_path, "clone", "--quiet", fleet.path.as_uri(), "clone")
-        return tmp_path / "clone"
-
-    @pytest.fixture(autouse=True)
-    def _no_contexts(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path / "config"))
-
-    def test_what_writes_there_writes_to_its_remote(
-        self, on: On, demandops: Run, fleet: GitRepo, clone: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        monkeypatch.chdir(clone)
-        before = fleet.tip
-        ran = demandops("request", "-", stdin=yaml.safe_dump(perception(id="more")))
-        assert (ran.code, ran.err) == (0, "to see the new commit in this checkout: git pull\n")
-        assert git(fleet, "rev-parse", "main~1") == before
-        more = yaml.safe_dump(perception(id="again"))
-        assert on("request", "-", stdin=more).err == ""
-        git(clone, "remote", "remove", "origin")
-        for command in (
-            "request -",
-            "decommission vehicle00",
-            "rollback HEAD",
-            "upgrade",
-            "override create calm --node edge --hold -m Tests",
-            "suspend --requester vehicle00 -m Tests",
-        ):
-            ran = demandops(*command.split(), "--dry-run", stdin=more)
-            assert ran.code == 0, f"{command}: {ran.err}"
-        ran = demandops("request", "-", stdin=more)
-        assert ran.code == 2
-        assert "has no remote 'origin' to write to; give --state-repo" in ran.err
-
-    def test_a_context_is_named_once(
-        self, demandops: Run, fleet: GitRepo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        def config(*args: str | Path) -> str:
-            ran = demandops("config", *args)
-            assert ran.code == 0
-            return ran.out
-
-        def found(*args: str) -> str:
-            ran = demandops("get", "leases", *args, "-o", "name")
-            return ran.out if ran.code == 0 else f"exit {ran.code:d}"
-
-        gone = tmp_path / "gone"
-        assert config("list") == "no contexts; see demandops config set\n"
-        assert found() == "exit 2"
-        config("set", "fleet", "--state-repo", fleet.path)
-        config("set", "gone", "--state-repo", gone)
-        assert (found(), found("--context", "gone")) == ("patrol\n", "exit 1")
-        with monkeypatch.context() as environment:
-            environment.setenv("DEMANDOPS_STATE_REPO", str(gone))
-            assert (found(), found("--context", "fleet")) == ("exit 1", "patrol\n")
-        config("use", "gone")
-        assert (found(), found("--context", "fleet")) == ("exit 1", "patrol\n")
-        ran = demandops("get", "leases", "--context", "flet")
-        assert "contexts.yaml: --context: " in ran.err and "did you mean 'fleet'?" in ran.err
-        config("delete", "gone")
-        listed = json.loads(config("list", "-o", "json"))
-        assert (listed["current"], [*listed["contexts"]]) == (None, ["fleet"])
-
-    def test_a_relative_folder_of_the_environment_counts_only_where_it_exists(
-        self,
-        demandops: Run,
-        fleet: GitRepo,
-        clone: Path,
-        tmp_path: Path,
-        monkeypatch: pytest.MonkeyPatch,
-    ) -> None:
-        monkeypatch.setenv("DEMANDOPS_STATE_REPO", fleet.path.name)
-        for folder in (fleet.path.parent, clone / "inventory"):
-            monkeypatch.chdir(folder)
-            assert demandops("get", "leases", "-o", "name").out == "patrol\n"
-        assert demandops("decommission", "vehicle00", "--dry-run").code == 0
-        (tmp_path / "other").mkdir()
-        monkeypatch.chdir(tmp_path / "other")
-        ran = demandops("get", "leases")
-        assert ran.code == 2
-        assert f"'{fleet.path.name}', a relative folder that does not exist in" in ran.err
-
-    def test_a_context_lends_its_clusters_to_its_own_state_repo_alone(
-        self, on: On, demandops: Run, fleet: GitRepo, clone: Path, monkeypatch: pytest.MonkeyPatch
-    ) -> None:
-        missing = clone.parent / "clusters.yaml"
-        options = ("--state-repo", fleet.path.as_uri(), "--clusters", missing)
-        assert demandops("config", "set", "fleet", *options).code == 0
-        assert str(missing) in demandops("status").err
-        assert on("status").code == 0
-        monkeypatch.chdir(clone)
-        assert str(missing) in demandops("status").err
-
-    def test_a_file_that_is_not_valid_is_told_with_its_place(
-        self, demandops: Run, tmp_path: Path
-    ) -> None:
-        file = tmp_path / "config" / "demandops" / "contexts.yaml"
-        file.parent.mkdir(parents=True)
-        file.write_text("apiVersion: demandops/v1\nkind: Contexts\ncurrent: a\ncontexts: {b: {}}\n")
-        ran = demandops("get", "demands")
-        assert ran.code == 1
-        assert f"{file}:4: contexts.b.stateRepo: " in ran.err
 
 
 class TestStatus:

@@ -43,13 +43,13 @@ class Step(FrozenModel):
     git: list[str] = Field(default_factory=list)
     """Commands of git in the clone."""
     run: str = ""
-    """The command. Those that take a state repo get ``--state-repo $repo``, unless they run in the
-    clone.
+    """The command. Those that take a state repo get ``--state-repo $repo``, unless `inside` says in
+    which folder of the clone, or `environment` with which variables, the command runs.
     """
+    environment: dict[str, str] = Field(default_factory=dict)
     given: list[Any] = Field(default_factory=list)
     """Goals that the command reads from its standard input."""
     inside: str = ""
-    """The folder of the clone in which the command runs."""
     exit: int = 0
     writes: bool | None = None
     """Whether the command changes main. One that fails must not."""
@@ -136,12 +136,15 @@ class Teller:
         with patch.context() as own:
             if step.inside:
                 own.chdir(self.clone / step.inside)
+            for variable, value in step.environment.items():
+                own.setenv(variable, value)
             if step.run:
                 self._check(step)
 
     def _check(self, step: Step) -> None:
         args, before = shlex.split(step.run), self.repo.tip
-        if not step.inside and args[0] not in _NAMED_BY_FOLDER and "--state-repo" not in args:
+        named = step.inside or step.environment or "--state-repo" in args
+        if not named and args[0] not in _NAMED_BY_FOLDER:
             args += ["--state-repo", str(self.repo.path)]
         if step.gives:
             args += ["--output", "json"]
