@@ -26,12 +26,6 @@ def clone(on: On, state: GitRepo, tmp_path: Path) -> Path:
     return tmp_path / "clone"
 
 
-def test_there_is_a_schema_for_overrides(demandops: Run) -> None:
-    schema = json.loads(demandops("schema", "override").out)
-    assert set(schema["required"]) == {"apiVersion", "kind", "reason", "owner", "select"}
-    assert "name" not in schema["properties"]
-
-
 VALUES = [("domainId: 0", "domainId: 7"), ("replicas: 1", "replicas: 3")]
 
 

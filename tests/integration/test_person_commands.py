@@ -118,10 +118,6 @@ def test_a_person_sees_the_consequence_and_is_asked(joined: GitRepo, command: st
     assert f"Reason: {command.rsplit(maxsplit=1)[-1]}" in git(joined, "log", "-1", "--format=%b")
 
 
-def test_a_script_is_not_asked(on: On, joined: GitRepo) -> None:
-    assert "is decommissioned in" in on("decommission", "vehicle00").out
-
-
 def test_a_fleet_is_watched_live(on: On, joined: GitRepo) -> None:
     with Dialogue("watch", "--state-repo", joined.path) as watching:
         watching.read_until("Join ")

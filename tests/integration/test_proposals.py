@@ -104,40 +104,6 @@ def test_one_that_no_longer_fits_is_left_to_the_generator(
     assert "wait until a running generator has made the branch anew, then try again" in told
 
 
-def edit(person: Person, branch: str, content: bytes, *, executable: bool = False) -> str:
-    """Push a commit with a file `sketch` to a branch; return the commit's id."""
-    person.fetch()
-    git(person.folder, "checkout", "--quiet", "-B", "work", f"origin/{branch}")
-    person.folder.joinpath("sketch").write_bytes(content)
-    git(person.folder, "add", "sketch")
-    if executable:
-        git(person.folder, "update-index", "--chmod=+x", "sketch")
-    git(person.folder, "commit", "--quiet", "--message", "Add a sketch")
-    git(person.folder, "push", "--quiet", "origin", f"HEAD:{branch}")
-    return git(person.folder, "rev-parse", "HEAD")
-
-
-def test_what_a_person_added_to_a_proposal_is_approved_with_it(
-    on: On, strict: GitRepo, person: Person, branch: str
-) -> None:
-    head = edit(person, branch, b"text")
-    ran = on("approve", branch, "--commit", head)
-    assert ran.code == 0 and "  ~ file sketch\n" in ran.err
-    assert at(strict, "main^2") == head
-    assert strict.files()["sketch"] == "text"
-
-
-@pytest.mark.parametrize("scheme", ["", "file://"])
-def test_one_is_turned_down_even_if_a_person_edited_it(
-    demandops: Run, state: GitRepo, person: Person, branch: str, scheme: str
-) -> None:
-    edit(person, branch, b"text")
-    before = state.tip
-    ran = demandops("reject", branch, "--state-repo", f"{scheme}{state.path}")
-    assert (ran.code, ran.out) == (0, f"turned down: {branch} is deleted\n")
-    assert (branches(state.path), state.tip) == ([], before)
-
-
 def test_what_is_more_than_demands_is_listed_and_no_name_of_a_file_adds_lines(
     strict: GitRepo, person: Person, branch: str
 ) -> None:
@@ -162,6 +128,19 @@ def test_what_is_more_than_demands_is_listed_and_no_name_of_a_file_adds_lines(
     assert not [line for line in listed if line.startswith(("+ service harmless", "+ nothing"))]
 
 
+def test_a_binary_file_that_approve_would_change_is_told(
+    on: On, person: Person, branch: str
+) -> None:
+    person.fetch()
+    git(person.folder, "checkout", "--quiet", "-B", "work", f"origin/{branch}")
+    person.folder.joinpath("sketch").write_bytes(b"\xff\xd8")
+    git(person.folder, "add", "sketch")
+    git(person.folder, "commit", "--quiet", "--message", "Add a sketch")
+    git(person.folder, "push", "--quiet", "origin", f"HEAD:{branch}")
+    told = on.refused("approve", branch, "--commit", git(person.folder, "rev-parse", "HEAD"))
+    assert f"error: sketch in {branch} is not a plain text file; " in told
+
+
 def test_a_demand_named_like_the_branch_of_another_is_not_taken_for_it(
     on: On, strict: GitRepo, branch: str
 ) -> None:
@@ -169,15 +148,6 @@ def test_a_demand_named_like_the_branch_of_another_is_not_taken_for_it(
     on.book(put(branch, topic=("/other", "vehicle00")))
     ran = on("approve", branch, "--commit", head)
     assert ran.code == 0, ran.err
-
-
-@pytest.mark.parametrize("content", [b"\xff\xd8", b"text"], ids=["binary", "executable"])
-def test_a_file_that_approve_would_change_is_told(
-    on: On, person: Person, branch: str, content: bytes
-) -> None:
-    head = edit(person, branch, content, executable=content == b"text")
-    told = on.refused("approve", branch, "--commit", head).splitlines()[-1]
-    assert told.startswith(f"error: sketch in {branch} is not a plain text file; ")
 
 
 @pytest.mark.parametrize("command", ["approve", "reject"])

@@ -115,7 +115,8 @@ class Teller:
     def take(self, told: Any, patch: pytest.MonkeyPatch) -> None:
         repo = self.repo.path
         words = {"repo": str(repo), "url": repo.as_uri(), "first": root(repo)}
-        words["branch"] = next(iter(branches(repo)), "")
+        words["branch"] = next(iter(branches(repo)), "main")  # of a demand that waits
+        words["head"] = git(repo, "rev-parse", words["branch"])
         words |= {"tip": self.repo.tip, "clone": str(self.clone), "folder": str(self._folder)}
         step = Step.model_validate(_filled(told, words | self._names))
         send(repo, step.sends)
@@ -164,7 +165,7 @@ class Teller:
         files = self.repo.files() if step.leaves else {}
         for path, part in step.leaves.items():
             text = files.get(path)
-            assert part in (text or '') if part else text is None, (step.run, path, text)
+            assert part in (text or "") if part else text is None, (step.run, path, text)
         writes = False if step.exit else step.writes
         assert writes in (None, self.repo.tip != before), step.run
 
