@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import jsonschema_rs
-import pytest
 import yaml
 
 from tests.kit.cli import Run
@@ -61,40 +60,6 @@ def test_an_application_passes_check_at_once_and_its_example_demand_runs(
             "result_topic": "/edge_tracking_multi_tracker",
         },
     ]
-
-
-def test_a_fleet_from_nothing(demandops: Run, tmp_path: Path) -> None:
-    repo = tmp_path / "fleet"
-    assert demandops("init", repo, "--example", "none").code == 0
-    ran = demandops(*APPLICATION, "-C", repo)
-    assert (ran.code, ran.out) == (1, "")
-    assert "add one first, in inventory/nodes.yaml" in ran.err
-    nodes = [{"id": id, "type": "edge", "cluster": "site"} for id in ("edge00", "edge01")]
-    for path, kind, entries in (
-        ("clusters/site", "Clusters", [{"name": "site"}]),
-        ("nodes/edges", "Nodes", nodes),
-    ):
-        file = repo / "inventory" / f"{path}.yaml"
-        file.parent.mkdir()
-        data = {"apiVersion": "demandops/v1", "kind": kind, kind.lower(): entries}
-        file.write_text(yaml.safe_dump(data))
-    assert demandops(*APPLICATION, "-C", repo).code == 0
-    ran = demandops("check", repo)
-    assert (ran.code, ran.err) == (0, "")
-
-
-@pytest.mark.parametrize("allowed", [True, False])
-def test_the_example_is_demanded_by_whom_the_rules_allow(
-    checkout: Path, demandops: Run, allowed: bool
-) -> None:
-    applications = "" if allowed else ", applications: ['object-*']"
-    with (checkout / "policy" / "access-domains.yaml").open("a") as policy:
-        policy.write(f"    rules: [{{name: cars, requesters: ['vehicle*']{applications}}}]\n")
-    ran = demandops(*APPLICATION, "-C", checkout)
-    assert ran.code == 0
-    told = "no rule of access domain 'perception' allows demands for this application on edge"
-    assert (told in ran.out) is not allowed
-    assert read(checkout / "appdefs/tracking/demand.yaml")["requesters"] == ["vehicle00"]
 
 
 def test_every_file_that_people_write_names_its_schema(demandops: Run, tmp_path: Path) -> None:
