@@ -20,8 +20,7 @@ from demandops.repo.pull_request.merge_check import CheckResult
 from demandops.repo.pull_request.rendered_charts import RenderedCharts
 
 from tests.kit.cli import Run
-from tests.kit.config import override
-from tests.kit.goals import APP, EXPERIMENT
+from tests.kit.goals import EXPERIMENT
 from tests.kit.repo import git
 
 GOLDEN = Path(__file__).with_name("pull-request.md")
@@ -161,44 +160,7 @@ def test_edits_of_generated_files_are_refused_with_the_remedy(branch: Path, chec
     assert "change demandops.yaml, inventory/ or policy/ instead" in told["bootstrap/c-its.yaml"]
 
 
-def test_an_override_that_is_there_is_not_overwritten_by_the_one_suggested(
-    branch: Path, found: Found
-) -> None:
-    (branch / "overrides").mkdir(exist_ok=True)
-    there = branch / "overrides" / "od-edge-station00.yaml"
-    there.write_text(override({"nodes": ["cloud"]}, hold=True))
-    edit(branch / DETECTION, ("tolerations: []", "tolerations: [{key: gpu}]"))
-    assert found()["suggestions"][0]["file"] == "overrides/od-edge-station00-2.yaml"
-
-
 # ---- claims and configuration, and what follows ----
-
-
-def test_a_deleted_claim_is_no_fault_and_what_follows_is_shown(branch: Path, check: Run) -> None:
-    delete_a_claim(branch)
-    commit(branch)
-    need = claim(branch, f"application: {APP}").relative_to(branch)
-    ran = check()
-    assert ran.code == 0
-    assert ran.out.partition("what merging would do")[2] == (
-        f", compared with {git(branch, 'rev-parse', 'origin/main')[:10]}:\n"
-        "\n"
-        "desired state:\n"
-        f"  - {Path(CLIENT).stem} (MQTT source of connection vehicle00/edge on vehicle00)\n"
-        f"  - {Path(TARGET).stem} (MQTT target of connection vehicle00/edge on edge)\n"
-        "\n"
-        "bookkeeping:\n"
-        "  - connection vehicle00/edge for station00, vehicle00\n"
-        "\n"
-        "the generator will write or remove 2 files:\n"
-        f"  remove {TARGET}\n"
-        f"  remove {CLIENT}\n"
-    )
-    told = [line.partition(" /vehicles/vehicle00/") for line in ran.err.splitlines()]
-    warning = f"warning: {need}: application '{APP}': "
-    assert [line[0].removeprefix(warning) for line in told] == ["ego_data", "point_cloud"]
-    topics = [line[2].partition(" does not arrive: ")[0] for line in told]
-    assert topics == ["ego_data", "drivers/lidar/pointcloud"]
 
 
 def test_a_symbolic_link_is_not_followed(branch: Path, tmp_path: Path, found: Found) -> None:
@@ -222,25 +184,6 @@ def test_the_check_of_another_render_version_says_so(
 
 
 # ---- branches ----
-
-
-def test_a_branch_of_several_commits_is_seen_whole_while_main_moves_on(
-    bare: Path, branch: Path, found: Found
-) -> None:
-    newer_images(branch)
-    commit(branch)
-    delete_a_claim(branch)
-    commit(branch)
-    before = found()
-    assert {one["change"] for one in before["releases"]} == {"change", "stop"}
-    book(bare, 2)
-    git(branch, "fetch", "--quiet", "origin")
-    assert found() == before
-    git(branch, "merge", "--quiet", "--no-edit", "origin/main")
-    after = found()
-    assert (after["faults"], after["base"]) == ([], git(branch, "rev-parse", "origin/main"))
-    assert {one["change"] for one in after["releases"]} == {"change", "stop"}
-    assert not [one for one in after["bookkeeping"] if one["change"] == "added"]
 
 
 @pytest.mark.parametrize("base", [[], ["--base", "origin/main"]], ids=["default", "named"])
