@@ -25,10 +25,8 @@ from tests.kit.repo import git
 
 GOLDEN = Path(__file__).with_name("pull-request.md")
 EDGE = "clusters/c-its/perception/edge"
-FUSION = f"{EDGE}/of-edge-object-detection-fusion-cf7e0180a8bb.yaml"
 DETECTION = f"{EDGE}/od-edge-station00.yaml"
 CLIENT = "clusters/c-its/perception/vehicle00/mqtt-vehicle00-edge-source-d3ca91c2df6c.yaml"
-TARGET = f"{EDGE}/mqtt-vehicle00-edge-target-3c0f22bda69b.yaml"
 LOST = "is generated, so a manual edit is lost; revert it"
 Found = Callable[..., dict[str, Any]]
 
