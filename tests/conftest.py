@@ -15,13 +15,12 @@ from pathlib import Path
 from types import FrameType
 
 import pytest
-import yaml
 from demandops.repo.pull_request.helm import HELM_BIN
 from demandops.serve.generator import Generator
 from hypothesis import HealthCheck, settings
 
 from tests.kit import repo, sync
-from tests.kit.cli import Ran, Run, runner
+from tests.kit.cli import Run, runner
 from tests.kit.generator import running
 from tests.kit.limits import LONGEST_TEST_S
 from tests.kit.processes import Drivers
@@ -193,17 +192,6 @@ def generator(bare: Path) -> Iterator[Generator]:
 @pytest.fixture
 def demandops(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Run:
     return runner(capsys, monkeypatch)
-
-
-@pytest.fixture
-def request_json(demandops: Run, state: GitRepo) -> Callable[..., Ran]:
-    def send(*goals: object, more: tuple[str, ...] = ()) -> Ran:
-        text = yaml.safe_dump_all(goals, sort_keys=False, allow_unicode=True)
-        return demandops(
-            "request", "-", "--state-repo", state.path, "--output", "json", *more, stdin=text
-        )
-
-    return send
 
 
 @pytest.fixture(scope="session")

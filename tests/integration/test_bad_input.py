@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +18,16 @@ from demandops.cli.target import ContextsFile
 from demandops.cluster.clusters_file import AccessFile
 from demandops.detect.rule_file import RuleFile
 
+from tests.integration.conftest import On
+from tests.kit import plain_yaml
 from tests.kit.goals import perception
 from tests.kit.limits import PATIENCE_S
 from tests.kit.mutations import Form, mutations
-from tests.kit.repo import hook
+from tests.kit.repo import GitRepo
 from tests.kit.rich import CONFIG_MODELS, GOAL_MODELS, own_goal, reference_goal
 
-DETECTION = "appdefs/object-detection-fusion/charts/object-detection"
-
-Send = Callable[..., Any]
+APPDEF = "appdefs/object-detection-fusion"
+CHART = f"{APPDEF}/charts/object-detection"
 
 
 @pytest.fixture(autouse=True)
@@ -38,69 +39,31 @@ def _nothing_is_left_behind(data_home: Path) -> Iterator[None]:
         assert not [line for line in lines if "done" not in line and line["operation"] not in done]
 
 
-def refused(ran: Any) -> list[tuple[str, str]]:
-    """Check that the only request was refused; return field and message of each fault."""
-    (row,) = ran.json()
-    assert (ran.code, row["outcome"], row["commit"]) == (1, "refused", None)
-    return [(error["field"], error["message"]) for error in row["faults"]]
-
-
-def booked(ran: Any) -> None:
-    (row,) = ran.json()
-    assert (ran.code, row["outcome"], row["faults"]) == (0, "booked", [])
-
-
-@pytest.fixture
-def bookkeeping(demandops: Send, state: Any) -> Callable[[], dict[str, Any]]:
-    def read() -> dict[str, Any]:
-        found: dict[str, Any] = demandops(
-            "bookkeeping", "--state-repo", state.path, "--output", "json"
-        ).json()
-        return found
-
-    return read
-
-
-def test_a_push_that_the_remote_rejects_is_a_refusal(
-    demandops: Send, request_json: Send, state: Any
-) -> None:
-    hook(state, "pre-receive", "exit 1")
-    before, url = state.tip, state.path.as_uri()
-    given = yaml.safe_dump(perception())
-    ran = demandops("request", "-", "--state-repo", url, "--output", "json", stdin=given)
-    ((field, message),) = refused(ran)
-    assert (field, state.tip) == ("", before)
-    assert message.startswith(f"{url} rejects the push: ")
-
-
-def test_a_broken_book_is_told_and_not_taken_for_an_empty_one(
-    request_json: Send, state: Any, demandops: Send
-) -> None:
-    booked(request_json(perception()))
+def test_a_broken_book_is_told_and_not_taken_for_an_empty_one(on: On, state: GitRepo) -> None:
+    on.book(perception())
     (path, *_) = sorted(p for p in state.files("ledger/") if p.endswith(".yaml"))
     state.commit({path: state.files()[path][:60]})
-    ran = demandops("bookkeeping", "--state-repo", state.path, "--output", "json")
+    ran = on("bookkeeping", "--output", "json")
     assert ran.code == 1
     assert {each["file"] for each in ran.json()["faults"]} == {path}
-    assert ran.err.startswith(f"error: {path}: ")
-    booked(request_json(perception(id="another")))
+    on.book(perception(id="another"))
     assert path in state.files("ledger/")
 
 
 @pytest.mark.parametrize(
     ("path", "text"),
     [
-        ("appdefs/object-detection-fusion/values/object-detection.yaml.j2", "replicas: many"),
-        (f"{DETECTION}/values.schema.json", "{"),
-        (f"{DETECTION}/values.yaml", "a: ["),
+        (f"{APPDEF}/values/object-detection.yaml.j2", "replicas: many"),
+        (f"{CHART}/values.schema.json", "{"),
+        (f"{CHART}/values.yaml", "a: ["),
     ],
     ids=["values", "schema", "defaults"],
 )
 def test_of_a_chart_that_people_broke_the_last_valid_version_stays_in_force(
-    request_json: Send, state: Any, caplog: pytest.LogCaptureFixture, path: str, text: str
+    on: On, state: GitRepo, caplog: pytest.LogCaptureFixture, path: str, text: str
 ) -> None:
     state.commit({path: text})
-    booked(request_json(perception()))
+    on.book(perception())
     assert any("/od-" in manifest for manifest in state.manifests())
     assert state.files()[path] == text, "the generator must not change what people wrote"
     assert path in caplog.text
@@ -110,16 +73,18 @@ def test_of_a_chart_that_people_broke_the_last_valid_version_stays_in_force(
     ("valid", "model"), list(zip((reference_goal, own_goal), GOAL_MODELS, strict=True))
 )
 def test_a_mistake_anywhere_in_a_goal_changes_nothing(
-    request_json: Send, state: Any, data_home: Path, valid: Any, model: Any
+    on: On, state: GitRepo, data_home: Path, valid: Any, model: Any
 ) -> None:
     """A sample only; ``tests/unit/demand/test_mistakes_in_goals.py`` tries every mistake."""
     form, before = Form(model.model_json_schema()), state.tip
     wrong = [m for m in mutations(valid()) if form.forbids(m.document)]
     for mutation in wrong[:: len(wrong) // 4]:
-        fields = [field for field, _ in refused(request_json(mutation.document))]
+        ran = on.request(mutation.document)
+        (row,) = ran.json()
+        assert (ran.code, row["outcome"], row["commit"], state.tip) == (1, "refused", None, before)
+        fields = [fault["field"] for fault in row["faults"]]
         assert any(map(mutation.is_at, fields)), (mutation.place, mutation.kind, fields)
-        assert state.tip == before
-    booked(request_json(perception()))
+    on.book(perception())
     assert list(data_home.rglob("outbox.jsonl")), "the fixture must find the journal"
 
 
@@ -129,97 +94,21 @@ def test_the_schemas_of_files_and_goals_are_the_tried_ones() -> None:
     assert shown == {*CONFIG_MODELS.values(), *GOAL_MODELS}
 
 
-# A file's content, and the start of the message; the rest has words of libyaml or pydantic.
-ATTACKS: dict[str, tuple[str | bytes, str]] = {
-    "empty": ("", "error: no request in {file}; write one\n"),
-    "only a comment": ("# nothing\n", "error: no request in {file}; write one\n"),
-    "empty documents": ("---\n---\n...\n", "error: no request in {file}; write one\n"),
-    "a list": (
-        "- id: a\n",
-        "{file}: request 0 '' refused\n"
-        "  a request is a mapping with the fields of a Demand (kind, demand, requesters and so on)"
-        ", or with id, apps, connections and shutdown\n",
-    ),
-    "a text": (
-        "hello\n",
-        "{file}: request 0 '' refused\n"
-        "  a request is a mapping with the fields of a Demand (kind, demand, requesters and so on)"
-        ", or with id, apps, connections and shutdown\n",
-    ),
-    "a key twice": (
-        "id: a\napps: []\nid: b\n",
-        "error: {file}: line 3, column 1: not valid YAML: the key 'id' appears twice; remove one\n",
-    ),
-    "a key twice, deep down": (
-        "apps:\n- header:\n    id: a\n    id: b\n",
-        "error: {file}: line 4, column 5: not valid YAML: the key 'id' appears twice; remove one\n",
-    ),
-    "an anchor": (
-        "id: &a x\n",
-        "error: {file}: line 1: anchors and aliases (& and *) are not allowed; write the value "
-        "out\n",
-    ),
-    "an alias of itself": (
-        "id: x\napps: &a [*a]\n",
-        "error: {file}: line 2: anchors and aliases (& and *) are not allowed; write the value "
-        "out\n",
-    ),
-    "a billion laughs": (
-        "a: &a [x, x]\n"
-        + "".join(
-            f"{b}: &{b} [*{a}, *{a}]\n"
-            for a, b in zip("abcdefghijklmnopqrstuvwxy", "bcdefghijklmnopqrstuvwxyz", strict=True)
-        ),
-        "error: {file}: line 1: anchors and aliases (& and *) are not allowed; write the value "
-        "out\n",
-    ),
-    "binary": (bytes(range(256)), "error: {file}: is not UTF-8 text; save it as UTF-8\n"),
-    "UTF-16": ("id: a\n".encode("utf-16"), "error: {file}: is not UTF-8 text; save it as UTF-8\n"),
-    "a picture": (
-        b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR",
-        "error: {file}: is not UTF-8 text; save it as UTF-8\n",
-    ),
-    "a tab": (
-        "id: a\n\tapps: []\n",
-        "error: {file}: line 2, column 1: not valid YAML: ",
-    ),
-    "an open quote": (
-        'id: "a\n',
-        "error: {file}: line 2, column 1: not valid YAML: ",
-    ),
-    "an open bracket": (
-        "apps: [\n",
-        "error: {file}: line 2, column 1: not valid YAML: ",
-    ),
-    "a tag of Python": (
-        'id: !!python/object/apply:os.system ["touch {trace}"]\n',
-        "error: {file}: line 1, column 5: not valid YAML: ",
-    ),
-    "half of a character": (
-        'id: "\\ud800"\n',
-        "error: {file}: line 1, column 8: not valid YAML: ",
-    ),
-    "a list for a key": (
-        "? [a, b]\n: c\n",
-        "error: {file}: line 1, column 3: not valid YAML: the key ['a', 'b'] must be text; put it "
-        "in quotes\n",
-    ),
-    "a number that YAML 1.1 reads into a time": (
-        "id: 12:30:45\n",
-        "{file}: request 0 '' refused\n  line 1: id: must be text, not 45045; put it in quotes\n",
-    ),
-    "a number beyond a byte": (
-        "connections: [{id: c, type: " + "9" * 4000 + "}]\n",
-        "{file}: request 0 '' refused\n  line 1: connections[0].type: ",
-    ),
-    "an infinite number": (
-        "connections: [{id: c, type: .inf}]\n",
-        "{file}: request 0 '' refused\n"
-        "  line 1: connections[0].type: must be a whole number, not inf\n",
-    ),
+TOLD = plain_yaml.load(Path(__file__).with_name("attacks.yaml").read_text())
+MORE = TOLD.pop("more")
+MORE += [
+    "connections: [{id: c, type: 0x" + "f" * 5000 + "}]\n", "id: 0x" + "f" * 5000 + "\n",
+    "id: " + "9" * 5000 + "\n", "id: 0b" + "1" * 20000 + "\n", "- " * 1500 + "a\n",
+    "apps: " + "[" * 900 + "]" * 900 + "\n", "apps: " + "{a: " * 900 + "}" * 900 + "\n",
+    "".join(" " * depth + "a:\n" for depth in range(1500)), "a" * 100_000, "? " * 500,
+    "\n" * 10_000 + "&a b",
+]  # fmt: skip
+NO_UTF8 = "is not UTF-8 text"
+ATTACKS: dict[str, tuple[str | bytes, str]] = TOLD | {
+    "binary": (bytes(range(256)), NO_UTF8),
+    "UTF-16": ("id: a\n".encode("utf-16"), NO_UTF8),
+    "a picture": (b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR", NO_UTF8),
 }
-
-
 EACH = """
 import sys
 from demandops.cli.main import run
@@ -231,79 +120,30 @@ for file in sys.argv[2:]:
 class TestYamlAttacks:
     """The message names file and place, the exit code is 1, and nothing is booked."""
 
-    @pytest.mark.parametrize("name", ATTACKS)
+    @pytest.mark.parametrize(("content", "told"), ATTACKS.values(), ids=ATTACKS)
     def test_a_file_is_refused_with_its_name_and_the_place(
-        self, demandops: Send, state: Any, tmp_path: Path, name: str
+        self, on: On, tmp_path: Path, content: str | bytes, told: str
     ) -> None:
-        content, expected = ATTACKS[name]
-        file = tmp_path / "request.yaml"
+        file, trace = tmp_path / "request.yaml", tmp_path / "trace"
         if isinstance(content, str):
-            content = content.replace("{trace}", str(tmp_path / "trace")).encode()
+            content = content.replace("{trace}", str(trace)).replace("{digits}", "9" * 4000)
+            content = content.encode()
         file.write_bytes(content)
-        before = state.tip
-        ran = demandops("request", file, "--state-repo", state.path)
-        assert (ran.code, ran.out) == (1, "")
-        assert ran.err.startswith(expected.format(file=file))
-        assert state.tip == before
-        assert not (tmp_path / "trace").exists()
+        errors = on.refused("request", file)
+        assert str(file) in errors and told.format(file=file) in errors
+        assert not trace.exists()
 
-    def test_any_content_of_a_file_ends_in_an_error_message(
-        self, demandops: Send, state: Any, tmp_path: Path
-    ) -> None:
-        contents = [
-            "~: x\n",
-            "5: x\n",
-            "true: x\n",
-            "1.5: x\n",
-            "apps: [{header: {~: x}}]\n",
-            "connections: [{id: c, type: 0x" + "f" * 5000 + "}]\n",
-            "id: 0x" + "f" * 5000 + "\n",
-            "id: " + "9" * 5000 + "\n",
-            "id: 0b" + "1" * 20000 + "\n",
-            "id: !!binary aGVsbG8=\n",
-            "id: !!binary '='\n",
-            "id: !!int x\n",
-            "id: !!float x\n",
-            "id: !!bool x\n",
-            "id: !!timestamp x\n",
-            "apps: !!set {a, b}\n",
-            "apps: !!omap [a: b]\n",
-            "apps: !!pairs [a: b]\n",
-            "id: !<tag:yaml.org,2002:str> [x]\n",
-            "!!map [a]\n",
-            "<<: {id: x}\n",
-            "<<: 5\n",
-            "id: =\n",
-            "id: 1:99999999999999999999:1\n",
-            "id: 2026-99-99\n",
-            "id: -.inf\n",
-            "id: .nan\n",
-            "%YAML 9.9\n---\nid: a\n",
-            "%TAG ! !foo\n---\nid: a\n",
-            "apps: " + "[" * 900 + "]" * 900 + "\n",
-            "apps: " + "{a: " * 900 + "}" * 900 + "\n",
-            "".join(" " * depth + "a:\n" for depth in range(1500)),
-            "- " * 1500 + "a\n",
-            "a\0b\n",
-            "\ufeffid: 5\n",
-            "id: a\u2028: b\n",
-            "a" * 100_000,
-            "? " * 500,
-            "\n" * 10_000 + "&a b",
-        ]
+    def test_any_content_of_a_file_ends_in_an_error_message(self, on: On, tmp_path: Path) -> None:
         file = tmp_path / "request.yaml"
-        before = state.tip
-        for content in contents:
+        for content in MORE:
             file.write_text(content)
-            ran, shown = demandops("request", file, "--state-repo", state.path), repr(content[:24])
-            assert (ran.code, ran.out) == (1, ""), (shown, ran.err)
-            assert str(file) in ran.err, shown
-            assert "fault of" not in ran.err, f"{shown} is the user's to fix"
-            assert len(ran.err) < 5000, f"{shown}: a message that nobody reads"
-            assert state.tip == before, shown
+            errors, shown = on.refused("request", file), repr(content[:24])
+            assert str(file) in errors, shown
+            assert "fault of" not in errors, f"{shown} is the user's to fix"
+            assert len(errors) < 5000, f"{shown}: a message that nobody reads"
 
     def test_brackets_without_end_crash_nothing(
-        self, state: Any, tmp_path: Path, data_home: Path
+        self, state: GitRepo, tmp_path: Path, data_home: Path
     ) -> None:
         """The commands run in another process, because a parser might overflow its stack."""
         files = [tmp_path / "lists.yaml", tmp_path / "mappings.yaml"]
@@ -318,42 +158,32 @@ class TestYamlAttacks:
             assert said.startswith(f"error: {file}: ")
             assert "nested" in said
 
-    def test_the_traps_of_yaml_are_taken_as_text(
-        self, demandops: Send, state: Any, bookkeeping: Send
-    ) -> None:
+    def test_the_traps_of_yaml_are_taken_as_text(self, on: On) -> None:
         texts = ["yes", "null", "~", "1e3", "0o7", "010", "12:30:45", "2026-01-31", "0x1F", "<<"]
         items = [
             f"- {{id: {written}, type: 1, requester_ids: [{written}], source_node_id: vehicle00, "
             "target_node_id: edge, source_topics: [/a], target_topics: [/a]}"
             for written in (*(f'"{text}"' for text in texts), "2026-02-01")
         ]
-        text = "id: x\nconnections:\n" + "\n".join(items)
-        ran = demandops("request", "-", "--state-repo", state.path, "--output", "json", stdin=text)
-        booked(ran)
-        connections = bookkeeping()["connections"]
+        on.json("request", "-", stdin="id: x\nconnections:\n" + "\n".join(items))
+        connections = on.json("bookkeeping")["connections"]
         assert {id: entry["requesters"] for id, entry in connections.items()} == {
             text: [text] for text in (*texts, "2026-02-01")
         }
 
-    def test_what_cannot_be_read_is_named(
-        self, demandops: Send, state: Any, tmp_path: Path
-    ) -> None:
+    def test_what_cannot_be_read_is_named(self, on: On, tmp_path: Path) -> None:
         for file, told in (
-            (
-                tmp_path / "none",
-                f"{tmp_path}/none: cannot be read: No such file or directory; check the path",
-            ),
-            (tmp_path, f"{tmp_path}: cannot be read: Is a directory; check the path"),
-            ("-", "standard input: is not UTF-8 text; save it as UTF-8"),
+            (tmp_path / "none", f"{tmp_path}/none: cannot be read: No such file or directory"),
+            (tmp_path, f"{tmp_path}: cannot be read: Is a directory"),
+            ("-", "standard input: is not UTF-8 text"),
         ):
-            ran = demandops("request", file, "--state-repo", state.path, stdin=bytes(range(256)))
-            assert ran == (1, "", f"error: {told}\n")
+            errors = on.refused("request", file, stdin=bytes(range(256)))
+            assert errors.startswith(f"error: {told}; ")
 
     def test_no_control_character_of_a_file_reaches_the_terminal(
-        self, demandops: Send, state: Any, tmp_path: Path
+        self, on: On, tmp_path: Path
     ) -> None:
         file = tmp_path / "request.yaml"
         file.write_text('"\\e[31mred\\a": 1\nid: "\\e]0;title\\a"\napps: [{"\\b\\b": 1}]\n')
-        ran = demandops("request", file, "--state-repo", state.path)
-        assert ran.code == 1
-        assert ran.err.replace("\n", "").isprintable(), repr(ran.err)
+        errors = on.refused("request", file)
+        assert errors.replace("\n", "").isprintable(), repr(errors)

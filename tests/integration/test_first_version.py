@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ import pytest
 import yaml
 from demandops.base.settings import LEDGER_API_VERSION
 
-from tests.kit.cli import Ran, Run
+from tests.integration.conftest import On
 from tests.kit.repo import GitRepo, first_version, git
 
 EXPERIMENT = Path(__file__).parents[2] / "examples" / "experiment"
@@ -23,19 +22,13 @@ def state(tmp_path: Path) -> GitRepo:
     return first_version(tmp_path / "state.git")
 
 
-@pytest.fixture
-def run(demandops: Run, state: GitRepo) -> Run:
-    def call(command: str, *args: str | Path, stdin: str = "") -> Ran:
-        return demandops(command, *args, "--state-repo", state.path, stdin=stdin)
-
-    return call
-
-
-def documents(files: dict[str, str]) -> Iterator[tuple[str, Any]]:
-    """Yield each manifest under a name that is the same before and after an upgrade."""
-    for path, text in files.items():
-        for place, document in enumerate(filter(None, yaml.safe_load_all(text))):
-            yield f"{path} {place}", document
+def documents(files: dict[str, str]) -> dict[str, Any]:
+    """Return each manifest by a name that is the same before and after an upgrade."""
+    return {
+        f"{path} {place}": document
+        for path, text in files.items()
+        for place, document in enumerate(filter(None, yaml.safe_load_all(text)))
+    }
 
 
 def with_todays_topics(text: str) -> str:
@@ -57,42 +50,35 @@ def ledger(state: GitRepo) -> dict[str, Any]:
 
 
 def test_commands_that_read_work_before_the_upgrade_and_others_say_what_to_do(
-    run: Run, state: GitRepo
+    on: On, state: GitRepo
 ) -> None:
     tip = state.tip
-    services = run("bookkeeping", "--output", "json").json()["services"]
+    services = on("bookkeeping", "--output", "json").json()["services"]
     assert "od-edge-station00" in services
-    assert run("log").code == run("why", "od-edge-station00").code == 0
-    refused = run("request", EXPERIMENT / "6-vehicle01-leaves.yaml")
-    assert refused.err == (
-        "error: demandops.yaml: renderVersion: is 1, but this generator renders version 2; stop "
-        "older generators, then run `demandops upgrade` to render everything again\n"
-    )
+    assert on("log").code == on("why", "od-edge-station00").code == 0
+    refused = on("request", EXPERIMENT / "6-vehicle01-leaves.yaml")
+    assert refused.err.startswith("error: demandops.yaml: renderVersion: is 1, but ")
     assert state.tip == tip
 
 
 def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_outputs_alone(
-    run: Run, state: GitRepo
+    on: On, state: GitRepo
 ) -> None:
-    books = run("bookkeeping", "--output", "json").json()
+    books = on("bookkeeping", "--output", "json").json()
     old, old_ledger = state.files(), ledger(state)
     manifests = {path: with_todays_topics(text) for path, text in state.manifests().items()}
     assert {p for p, text in manifests.items() if text != state.manifests()[p]} == {
         path for path in manifests if path.rpartition("/")[2].startswith("of-")
     }
-    before = dict(documents(manifests))
-    assert run("upgrade").out.endswith(
-        "after the upgrade, on the clusters:\n"
-        "- c-its: apply the cluster's bootstrap file again, because the file changed\n"
-        f"      git show main:{BOOTSTRAP} | kubectl apply -f -\n"
-    )
+    before = documents(manifests)
+    assert on("upgrade").out.endswith(f"git show main:{BOOTSTRAP} | kubectl apply -f -\n")
     new = state.files()
-    assert run("bookkeeping", "--output", "json").json() == books | {"commit": state.tip}
+    assert on("bookkeeping", "--output", "json").json() == books | {"commit": state.tip}
     for path, file in ledger(state).items():
         joined = file["kind"].endswith("Claim") and file["demand"] != "vehicle03-perception"
         added = {"action": "DeploymentRequest"} if joined else {}
         assert file == old_ledger[path] | {"apiVersion": LEDGER_API_VERSION} | added
-    after = dict(documents(state.manifests()))
+    after = documents(state.manifests())
     assert {n: without_labels(one) for n, one in after.items()} == {
         n: without_labels(one) for n, one in before.items()
     }
@@ -100,22 +86,22 @@ def test_an_upgrade_writes_the_same_claims_and_changes_labels_and_the_fusions_ou
         labels = before[name]["metadata"].get("labels", {})
         assert labels.items() <= document["metadata"].get("labels", {}).items()
     assert {p for p in new if p.startswith("bootstrap/") and new[p] != old[p]} == {BOOTSTRAP}
-    assert "nothing to do" in run("upgrade").out
-    skipped = [row["skipped"] for row in run("verify", "HEAD", "--output", "json").json()]
+    assert "nothing to do" in on("upgrade").out
+    skipped = [row["skipped"] for row in on("verify", "HEAD", "--output", "json").json()]
     assert skipped == [None]
-    assert run("verify").code == 0
+    assert on("verify").code == 0
 
 
 def test_demands_of_before_are_given_up_and_restored_after_the_upgrade(
-    run: Run, state: GitRepo
+    on: On, state: GitRepo
 ) -> None:
     before = state.tip
-    assert run("upgrade").code == 0
-    assert run("request", EXPERIMENT / "6-vehicle01-leaves.yaml").code == 0
+    assert on("upgrade").code == 0
+    assert on("request", EXPERIMENT / "6-vehicle01-leaves.yaml").code == 0
     assert not any("vehicle01" in file.get("requesters", ()) for file in claims(state))
-    assert run("rollback", before, "--reason", "try", "--drop-newer").code == 0
+    assert on("rollback", before, "--reason", "try", "--drop-newer").code == 0
     assert any("vehicle01" in file["requesters"] for file in claims(state))
-    assert run("verify").code == 0
+    assert on("verify").code == 0
     assert git(state, "fsck", "--strict") == ""
 
 

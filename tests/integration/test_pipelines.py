@@ -20,6 +20,7 @@ import yaml
 from click.testing import CliRunner
 from demandops.cli.repo.check import MARK
 
+from tests.kit.cli import Run
 from tests.kit.config import skeleton
 from tests.kit.repo import git
 
@@ -29,36 +30,58 @@ IMAGES = Path(__file__).parents[2] / "templates" / "scaffold" / "image"
 BASH = shutil.which("bash") or "bash"
 
 
-@pytest.fixture(scope="module")
-def github() -> dict[str, Any]:
-    data: dict[str, Any] = yaml.safe_load(skeleton()[GITHUB])
+Pipeline = dict[str, Any]
+
+
+def pipeline(path: str) -> Pipeline:
+    data: Pipeline = yaml.safe_load(skeleton()[path])
     return data
 
 
-@pytest.fixture(scope="module")
-def comment() -> dict[str, Any]:
-    data: dict[str, Any] = yaml.safe_load(skeleton()[COMMENT])
-    return data
+@pytest.fixture
+def github() -> Pipeline:
+    return pipeline(GITHUB)
 
 
-@pytest.fixture(scope="module")
-def gitlab() -> dict[str, Any]:
-    data: dict[str, Any] = yaml.safe_load(skeleton()[GITLAB])
-    return data
+@pytest.fixture
+def comment() -> Pipeline:
+    return pipeline(COMMENT)
 
 
-@pytest.mark.parametrize(
-    ("path", "options"),
-    [
-        (GITHUB, ["--builtin-schema", "vendor.github-workflows"]),
-        (COMMENT, ["--builtin-schema", "vendor.github-workflows"]),
-        (GITLAB, ["--builtin-schema", "vendor.gitlab-ci", "--data-transform", "gitlab-ci"]),
-    ],
-    ids=["github", "github-comment", "gitlab"],
-)
-def test_a_pipeline_is_valid_by_its_schema(checkout: Path, path: str, options: list[str]) -> None:
-    ran = CliRunner().invoke(check_jsonschema.main, [*options, str(checkout / path)])
-    assert ran.exit_code == 0, ran.output
+@pytest.fixture
+def gitlab() -> Pipeline:
+    return pipeline(GITLAB)
+
+
+def bash(script: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [BASH, "-e", "-c", script], capture_output=True, text=True, check=False, **options
+    )
+
+
+@pytest.fixture
+def package(tmp_path: Path, demandops: Run) -> Path:
+    """A folder with what `demandops new image` writes."""
+    folder = tmp_path / "package"
+    folder.mkdir()
+    where = ("--state-repo", "git@github.example:example/fleet.git", "-C", folder)
+    ran = demandops("new", "image", "tracking", "--repository", "ghcr.io/example/tracking", *where)
+    assert (ran.code, ran.err) == (0, "")
+    return folder
+
+
+def test_a_pipeline_is_valid_by_its_schema(checkout: Path, package: Path) -> None:
+    forge = ["--builtin-schema", "vendor.github-workflows"]
+    lab = ["--builtin-schema", "vendor.gitlab-ci", "--data-transform", "gitlab-ci"]
+    for file, options in (
+        (checkout / GITHUB, forge),
+        (checkout / COMMENT, forge),
+        (checkout / GITLAB, lab),
+        (package / ".github/workflows/image.yml", forge),
+        (package / ".gitlab-ci.yml", lab),
+    ):
+        ran = CliRunner().invoke(check_jsonschema.main, [*options, str(file)])
+        assert ran.exit_code == 0, ran.output
 
 
 def test_what_pipelines_run_is_named_by_its_digest() -> None:
@@ -78,7 +101,7 @@ def test_what_pipelines_run_is_named_by_its_digest() -> None:
 
 
 def test_no_token_is_where_a_branch_may_change_the_pipeline(
-    github: dict[str, Any], comment: dict[str, Any], gitlab: dict[str, Any]
+    github: Pipeline, comment: Pipeline, gitlab: Pipeline
 ) -> None:
     # a branch may change these two for its own pull request
     assert github["permissions"] == {"contents": "read"}
@@ -109,13 +132,15 @@ def test_the_token_for_the_state_repo_is_only_where_a_protected_tag_runs() -> No
 
 
 def test_no_text_of_a_pull_request_reaches_a_shell(
-    github: dict[str, Any], comment: dict[str, Any]
+    github: Pipeline, comment: Pipeline, package: Path
 ) -> None:
     checkout = github["jobs"]["check"]["steps"][0]["with"]
     assert (checkout["persist-credentials"], checkout["fetch-depth"]) == (False, 0)
-    jobs = [*github["jobs"].values(), *comment["jobs"].values()]
+    image = yaml.safe_load((package / ".github/workflows/image.yml").read_text())
+    assert image["permissions"] == {"contents": "read"}
+    jobs = [job for workflow in (github, comment, image) for job in workflow["jobs"].values()]
     scripts = [step["run"] for job in jobs for step in job["steps"] if "run" in step]
-    assert len(scripts) == 4
+    assert len(scripts) > 4
     # no script contains names from a pull request, like a branch or a title, as text
     assert not [script for script in scripts if "${{" in script]
     for script in scripts:
@@ -147,7 +172,7 @@ def installing(request: pytest.FixtureRequest, tmp_path: Path) -> tuple[str, dic
 
     The fake programs only print their arguments.
     """
-    pipeline: dict[str, Any] = request.getfixturevalue(request.param)
+    pipeline: Pipeline = request.getfixturevalue(request.param)
     if request.param == "github":
         (script,) = [one["run"] for one in pipeline["jobs"]["check"]["steps"] if "pip" in str(one)]
     else:
@@ -166,38 +191,16 @@ def test_a_pipeline_installs_what_the_variable_names(
 ) -> None:
     script, environ = installing
     package = "git+https://git.example.org/demandops.git@v1.0.0"
-    done = subprocess.run(
-        [BASH, "-e", "-c", script],
-        env={**environ, "DEMANDOPS_PACKAGE": package},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    done = bash(script, env={**environ, "DEMANDOPS_PACKAGE": package})
     constraints = f"{environ['RUNNER_TEMP']}/demandops/share/demandops/constraints.txt"
     assert done.stdout.splitlines() == [
         "python -I -m venv",
         f"pip install --quiet --no-deps {package}",
         f"pip install --quiet --constraint {constraints} demandops",
     ]
-
-
-def test_a_pipeline_that_knows_no_package_says_which_variable_to_set(
-    installing: tuple[str, dict[str, str]],
-) -> None:
-    script, environ = installing
-    done = subprocess.run(
-        [BASH, "-e", "-c", script],
-        env={**environ, "DEMANDOPS_PACKAGE": ""},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = bash(script, env={**environ, "DEMANDOPS_PACKAGE": ""})
     assert (done.returncode != 0, done.stdout) == (True, "")
-    message = done.stderr[done.stderr.index("DEMANDOPS_PACKAGE") :]
-    assert re.sub("the (repository|project)", "the …", message) == (
-        "DEMANDOPS_PACKAGE: is not set; set this variable of the … to what pip installs: the URL "
-        "of a wheel, or git+https://… (docs/pull-requests.md of DemandOps)\n"
-    )
+    assert "DEMANDOPS_PACKAGE: is not set; set this variable of the " in done.stderr
 
 
 SOUND_OR_NOT = pytest.mark.parametrize(
@@ -205,9 +208,14 @@ SOUND_OR_NOT = pytest.mark.parametrize(
 )
 
 
+def reports(done: subprocess.CompletedProcess[str], report: str, sound: bool) -> None:
+    assert done.returncode == (0 if sound else 1), done.stderr
+    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else '1 error'}")
+
+
 @SOUND_OR_NOT
 def test_github_checks_and_reports(
-    checkout: Path, tmp_path: Path, github: dict[str, Any], sound: bool
+    checkout: Path, tmp_path: Path, github: Pipeline, sound: bool
 ) -> None:
     git(checkout, "update-ref", "refs/remotes/origin/main", "HEAD")
     if not sound:
@@ -216,42 +224,28 @@ def test_github_checks_and_reports(
     (step,) = [one for one in github["jobs"]["check"]["steps"] if one.get("name") == "Check"]
     summary = tmp_path / "summary.md"
     more = {"RUNNER_TEMP": str(tmp_path), "GITHUB_STEP_SUMMARY": str(summary), **helm(tmp_path)}
-    done = subprocess.run(
-        [BASH, "-e", "-c", step["run"]],
-        cwd=checkout,
-        env=environment(tmp_path, BASE="origin/main", **more),
-        check=False,
-    )
-    assert done.returncode == (0 if sound else 1)
-    report = (tmp_path / "report.md").read_text()
-    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else '1 error'}")
-    assert summary.read_text() == report
+    done = bash(step["run"], cwd=checkout, env=environment(tmp_path, BASE="origin/main", **more))
+    reports(done, (tmp_path / "report.md").read_text(), sound)
+    assert summary.read_text() == (tmp_path / "report.md").read_text()
 
 
 @SOUND_OR_NOT
 def test_gitlab_checks_and_reports(
-    checkout: Path, tmp_path: Path, gitlab: dict[str, Any], sound: bool
+    checkout: Path, tmp_path: Path, gitlab: Pipeline, sound: bool
 ) -> None:
-    remote = tmp_path / "remote.git"
-    git(tmp_path, "clone", "--quiet", "--bare", str(checkout), str(remote))
-    git(checkout, "remote", "add", "origin", remote.as_uri())
+    git(tmp_path, "clone", "--quiet", "--bare", str(checkout), "remote.git")
+    git(checkout, "remote", "add", "origin", (tmp_path / "remote.git").as_uri())
     if not sound:
         (checkout / "inventory" / "brokers.yaml").write_text("kind: [\n")
     program = tmp_path / "venv" / "bin" / "demandops"
     put_demandops(program)
     lines = gitlab["demandops"]["script"]
     script = "\n".join(lines[next(n for n, line in enumerate(lines) if "git fetch" in line) :])
-    done = subprocess.run(
-        [BASH, "-e", "-c", script.replace("/tmp/demandops/bin/demandops", str(program))],
-        cwd=checkout,
-        env=environment(tmp_path, CI_MERGE_REQUEST_TARGET_BRANCH_NAME="main", **helm(tmp_path)),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == (0 if sound else 1), done.stderr
+    script = script.replace("/tmp/demandops/bin/demandops", str(program))
+    more = {"CI_MERGE_REQUEST_TARGET_BRANCH_NAME": "main", **helm(tmp_path)}
+    done = bash(script, cwd=checkout, env=environment(tmp_path, **more))
     report = (checkout / "report.md").read_text()
-    assert report.startswith(f"{MARK}\n## DemandOps: {'valid' if sound else '1 error'}")
+    reports(done, report, sound)
     assert report in done.stdout
 
 
@@ -276,12 +270,8 @@ def test_helm_is_brought_as_its_digest_says(
     assert len(re.findall(r"digest=[0-9a-f]{64} ", script)) == 2
     script = re.sub("digest=[0-9a-f]+", f"digest={digest}", script)
     more = {"RUNNER_TEMP": str(tmp_path / "brought"), "HELM_SOURCE": tmp_path.as_uri()}
-    done = subprocess.run(
-        [BASH, "-e", "-c", script.replace("/tmp/helm", str(tmp_path / "brought" / "helm"))],
-        env=environment(tmp_path, CI_PROJECT_DIR=str(tmp_path), **more),
-        capture_output=True,
-        check=False,
-    )
+    script = script.replace("/tmp/helm", str(tmp_path / "brought" / "helm"))
+    done = bash(script, env=environment(tmp_path, CI_PROJECT_DIR=str(tmp_path), **more))
     assert (done.returncode == 0) == sound, done.stderr
     assert (tmp_path / "brought" / "helm" / "helm").exists() == sound
 
@@ -299,17 +289,13 @@ else:
     with (here / "written").open("a") as written:
         print(path, *options, file=written)
 """
-EVENT = {
-    "repository": {"id": 1},
-    "workflow_run": {
-        "head_sha": "newest",
-        "pull_requests": [
-            {"number": 1, "head": {"sha": "newest"}, "base": {"ref": "other", "repo": {"id": 1}}},
-            {"number": 2, "head": {"sha": "newest"}, "base": {"ref": "main", "repo": {"id": 2}}},
-            {"number": 3, "head": {"sha": "newest"}, "base": {"ref": "main", "repo": {"id": 1}}},
-        ],
-    },
-}
+PULL_REQUESTS = """
+- {number: 1, head: {sha: newest}, base: {ref: other, repo: {id: 1}}}
+- {number: 2, head: {sha: newest}, base: {ref: main, repo: {id: 2}}}
+- {number: 3, head: {sha: newest}, base: {ref: main, repo: {id: 1}}}
+"""
+RUN = {"head_sha": "newest", "pull_requests": yaml.safe_load(PULL_REQUESTS)}
+EVENT = {"repository": {"id": 1}, "workflow_run": RUN}
 ROBOT, PERSON = {"type": "Bot"}, {"type": "User"}
 
 
@@ -344,19 +330,14 @@ class Commenting:
         }
         work = self._folder / "work"
         work.mkdir()
-        done = subprocess.run(
-            [BASH, "-e", "-c", self._script],
-            cwd=work,
-            env=environment(self._folder, **more),
-            check=False,
-        )
+        done = bash(self._script, cwd=work, env=environment(self._folder, **more))
         written = self._folder / "written"
         assert {path.name for path in work.iterdir()} <= {"report.md", "report.zip"}
         return done.returncode, written.read_text() if written.exists() else ""
 
 
 @pytest.fixture
-def commenting(tmp_path: Path, comment: dict[str, Any]) -> Commenting:
+def commenting(tmp_path: Path, comment: Pipeline) -> Commenting:
     return Commenting(tmp_path, comment["jobs"]["comment"]["steps"][0]["run"])
 
 
@@ -365,10 +346,8 @@ REPORT = f"{MARK}\n## DemandOps: valid\n"
 
 def test_the_report_becomes_a_comment_of_the_pull_request(commenting: Commenting) -> None:
     commenting.comments = [{"id": 1, "user": PERSON, "body": REPORT}]
-    assert commenting.run({"report.md": REPORT}) == (
-        0,
-        "--silent repos/its/fleet/issues/3/comments -F body=@report.md\n",
-    )
+    written = "--silent repos/its/fleet/issues/3/comments -F body=@report.md\n"
+    assert commenting.run({"report.md": REPORT}) == (0, written)
 
 
 def test_an_earlier_comment_is_changed(commenting: Commenting) -> None:
@@ -381,8 +360,12 @@ def test_an_earlier_comment_is_changed(commenting: Commenting) -> None:
     assert (code, "PATCH repos/its/fleet/issues/comments/3 " in written) == (0, True)
 
 
-def test_a_report_of_older_commits_is_not_shown(commenting: Commenting) -> None:
-    commenting.event = {**EVENT, "workflow_run": EVENT["workflow_run"] | {"head_sha": "older"}}
+@pytest.mark.parametrize("why", ["of older commits", "too large"])
+def test_a_report_that_is_old_or_large_is_not_shown(commenting: Commenting, why: str) -> None:
+    if why == "too large":
+        commenting.size = 10**9
+    else:
+        commenting.event = {**EVENT, "workflow_run": RUN | {"head_sha": "older"}}
     assert commenting.run({"report.md": REPORT}) == (0, "")
 
 
@@ -411,6 +394,45 @@ def test_an_artifact_that_is_no_report_is_refused(
     assert commenting.run(entries) == (1, "")
 
 
-def test_a_large_artifact_is_not_downloaded(commenting: Commenting) -> None:
-    commenting.size = 10**9
-    assert commenting.run({"report.md": REPORT}) == (0, "")
+# ---- what `demandops new image` writes ----
+
+DIGEST = f"sha256:{64 * 'a'}"
+
+
+def propose(package: Path, remote: Path, tag: str, digest: str) -> subprocess.CompletedProcess[str]:
+    script = f'"{package}/ci/propose-image" "$TAG" "$DIGEST"'
+    words = {"STATE_REPO": remote.as_uri(), "TAG": tag, "DIGEST": digest}
+    return bash(f"{BASH} {script}", env={**os.environ, **words})
+
+
+def test_the_proposed_image_passes_check(
+    package: Path, checkout: Path, demandops: Run, tmp_path: Path
+) -> None:
+    texts = [path.read_text() for path in package.rglob("*") if path.is_file()]
+    assert not [text for text in texts if "@NAME@" in text or "@STATE_REPO@" in text]
+    remote = tmp_path / "remote.git"
+    git(tmp_path, "clone", "--quiet", "--bare", str(checkout), str(remote))
+    ran = propose(package, remote, "1.2.0", DIGEST)
+    assert (ran.returncode, ran.stdout) == (0, "image/tracking-1.2.0\n"), ran.stderr
+    git(checkout, "fetch", "--quiet", str(remote), "image/tracking-1.2.0")
+    git(checkout, "checkout", "--quiet", "FETCH_HEAD")
+    assert git(checkout, "log", "-1", "--format=%s") == "Run tracking 1.2.0"
+    entry = yaml.safe_load((checkout / "registry/images/tracking.yaml").read_text())
+    pinned = {"repository": "ghcr.io/example/tracking", "tag": "1.2.0", "digest": DIGEST}
+    assert entry["images"]["tracking"] == pinned
+    assert demandops("check", checkout).code == 0
+    git(remote, "branch", "--force", "main", "image/tracking-1.2.0")
+    again = propose(package, remote, "1.2.0", DIGEST)
+    assert (again.returncode, again.stdout) == (0, "")
+
+
+@pytest.mark.parametrize(
+    ("tag", "digest", "wrong"),
+    [("1; reboot", DIGEST, "1; reboot"), ("1.0", "latest", "latest"), ("$(x)", DIGEST, "$(x)")],
+)
+def test_an_invalid_tag_or_digest_is_refused(
+    package: Path, tmp_path: Path, tag: str, digest: str, wrong: str
+) -> None:
+    ran = propose(package, tmp_path / "unused.git", tag, digest)
+    assert ran.returncode == 1
+    assert ran.stderr.startswith(f"'{wrong}' is not a ")

@@ -24,17 +24,15 @@ from tests.kit import goals
 from tests.kit.generator import book, running, wait_until
 from tests.kit.html import Page
 
-VIEWS = (
-    "/",
-    "/map",
-    "/demands",
-    "/services",
-    "/connections",
-    "/leases",
-    "/timeline",
-    "/overrides",
-    "/rates",
-)
+VIEWS = ("/", "/map", "/demands", "/services", "/connections", "/leases", "/timeline",
+         "/overrides", "/rates")  # fmt: skip
+DENY = """apiVersion: demandops/v1
+kind: Override
+reason: The road is closed
+owner: traffic-control
+select: [{connections: [vehicle01/edge]}]
+deny: true
+"""
 
 Look = Callable[..., Page]
 

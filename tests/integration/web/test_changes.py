@@ -10,7 +10,6 @@ import sys
 import urllib.request
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -23,28 +22,37 @@ from demandops.web.server import Site
 from demandops.web.situation import CommitState
 from starlette.testclient import TestClient
 
-from tests.integration.web.conftest import VIEWS, Look, causes
+from tests.integration.web.conftest import DENY, VIEWS, Look, causes
 from tests.kit import goals
+from tests.kit.config import override
 from tests.kit.generator import Proposed, book, running, wait_until
 from tests.kit.limits import PATIENCE_S
 from tests.kit.repo import GitRepo, Person, away, git
 
-DENY = """apiVersion: demandops/v1
-kind: Override
-reason: The road is closed
-owner: traffic-control
-select: [{connections: [vehicle01/edge]}]
-deny: true
-"""
+LINK = {"id": "vehicle02/cloud", "type": "mqtt", "source": "vehicle02", "target": "cloud"}
+LINK |= {"topics": [{"source": "/t"}]}
 DETECTION = "od-edge-vehicle00"
+
+
+def overridden(generator: Generator, overrides: int = 1) -> None:
+    """Wait until the generator follows a person's overrides."""
+    generator.fetch_now()
+    wait_until(
+        lambda: len(generator.snapshot.state.config.overrides) == overrides, "overrides apply"
+    )
+
+
+def broken(generator: Generator) -> None:
+    """Wait until the generator reports what a person broke."""
+    generator.fetch_now()
+    wait_until(lambda: generator.snapshot.problems, "the generator reports it")
 
 
 def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     booked: Generator, person: Person, follower: Follower, look: Look
 ) -> None:
     person.override(roadworks=DENY)
-    booked.fetch_now()
-    wait_until(lambda: booked.snapshot.state.config.overrides, "the override is in effect")
+    overridden(booked)
     page = look("/")
     assert page.texts("h1") == ["1 of 1 application is not ready"]
     (cause,) = causes(follower.newest, follower)
@@ -52,10 +60,8 @@ def test_a_denied_connection_names_the_override_its_owner_and_since_when(
     assert cause.remedy.who == "traffic-control, who owns the override"
     assert cause.remedy.command == "git rm overrides/roadworks.yaml"
     assert cause.requesters == ("station00", "vehicle01")
-    assert (
-        cause.since
-        == follower.last_change(follower.newest.commit_state, "overrides/roadworks.yaml").time
-    )  # type: ignore[union-attr]
+    changed = follower.last_change(follower.newest.commit_state, "overrides/roadworks.yaml")
+    assert changed and cause.since == changed.time
     assert "vehicle01/edge is booked, but overrides/roadworks.yaml denies it" in page.text
     assert "vehicle01/edge" not in look("/connections").text
     for path in VIEWS:
@@ -78,8 +84,7 @@ def test_an_invalid_file_names_who_wrote_it(
     booked: Generator, person: Person, follower: Follower, look: Look
 ) -> None:
     person.change({"registry/images.yaml": "images: [\n"}, "Break it")
-    booked.fetch_now()
-    wait_until(lambda: booked.snapshot.problems, "the generator reports it")
+    broken(booked)
     page = look("/")
     (cause,) = causes(follower.newest, follower)
     assert cause.kind == "invalid"
@@ -93,8 +98,7 @@ def test_too_many_causes_are_counted(
     booked: Generator, person: Person, look: Look, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     person.change({"registry/images.yaml": "images: [\n", "registry/charts.yaml": "charts: [\n"})
-    booked.fetch_now()
-    wait_until(lambda: booked.snapshot.problems, "the generator reports them")
+    broken(booked)
     assert "more causes" not in look("/").text
     monkeypatch.setattr(server, "_MOST_CAUSES", 1)
     page = look("/")
@@ -124,25 +128,7 @@ def _approved(generator: Generator) -> bool:
 
 
 def test_a_lease_is_listed_with_its_end(booked: Generator, look: Look) -> None:
-    book(
-        booked,
-        {
-            "apiVersion": "demandops/v1",
-            "kind": "Demand",
-            "demand": "short",
-            "requesters": ["vehicle02"],
-            "lease": "10m",
-            "connections": [
-                {
-                    "id": "vehicle02/cloud",
-                    "type": "mqtt",
-                    "source": "vehicle02",
-                    "target": "cloud",
-                    "topics": [{"source": "/t"}],
-                }
-            ],
-        },
-    )
+    book(booked, goals.put("short", "vehicle02", applications=[], connections=[LINK], lease="10m"))
     (row,) = look("/leases").texts("tr")[1:]
     assert re.match(r"in [0-9m]+s? vehicle02/cloud connection short vehicle02 10m", row)
 
@@ -170,8 +156,7 @@ def test_the_file_that_stops_a_release_stops_it(
     before = set(state.manifests())
     name = text.splitlines()[0].removeprefix("# ")
     person.change({name: text})
-    booked.fetch_now()
-    wait_until(lambda: booked.snapshot.state.config.overrides, "the override is in effect")
+    overridden(booked)
     assert look("/release", name=release).texts("h1") != [f"{release} unknown"]
     assert told.format(name) in look("/").text
     gone = {Path(path).stem for path in before - set(state.manifests())}
@@ -183,42 +168,25 @@ def test_the_file_that_stops_a_release_stops_it(
 def test_an_override_that_another_holds_back_is_told(
     booked: Generator, person: Person, look: Look
 ) -> None:
-    select = "apiVersion: demandops/v1\nkind: Override\nreason: r\nowner: ada\n"
-    select += "select: [{services: [object-fusion]}]\n"
-    person.override(frozen=f"{select}hold: true\npriority: 1\n", more=f"{select}replicas: 2\n")
-    booked.fetch_now()
-    wait_until(lambda: len(booked.snapshot.state.config.overrides) == 2, "both are merged")
+    fusion = {"services": ["object-fusion"]}
+    person.override(
+        frozen=override(fusion, hold=True, priority=1), more=override(fusion, replicas=2)
+    )
+    overridden(booked, 2)
     assert "held back" in look("/overrides").text
 
 
 def test_the_consequence_of_a_release_is_what_follows(
     booked: Generator, look: Look, state: GitRepo
 ) -> None:
-    goal: dict[str, Any] = {
-        "apiVersion": "demandops/v1",
-        "kind": "Demand",
-        "demand": "mine",
-        "requesters": ["vehicle02"],
-        "connections": [
-            {
-                "id": "vehicle02/cloud",
-                "type": "mqtt",
-                "source": "vehicle02",
-                "target": "cloud",
-                "topics": [{"source": "/t"}],
-            }
-        ],
-    }
-    book(booked, goal)
+    book(booked, goals.put("mine", "vehicle02", applications=[], connections=[LINK]))
     page = look("/demand", id="mine")
     told = {e.text.strip() for e in page.all("a") if "li" in e.inside and "main" in e.inside}
     (command,) = [e.text for e in page.all("pre")]
     file = command.partition("<<'END'\n")[2].removesuffix("END")
     before = set(state.manifests())
     book(booked, yaml.safe_load(file))
-    gone = {
-        path.rsplit("/", 1)[1].removesuffix(".yaml") for path in before - set(state.manifests())
-    }
+    gone = {Path(path).stem for path in before - set(state.manifests())}
     assert gone == told and len(gone) == 2
 
 
@@ -227,8 +195,7 @@ def test_the_time_line_has_lanes_for_demands_overrides_and_people(
 ) -> None:
     person.override(roadworks=DENY)
     person.change({"README.md": "hello"}, "Greet")
-    booked.fetch_now()
-    wait_until(lambda: booked.snapshot.state.config.overrides, "the override is in effect")
+    overridden(booked)
     assert len(look("/timeline", lane="demands").texts("tr")[1:]) == 2
     assert "A person's change" in look("/timeline", lane="overrides").text
     assert "Greet" in look("/timeline", lane="people").text
@@ -244,7 +211,7 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
         node["position"] = {"x": 10.0 * (number % 3), "y": float(number)}
     person.change({path: yaml.safe_dump(nodes)})
     wait_until(
-        lambda: next(iter(follower.newest.commit_state.config.nodes.values())).position,
+        lambda: all(node.position for node in follower.newest.commit_state.config.nodes.values()),
         "the nodes have positions",
     )
     drawn = fleet_map.picture(follower.newest, Filter(""), "")
@@ -261,12 +228,8 @@ def test_nodes_are_drawn_where_they_are_and_cover_no_other(
 
 
 def _cover(one: fleet_map.NodeCard, other: fleet_map.NodeCard) -> bool:
-    return not (
-        one.x + one.width <= other.x
-        or other.x + other.width <= one.x
-        or one.y + one.height <= other.y
-        or other.y + other.height <= one.y
-    )
+    beside = one.x + one.width <= other.x or other.x + other.width <= one.x
+    return not (beside or one.y + one.height <= other.y or other.y + other.height <= one.y)
 
 
 @pytest.mark.parametrize(
@@ -296,10 +259,7 @@ def test_views_derived_step_by_step_equal_views_derived_from_scratch(
     scaling = "{max: 4, per: {sources: 1}, dividesWork: true, downAfter: 1s}"
     text = person.read(appdef).replace("prefix: of\n", f"prefix: of\n    scaling: {scaling}\n")
     person.change({appdef: text}, "Keep replicas")
-    wait_until(
-        lambda: follower.newest.commit_state.config.files[appdef] == text,
-        "the page has the new file",
-    )
+    wait_until(lambda: follower.newest.commit_state.config.files[appdef] == text, "it is shown")
     joins = [yaml.safe_load(file.read_text()) for file in goals.EXPERIMENT]
     one_leaves = copy.deepcopy(joins[0]) | {"shutdown": True, "connections": []}
     one_leaves["apps"][0]["object_detection_fusion_app"]["requester_ids"] = ["station00"]
@@ -314,9 +274,8 @@ def _assert_taken_over(follower: Follower, look: Look) -> None:
     for name in LISTS:
         look(f"/{name}")
     now = follower.newest
-    anew = replace(
-        now, commit_state=CommitState(now.commit_state.snapshot, now.commit_state.entry, ())
-    )
+    state = CommitState(now.commit_state.snapshot, now.commit_state.entry, ())
+    anew = replace(now, commit_state=state)
     assert now.commit_state.targets == anew.commit_state.targets
     assert now.commit_state.claims_of_releases == anew.commit_state.claims_of_releases
     for name in LISTS:

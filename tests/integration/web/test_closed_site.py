@@ -68,11 +68,7 @@ def test_the_documentation_comes_with_the_page_where_it_was_built(
 
 
 def test_another_name_of_this_machine_is_refused(client: TestClient) -> None:
-    """If any name were accepted, another site could read the page through a visitor's
-    browser.
-
-    For that, the other site would make its own name point to this machine (DNS rebinding).
-    """
+    """Else another site, whose name points to this machine, reads the page (DNS rebinding)."""
     refused = client.get("/", headers={"Host": "attacker.example"})
     assert refused.status_code == 400
     assert client.get("/", headers={"Host": "localhost:8080"}).status_code == 200
@@ -99,16 +95,12 @@ HERE = {
 }
 
 
-@pytest.mark.parametrize(
-    "path", ["/", "/services?at=HEAD", "/events", "/health", "/static/page.js"]
-)
 @pytest.mark.parametrize("case", ELSEWHERE)
-def test_what_another_site_makes_a_browser_ask_is_refused(
-    client: TestClient, case: str, path: str
-) -> None:
-    refused = client.get(path, headers=ELSEWHERE[case])
-    assert refused.status_code == 403
-    assert "default-src 'none'" in refused.headers["Content-Security-Policy"]
+def test_what_another_site_makes_a_browser_ask_is_refused(client: TestClient, case: str) -> None:
+    for path in ("/", "/services?at=HEAD", "/events", "/health", "/static/page.js"):
+        refused = client.get(path, headers=ELSEWHERE[case])
+        assert refused.status_code == 403
+        assert "default-src 'none'" in refused.headers["Content-Security-Policy"]
 
 
 @pytest.mark.parametrize("case", HERE)
@@ -129,6 +121,4 @@ def test_an_address_that_cannot_be_used_is_named_and_the_follower_ends(bare: Pat
     with pytest.raises(InvalidInput) as told:
         WebServer("8080", "--web", follower)
     assert follower.closed.is_set()
-    assert str(told.value) == (
-        "--web: '8080' is not an address to listen on; write one like 127.0.0.1:8090"
-    )
+    assert str(told.value).startswith("--web: '8080' is not an address to listen on")

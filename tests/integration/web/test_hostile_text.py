@@ -5,7 +5,6 @@ The page shows invisible characters of the text as escapes.
 
 from __future__ import annotations
 
-import json
 import shlex
 
 from demandops.repo.history.commit_log import PROPOSAL
@@ -14,6 +13,7 @@ from demandops.web.follower import Follower
 
 from tests.integration.web.conftest import VIEWS, Look
 from tests.kit import goals
+from tests.kit.config import override
 from tests.kit.generator import book, wait_until
 from tests.kit.html import Page
 from tests.kit.repo import GitRepo, Person, git
@@ -26,15 +26,9 @@ def test_text_from_outside_stays_text(booked: Generator, person: Person, look: L
     vehicle = "v<b>&amp;\"x'"
     app = goals.application(f"edge/{HOSTILE}", who=[vehicle])
     book(booked, goals.goal([app], [goals.connection(who=[vehicle])], id=HOSTILE))
-    override = {
-        "apiVersion": "demandops/v1",
-        "kind": "Override",
-        "reason": HOSTILE,
-        "owner": HOSTILE,
-        "select": [{"applications": ["edge/object_detection_fusion"]}],
-        "deny": True,
-    }
-    files = {"overrides/x.yaml": json.dumps(override), "inventory/brokers.yaml": f"{HOSTILE}: ["}
+    select = {"applications": ["edge/object_detection_fusion"]}
+    denial = override(select, deny=True, reason=HOSTILE, owner=HOSTILE)
+    files = {"overrides/x.yaml": denial, "inventory/brokers.yaml": f"{HOSTILE}: ["}
     author = HOSTILE.replace("<", "(").replace(">", ")")
     person.change(files, HOSTILE, (author, "x@example.org", 1_790_000_000))
     booked.fetch_now()
