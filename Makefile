@@ -86,13 +86,9 @@ test-packages: system-test setup  ## Run the tests that build the wheel and the 
 page: system-page setup  ## Look at the web page in a headless browser: every view, live, light, dark, on a phone
 	@$(PY) -m pytest -q $(PAGE_TESTS)
 
-# The core's tests must not import Git: without_git forbids that, and --confcutdir leaves out
-# tests/conftest.py, which imports it.
-CORE := config decision demand ledger plan render templating
-CORE_TESTS := -p tests.kit.without_git --confcutdir tests/unit tests/golden tests/model tests/unit \
-  $(addprefix --ignore=tests/unit/,cluster serve repo demand/test_fuzz.py) \
-  --ignore-glob='tests/unit/test_[!s]*'
-CORE_COVERAGE := 84
+CORE := model connections decide render templating
+CORE_TESTS := tests/unit tests/golden tests/model tests/appdefs
+CORE_COVERAGE := 93
 coverage: export DEMANDOPS_EXAMPLES := 1
 coverage: export PYTEST_ADDOPTS := --cov-report=term-missing:skip-covered
 coverage: system-test setup  ## Report what the tests cover, then what the core's tests cover without Git
