@@ -18,16 +18,7 @@ from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.naming import Subject
 from demandops.decide import changeset, restoration, warnings
 from demandops.decide.admission import admission, admitted_request, permission
-from demandops.decide.admission.admitted_request import (
-    Checkpoint,
-    Throttle,
-    admit,
-    admitted,
-    completed,
-    leaves_nodes_open,
-    paced,
-    permission_faults,
-)
+from demandops.decide.admission.admitted_request import Checkpoint, Throttle, admit, admitted, paced
 from demandops.decide.booking import Drain, apply
 from demandops.decide.changeset import Changeset, FileReader, ReleaseChange
 from demandops.decide.checks import collisions, quotas, version_difference
@@ -170,7 +161,7 @@ def decide(
             checkpoint()
             # Look for nodes on which the demand is not refused. To try many nodes takes time, but
             # only a demand that is refused on the nodes chosen first takes this time.
-            if leaves_nodes_open(state, goal):
+            if admitted_request.leaves_nodes_open(state, goal):
                 checkpoint()
                 with suppress(Refused):
                     trials = _Trials(state, now, checkpoint)
@@ -213,9 +204,9 @@ class _Trials:
                 "too many nodes would have to be tried for this demand; name a node for each "
                 "application, or split the demand"
             )
-        request, config = completed(request, self._state), self._state.config
+        request, config = admitted_request.completed(request, self._state), self._state.config
         if next(admission.faults(request, config), None) or next(
-            permission_faults(request, config, self._checkpoint), None
+            admitted_request.permission_faults(request, config, self._checkpoint), None
         ):
             return False
         try:

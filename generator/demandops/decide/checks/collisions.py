@@ -14,15 +14,10 @@ from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections.connection import ClientKey
+from demandops.decide.planning import release_keys
 from demandops.decide.planning.flows import flows, outputs, usual_topic
 from demandops.decide.planning.planner import service_name
-from demandops.decide.planning.release_keys import (
-    ReleaseKey,
-    claims_needing,
-    is_needed,
-    keys_of,
-    keys_of_claims,
-)
+from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_of, keys_of_claims
 from demandops.decide.restoration import request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
@@ -79,7 +74,7 @@ def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault
 
 
 def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -> Iterator[Fault]:
-    claim = next(iter(claims_needing(after, key)), None)
+    claim = next(iter(release_keys.claims_needing(after, key)), None)
     if claim is None:
         return
     first = after.ledger.application(claim.subject.id) or claim.application
