@@ -78,13 +78,12 @@ class Mqtt(ConnectionType):
         package = message_type(route, sender, config).partition("/")[0]
         carried = config.clients.mqtt.messages
         if package and carried and package not in carried and not route.primitive:
-            yield fault(
-                f"{where}.type",
+            message = (
                 f"'{route.source}' carries messages of {package}, and mqtt.messages in "
                 f"{config.file_of(CLIENTS_FILE, self.word)} has only {', '.join(carried)}; use an "
-                "image that has the package, and add the package to mqtt.messages",
-                code=UNSUPPORTED,
+                "image that has the package, and add the package to mqtt.messages"
             )
+            yield fault(f"{where}.type", message, code=UNSUPPORTED)
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
         broker = choose_broker(connection, config)

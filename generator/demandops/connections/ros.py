@@ -41,12 +41,11 @@ class Ros(ConnectionType):
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         are_known = {connection.source, connection.target} <= config.nodes.keys()
         if are_known and _listener(connection, config) is None:
-            yield fault(
-                "type",
+            message = (
                 f"{self.name} needs an end with a reachable address; add 'wan: {{host: …}}' to "
-                f"'{connection.source}' or '{connection.target}' in {config.place_of(NODES_FILE)}",
-                code=UNSUPPORTED,
+                f"'{connection.source}' or '{connection.target}' in {config.place_of(NODES_FILE)}"
             )
+            yield fault("type", message, code=UNSUPPORTED)
 
     def route_faults(
         self, where: str, route: Route, sender: str, config: Config

@@ -94,11 +94,10 @@ def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -
         )
         for clash, other in chain[tuple[str, ServiceKey | None]](publishers, connections):
             remedy = _remedy(key, other, service, name, after.config)
-            yield fault(
-                _field(request, key, service),
-                f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}",
-                code="conflict",
+            message = (
+                f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}"
             )
+            yield fault(_field(request, key, service), message, code="conflict")
 
 
 def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterator[Fault]:
@@ -126,12 +125,11 @@ def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterato
             routes = (route for claim in claims for route in claim.connection.topics)
             read = {route.read_topic for route in routes if route.written_topic == flow.target}
             for topic in sorted(read - {flow.topic})[:1]:
-                yield item.fault(
-                    f"deliver[{flow.delivery}].topic",
+                message = (
                     f"connection '{id}' already brings {topic} to '{flow.receiver}' as "
-                    f"{flow.target}; choose another topic for this delivery",
-                    code="conflict",
+                    f"{flow.target}; choose another topic for this delivery"
                 )
+                yield item.fault(f"deliver[{flow.delivery}].topic", message, code="conflict")
 
 
 def _publishers(

@@ -77,19 +77,17 @@ def _check_domains(config: Config, reader: ConfigReader) -> None:
             reader.check_reference(file, field, broker, configs.BROKERS_FILE)
         other = seen.setdefault(domain.namespace, domain.name)
         if other != domain.name:
-            reader.add_fault(
-                file,
-                f"{place}.namespace",
+            message = (
                 f"'{domain.namespace}' is already the namespace of '{other}'; give each "
-                "access domain its own namespace",
+                "access domain its own namespace"
             )
+            reader.add_fault(file, f"{place}.namespace", message)
         if argocd and domain.namespace == argocd.namespace:
-            reader.add_fault(
-                file,
-                f"{place}.namespace",
+            message = (
                 f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
-                "all that Argo CD may; choose another namespace",
+                "all that Argo CD may; choose another namespace"
             )
+            reader.add_fault(file, f"{place}.namespace", message)
 
 
 def _check_host_network(config: Config, reader: ConfigReader) -> None:
@@ -187,12 +185,11 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
         if service.each or isinstance(service, ServiceDefinition):
             other = files.setdefault(name, file)
             if other != file:
-                reader.add_fault(
-                    file,
-                    where.rstrip("."),
+                message = (
                     f"'{name}' is defined in {other} too; choose another name, or define it once "
-                    f"in appdefs/{name}/service.yaml and use it in both",
+                    f"in appdefs/{name}/service.yaml and use it in both"
                 )
+                reader.add_fault(file, where.rstrip("."), message)
                 continue
         # releases of two services with one prefix could have the same name
         owner = prefixes.setdefault(service.prefix, (file, name))
@@ -237,12 +234,11 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
             configs.VERSIONS_FILE, name
         )
         if appdef.versions != "refuse" and is_unlisted:
-            reader.add_fault(
-                f"appdefs/{name}/appdef.yaml",
-                "versions",
+            message = (
                 f"is {appdef.versions}, but {config.place_of(configs.VERSIONS_FILE)} does not list "
-                f"the versions of '{name}'; add them there, or remove 'versions'",
+                f"the versions of '{name}'; add them there, or remove 'versions'"
             )
+            reader.add_fault(f"appdefs/{name}/appdef.yaml", "versions", message)
         if appdef.versions == "separate":
             _check_separate(name, config, reader)
     for name, listed in config.versions.items():
@@ -304,10 +300,9 @@ def _check_wire_types(config: Config, reader: ConfigReader) -> None:
         number = appdef.deployment_request.type
         other = seen.setdefault(number, appdef.name)
         if other != appdef.name:
+            message = f"{number} already names '{other}'; choose another number"
             reader.add_fault(
-                f"appdefs/{appdef.name}/appdef.yaml",
-                "deploymentRequest.type",
-                f"{number} already names '{other}'; choose another number",
+                f"appdefs/{appdef.name}/appdef.yaml", "deploymentRequest.type", message
             )
 
 
@@ -351,10 +346,9 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
         charts = {service.chart for service in selected} & {*config.charts}
         versions = {version for chart in charts for version in config.charts[chart].versions()}
         if override.version and versions and override.version not in versions:
-            reader.add_fault(
-                override.path,
-                "version",
+            message = (
                 f"'{override.version}' is not a version or channel that "
                 f"{config.place_of(configs.CHARTS_FILE)} has for a selected chart"
-                f"{suggestion(override.version, versions)}",
+                f"{suggestion(override.version, versions)}"
             )
+            reader.add_fault(override.path, "version", message)

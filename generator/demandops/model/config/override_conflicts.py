@@ -53,12 +53,11 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
     for override in by_rank(config.overrides[name] for name in rivals):
         for rival in by_rank(rivals[override.name].values())[:_MOST_SHOWN]:
             names = " and ".join(f"'{name}'" for name in contested_effects(rival, override))
-            reader.add_fault(
-                override.path,
-                "priority",
+            message = (
                 f"is {override.priority}, as in {rival.path}, and both overrides may set {names} "
-                "of the same release; change one of the priorities, or select different releases",
+                "of the same release; change one of the priorities, or select different releases"
             )
+            reader.add_fault(override.path, "priority", message)
 
 
 def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, ...], str]]:
