@@ -15,18 +15,12 @@ from typing import Any
 
 from demandops.base import naming
 from demandops.base.errors import Fault, Refused, fault
-from demandops.connections.connection import (
-    UNSUPPORTED,
-    Client,
-    ClientKey,
-    Connection,
-    Connections,
-    ConnectionType,
-)
+from demandops.connections import connection as routes
+from demandops.connections.connection import UNSUPPORTED, Client, ClientKey, Connection, Connections
 from demandops.model.config.config import NODES_FILE, Config, ConfigReader
 
 
-class Zenoh(ConnectionType):
+class Zenoh(routes.ConnectionType):
     name = "ZENOH"
     number = 2
     image = "zenoh-bridge"

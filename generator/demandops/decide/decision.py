@@ -36,14 +36,8 @@ from demandops.model.demand import demand_goal
 from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Decommission, DemandRequest
 from demandops.model.ledger import claim_file
-from demandops.model.ledger.ledger import (
-    Changes,
-    ClaimChange,
-    Ledger,
-    World,
-    changes_on,
-    claim_changes,
-)
+from demandops.model.ledger import ledger as ledgers
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World
 from demandops.model.ledger.records import Instance, Wait
 from demandops.model.release import ServiceKey, ServiceRelease
 
@@ -314,7 +308,9 @@ def _booked(
     changed = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
     ledger, kept_keys = update_kept_claims(state.ledger, after, touched, now)
-    changes = replace(changes, claims=claim_changes(state.ledger, ledger, [*changed, *kept_keys]))
+    changes = replace(
+        changes, claims=ledgers.claim_changes(state.ledger, ledger, [*changed, *kept_keys])
+    )
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
@@ -399,7 +395,7 @@ def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
     old = replace(state, ledger=before)
-    keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
+    keys = affected_keys(old, state, ledgers.changes_on(before, state.ledger, subjects))
     # a template that takes too long is no fault of the claim, so its release keeps its file
     return changeset.build_changeset(
         old, state, Changes(), keys, state.evaluate, read, keeps_late=True

@@ -9,7 +9,7 @@ from itertools import islice
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.decide.planning import overrides
-from demandops.decide.planning.overrides import Traits
+from demandops.decide.planning.overrides import Traits, fits
 from demandops.decide.planning.release_keys import is_needed, keys_of, keys_of_claims
 from demandops.model.config.config import Config
 from demandops.model.config.override import Selector, format_time
@@ -48,7 +48,7 @@ def denial_faults(request: DemandRequest, after: World, changes: Changes) -> Ite
             for override in denying
             for selector in override.select
             for traits in (services if selector.services else [demanded])
-            if overrides.fits(selector, traits, after.config)
+            if fits(selector, traits, after.config)
         )
         for override, selector in islice(matching, 1):
             until = f" until {format_time(override.end)}" if override.end else ""
