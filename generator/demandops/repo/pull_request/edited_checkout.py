@@ -37,7 +37,6 @@ from demandops.repo.load import state_in_effect
 # where it can, and a person has to write only the reason into it.
 
 _VALUES = (("spec", "values"), ("spec", "source", "helm", "valuesObject"))  # Flux, Argo CD
-_IMAGE_KEYS = {"repository", "tag", "digest"}
 _REFERENCE = re.compile(
     r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:[0-9a-f]{64}))?"
 )
@@ -125,7 +124,7 @@ def _merge_patch(
             inner = _merge_patch(was, value, names, pins)
             pin = {part: str(text) for part, text in inner.items() if text}
             name = names.get(str(was.get("repository")))
-            if name and pin and inner.keys() <= _IMAGE_KEYS:
+            if name and pin and inner.keys() <= {"repository", "tag", "digest"}:
                 pins[name] = pin
             elif inner:
                 patch[key] = inner
