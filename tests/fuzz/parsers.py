@@ -27,7 +27,7 @@ from demandops.detect import rule_file
 from demandops.detect.detector import Detector, Want
 from demandops.detect.observations import MessageReader, Observation, Unreadable
 from demandops.detect.rule_file import RuleFile
-from demandops.model.config import override, policy
+from demandops.model.config import base_model, override
 from demandops.model.config.load import load
 from demandops.model.ledger import claim_file, records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
@@ -438,7 +438,7 @@ def moment(data: bytes) -> None:
     for read, form in (
         (claim_file.parse_timestamp, claim_file.format_timestamp),
         (override.parse_time, override.format_time),
-        (policy.seconds_of, "{}s".format),
+        (base_model.seconds_of, "{}s".format),
     ):
         with suppress(ValueError):
             found: Any = read(text)
