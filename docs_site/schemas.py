@@ -7,7 +7,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from demandops.cli.repo import schema as command
+from demandops.cli.authoring import schema as command
 
 
 def page() -> str:

@@ -9,8 +9,8 @@ import shutil
 from pathlib import Path
 
 import pytest
+from demandops.cli.authoring.schema import SCHEMAS
 from demandops.cli.main import COMMANDS
-from demandops.cli.repo.schema import SCHEMAS
 from demandops_ros import node_parameters
 from mkdocs.commands.build import build
 from mkdocs.config import load_config

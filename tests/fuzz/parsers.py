@@ -20,14 +20,14 @@ from application_manager_interfaces.action import DeploymentRequest
 from demandops.base import strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.cli import target
-from demandops.cli.actions.override import ends_at
+from demandops.cli.changes.override import ends_at
 from demandops.cluster.health import ClusterDomain, ObjectName, health_reader
 from demandops.cluster.health import Target as ReleaseTarget
 from demandops.decide.state import try_configuration
 from demandops.detect import rule_file
 from demandops.detect.detector import Detector, Want
 from demandops.detect.observations import MessageReader, Observation, Unreadable
-from demandops.model.config import override, policy
+from demandops.model.config import base_model, override
 from demandops.model.config.load import load
 from demandops.model.ledger import claim_file, records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
@@ -331,7 +331,7 @@ def moment(data: bytes) -> None:
     for read, form in (
         (claim_file.parse_timestamp, claim_file.format_timestamp),
         (override.parse_time, override.format_time),
-        (policy.seconds_of, "{}s".format),
+        (base_model.seconds_of, "{}s".format),
     ):
         with suppress(ValueError):
             found: Any = read(text)

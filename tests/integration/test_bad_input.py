@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.cli.repo.schema import SCHEMAS
+from demandops.cli.authoring.schema import SCHEMAS
 from demandops.cli.target import ContextsFile
 from demandops.cluster.clusters_file import AccessFile
 from demandops.detect.rule_file import RuleFile

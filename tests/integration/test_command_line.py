@@ -16,7 +16,7 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
-from demandops.cli.views import bookkeeping
+from demandops.cli.queries import bookkeeping
 
 from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run

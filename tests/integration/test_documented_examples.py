@@ -22,7 +22,7 @@ from demandops.detect.observations import Observation
 from demandops.model.demand.demand_request import Expire
 from demandops.repo import new_repo
 from demandops.repo.history import commit_message
-from demandops.repo.pull_request.rendered_charts import manifest_faults
+from demandops.repo.merge_check.rendered_charts import manifest_faults
 
 from tests.kit.config import brokers, configuration, edited
 from tests.kit.goals import put

@@ -14,7 +14,7 @@ import pytest
 import yaml
 from demandops.base.runtime import REAL
 from demandops.cli.main import run
-from demandops.cli.views.get import KINDS
+from demandops.cli.queries.get import KINDS
 from demandops.model.config.override import parse_time
 from demandops.repo.git.repository import RemoteAway
 from demandops.repo.reader import Reader

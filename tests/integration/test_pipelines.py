@@ -18,7 +18,7 @@ import check_jsonschema
 import pytest
 import yaml
 from click.testing import CliRunner
-from demandops.cli.repo.check import MARK
+from demandops.cli.authoring.check import MARK
 
 from tests.kit.cli import Run
 from tests.kit.config import skeleton

@@ -13,11 +13,11 @@ from typing import Any
 
 import pytest
 import yaml
+from demandops.cli.authoring.check import LONGEST, MARK, report
 from demandops.cli.main import run
-from demandops.cli.repo.check import LONGEST, MARK, report
-from demandops.repo.pull_request import merge_check as checking
-from demandops.repo.pull_request.merge_check import CheckResult
-from demandops.repo.pull_request.rendered_charts import RenderedCharts
+from demandops.repo.merge_check import merge_check as checking
+from demandops.repo.merge_check.merge_check import CheckResult
+from demandops.repo.merge_check.rendered_charts import RenderedCharts
 
 from tests.kit.cli import Run
 from tests.kit.goals import EXPERIMENT

@@ -38,9 +38,9 @@ from demandops.serve.approvals.approvals import Approvals
 from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Receipt, Ticket
-from demandops.serve.timing import expiry, own_work
+from demandops.serve.timing import agenda, expiry
+from demandops.serve.timing.agenda import Draining, WaitingTurns
 from demandops.serve.timing.expiry import LeaseExpiry, ScaleDown
-from demandops.serve.timing.own_work import Draining, WaitingTurns
 from demandops.serve.worker import Worker
 
 Wrong = Callable[..., Any]
@@ -188,7 +188,7 @@ plant("leave_the_far_end", 0, ConnectionType, "keys", first_only)
 
 # ---- placement ----
 
-plant("let_the_last_in_first", 6, own_work, "in_turn", in_reverse)
+plant("let_the_last_in_first", 6, agenda, "in_turn", in_reverse)
 plant("ignore_priorities", 44, WaitingDemand, "turn", lambda _, one: (one.since, one.demand))
 
 

@@ -19,7 +19,7 @@ import pytest
 import yaml
 from demandops.base import settings
 from demandops.cli import main
-from demandops.cli.repo.schema import SCHEMAS
+from demandops.cli.authoring.schema import SCHEMAS
 
 from tests.kit.golden import CASES, whole
 

@@ -15,8 +15,8 @@ from demandops.base.errors import MOST_FAULTS, Fault, InvalidInput, StateRepoErr
 from demandops.base.quoting import is_visible, json_escaped, one_line
 from demandops.base.strict_yaml import located_in
 from demandops.cli import output
+from demandops.cli.authoring import check
 from demandops.cli.json_output import print_json, show
-from demandops.cli.repo import check
 from demandops.cli.table import Column, Table
 from demandops.model.config.base_model import parse_file
 from demandops.model.ledger.records import _KeptReplicasFile

@@ -8,7 +8,7 @@ from typing import Any
 
 import jsonschema_rs
 import pytest
-from demandops.cli.repo import schema
+from demandops.cli.authoring import schema
 
 FILE = "templates/schemas/properties.yaml"
 

@@ -13,13 +13,7 @@ from pydantic import Field
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import Fault, fault
-from demandops.base.naming import (
-    Subject,
-    SubjectKind,
-    TopicKey,
-    message_type_problem,
-    topic_problem,
-)
+from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.base.quoting import quoted
 from demandops.model.config.base_model import FrozenModel, without
 from demandops.model.config.config import CLIENTS_FILE, Config, ConfigReader
@@ -84,7 +78,9 @@ _DEFAULTS = tuple(
 )
 
 
-MessageType = Annotated[str, without(lambda value: message_type_problem(value) if value else "")]
+MessageType = Annotated[
+    str, without(lambda value: naming.message_type_problem(value) if value else "")
+]
 
 
 class RouteOptions(FrozenModel):
@@ -110,7 +106,7 @@ def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
     carried_back: dict[str, str] = {}
     for index, route in enumerate(routes):
         for side, name in (("source", route.source), ("target", route.target)):
-            problem = topic_problem(name)
+            problem = naming.topic_problem(name)
             if problem:
                 yield fault(f"{where}[{index}].{side}", problem)
         first = targets.setdefault(route.source, route)

@@ -90,12 +90,11 @@ def type_faults(kind: ConnectionType, connection: Connection, config: Config) ->
         for end, node in ends.items():
             if config.nodes[node].ros.rmw == "rmw_zenoh_cpp":
                 able = listed(other for other in CONNECTION_TYPES if not other.speaks_dds)
-                yield fault(
-                    end,
+                message = (
                     f"'{node}' runs rmw_zenoh_cpp, but type {kind.name} needs DDS; use type "
-                    f"{able}, or another rmw in {config.file_of(NODES_FILE, node)}",
-                    code=UNSUPPORTED,
+                    f"{able}, or another rmw in {config.file_of(NODES_FILE, node)}"
                 )
+                yield fault(end, message, code=UNSUPPORTED)
     yield from kind.link_faults(connection, config)
     yield from route_faults(kind, connection.topics, (connection.source, connection.target), config)
 

@@ -16,24 +16,10 @@ from typing import Any
 from demandops.base import naming
 from demandops.base.errors import Fault, Refused, fault
 from demandops.base.quoting import quoted
-from demandops.connections.connection import (
-    UNSUPPORTED,
-    ClientKey,
-    Connection,
-    Connections,
-    ConnectionType,
-    End,
-    Route,
-    make_end,
-    message_type,
-)
-from demandops.model.config.config import (
-    BROKERS_FILE,
-    CLIENTS_FILE,
-    IMAGES_FILE,
-    Config,
-    ConfigReader,
-)
+from demandops.connections import connection as routes
+from demandops.connections.connection import ClientKey, Connection, ConnectionType, End, Route
+from demandops.model.config import config as configs
+from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.inventory import Broker
 from demandops.model.config.registry import ClientSettings, MqttClientSettings
 
@@ -53,9 +39,9 @@ class Mqtt(ConnectionType):
     speaks_dds = False
 
     def config_faults(self, config: Config, reader: ConfigReader) -> Iterator[Fault]:
-        if config.brokers and reader.is_missing(IMAGES_FILE, self.image):
+        if config.brokers and reader.is_missing(configs.IMAGES_FILE, self.image):
             message = f"'{self.image}' is missing; add it, because MQTT connections run it"
-            yield fault("images", message).within(IMAGES_FILE)
+            yield fault("images", message).within(configs.IMAGES_FILE)
 
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         if not {connection.source, connection.target} <= config.nodes.keys():
@@ -64,7 +50,7 @@ class Mqtt(ConnectionType):
             return
         remedy = f"name one of: {', '.join(sorted(config.brokers))}"
         if not config.brokers:
-            remedy = f"add one to {config.place_of(BROKERS_FILE)}"
+            remedy = f"add one to {config.place_of(configs.BROKERS_FILE)}"
         ends = f"'{connection.target}' or '{connection.source}'"
         message = f"no broker is given, and none runs on {ends}"
         if connection.broker:
@@ -75,24 +61,23 @@ class Mqtt(ConnectionType):
         self, where: str, route: Route, sender: str, config: Config
     ) -> Iterator[Fault]:
         # the image of a client has the code of some packages' messages only
-        package = message_type(route, sender, config).partition("/")[0]
+        package = routes.message_type(route, sender, config).partition("/")[0]
         carried = config.clients.mqtt.messages
         if package and carried and package not in carried and not route.primitive:
-            yield fault(
-                f"{where}.type",
+            message = (
                 f"'{route.source}' carries messages of {package}, and mqtt.messages in "
-                f"{config.file_of(CLIENTS_FILE, self.word)} has only {', '.join(carried)}; use an "
-                "image that has the package, and add the package to mqtt.messages",
-                code=UNSUPPORTED,
+                f"{config.file_of(configs.CLIENTS_FILE, self.word)} has only {', '.join(carried)}; "
+                "use an image that has the package, and add the package to mqtt.messages"
             )
+            yield fault(f"{where}.type", message, code=routes.UNSUPPORTED)
 
     def settled(self, connection: Connection, config: Config) -> tuple[Connection, str]:
         broker = choose_broker(connection, config)
         if not connection.broker or broker is None or broker.node == connection.broker:
             return connection, ""
         note = (
-            f"uses the broker on '{broker.node}', because {config.place_of(BROKERS_FILE)} has "
-            f"none on {quoted(connection.broker)}"
+            f"uses the broker on '{broker.node}', because {config.place_of(configs.BROKERS_FILE)} "
+            f"has none on {quoted(connection.broker)}"
         )
         return replace(connection, broker=broker.node), note
 
@@ -105,7 +90,9 @@ class Mqtt(ConnectionType):
         if key.side == "source":  # both ends share the channel
             yield "MQTT channel", naming.object_name(self.word, key.id)
 
-    def client(self, key: ClientKey, connections: Connections, config: Config) -> MqttEnd | None:
+    def client(
+        self, key: ClientKey, connections: routes.Connections, config: Config
+    ) -> MqttEnd | None:
         connection = connections.get(key.id)
         if connection is None or not connection.topics:
             return None
@@ -113,13 +100,13 @@ class Mqtt(ConnectionType):
         if broker is None:
             message = (
                 f"connection '{key.id}' has no broker; add one on '{connection.target}' or "
-                f"'{connection.source}' to {config.place_of(BROKERS_FILE)}"
+                f"'{connection.source}' to {config.place_of(configs.BROKERS_FILE)}"
             )
             raise Refused.at("broker", message, code=_NO_BROKER)
         channel = naming.object_name(self.word, key.id)
         if broker.topic_prefix:
             channel = f"{broker.topic_prefix}/{channel}"
-        end = make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
+        end = routes.make_end(MqttEnd, key, connection, config, broker=broker, channel=channel)
         credentials = end.domain.broker_credentials.get(broker.node, broker.credentials)
         return replace(end, broker=broker.model_copy(update={"credentials": credentials}))
 
@@ -150,7 +137,7 @@ class MqttEnd(End):
         yield from End.shaping_entries(self, config)
         broker = self.broker
         yield (
-            config.file_of(BROKERS_FILE, broker.node),
+            config.file_of(configs.BROKERS_FILE, broker.node),
             broker.node,
             f"broker at {broker.host}:{broker.port}",
         )

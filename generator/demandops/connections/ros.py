@@ -14,17 +14,8 @@ from typing import Any
 
 from demandops.base import naming
 from demandops.base.errors import Fault, Refused, fault
-from demandops.connections.connection import (
-    UNSUPPORTED,
-    ClientKey,
-    Connection,
-    Connections,
-    ConnectionType,
-    End,
-    Route,
-    make_end,
-    message_type,
-)
+from demandops.connections import connection as routes
+from demandops.connections.connection import ClientKey, Connection, Connections, ConnectionType, End
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.config.inventory import Node, Wan
 
@@ -41,17 +32,16 @@ class Ros(ConnectionType):
     def link_faults(self, connection: Connection, config: Config) -> Iterator[Fault]:
         are_known = {connection.source, connection.target} <= config.nodes.keys()
         if are_known and _listener(connection, config) is None:
-            yield fault(
-                "type",
+            message = (
                 f"{self.name} needs an end with a reachable address; add 'wan: {{host: …}}' to "
-                f"'{connection.source}' or '{connection.target}' in {config.place_of(NODES_FILE)}",
-                code=UNSUPPORTED,
+                f"'{connection.source}' or '{connection.target}' in {config.place_of(NODES_FILE)}"
             )
+            yield fault("type", message, code=routes.UNSUPPORTED)
 
     def route_faults(
-        self, where: str, route: Route, sender: str, config: Config
+        self, where: str, route: routes.Route, sender: str, config: Config
     ) -> Iterator[Fault]:
-        if sender in config.nodes and not message_type(route, sender, config):
+        if sender in config.nodes and not routes.message_type(route, sender, config):
             yield fault(
                 f"{where}.type",
                 f"the message type of '{route.source}' is not known, and ROS needs it; give the "
@@ -71,14 +61,16 @@ class Ros(ConnectionType):
             return None
         ends = (connection.source, connection.target)
         typed = tuple(
-            replace(route, type=message_type(route, route.sender_and_receiver(*ends)[0], config))
+            replace(
+                route, type=routes.message_type(route, route.sender_and_receiver(*ends)[0], config)
+            )
             for route in connection.topics
         )
         listener = _listener(connection, config)
         if listener is None or listener.wan is None:
             message = f"connection '{key.id}' has no end with a wan address any longer; "
             message += "restore wan at one end"
-            raise Refused.at("connections", message, code=UNSUPPORTED)
+            raise Refused.at("connections", message, code=routes.UNSUPPORTED)
         port = _port(key.id, listener.wan)
         for other in connections.at(listener.id):
             if other == key.id or _port(other, listener.wan) != port:
@@ -91,9 +83,9 @@ class Ros(ConnectionType):
                     "connection id, or widen the range from 'firstPort' to 'lastPort' under 'wan' "
                     f"of '{listener.id}'"
                 )
-                raise Refused.at("connections", message, code=UNSUPPORTED)
+                raise Refused.at("connections", message, code=routes.UNSUPPORTED)
         connection = replace(connection, topics=typed)
-        return make_end(
+        return routes.make_end(
             RosEnd, key, connection, config, listener=listener.id, wan=listener.wan, port=port
         )
 

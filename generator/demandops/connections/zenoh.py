@@ -15,18 +15,12 @@ from typing import Any
 
 from demandops.base import naming
 from demandops.base.errors import Fault, Refused, fault
-from demandops.connections.connection import (
-    UNSUPPORTED,
-    Client,
-    ClientKey,
-    Connection,
-    Connections,
-    ConnectionType,
-)
+from demandops.connections import connection as routes
+from demandops.connections.connection import UNSUPPORTED, Client, ClientKey, Connection, Connections
 from demandops.model.config.config import NODES_FILE, Config, ConfigReader
 
 
-class Zenoh(ConnectionType):
+class Zenoh(routes.ConnectionType):
     name = "ZENOH"
     number = 2
     image = "zenoh-bridge"
@@ -54,24 +48,22 @@ class Zenoh(ConnectionType):
             return
         for end, node in (("source", source), ("target", target)):
             if node.zenoh is None:
-                yield fault(
-                    end,
+                message = (
                     f"'{node.id}' runs no Zenoh bridge; add 'zenoh: {{endpoint: …}}' to the node "
                     f"in {config.file_of(NODES_FILE, node.id)}, or 'zenoh: {{}}' if the node can "
-                    "reach other bridges",
-                    code=UNSUPPORTED,
+                    "reach other bridges"
                 )
+                yield fault(end, message, code=UNSUPPORTED)
         if source.zenoh is None or target.zenoh is None or source.id == target.id:
             return
         shared = set(source.zenoh.connect) & set(target.zenoh.connect)
         if not (source.zenoh.endpoint or target.zenoh.endpoint or shared):
-            yield fault(
-                "type",
+            message = (
                 f"{self.name} cannot link '{source.id}' and '{target.id}'; in "
                 f"{config.place_of(NODES_FILE)}, give one of the nodes an 'endpoint' under "
-                "'zenoh', or list the same router under 'connect' of both nodes",
-                code=UNSUPPORTED,
+                "'zenoh', or list the same router under 'connect' of both nodes"
             )
+            yield fault("type", message, code=UNSUPPORTED)
 
     def keys(self, connection: str, source: str, target: str) -> Iterable[ClientKey]:
         return ClientKey(self, source), ClientKey(self, target)

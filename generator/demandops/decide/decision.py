@@ -18,16 +18,7 @@ from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.naming import Subject
 from demandops.decide import changeset, restoration, warnings
 from demandops.decide.admission import admission, admitted_request, permission
-from demandops.decide.admission.admitted_request import (
-    Checkpoint,
-    Throttle,
-    admit,
-    admitted,
-    completed,
-    leaves_nodes_open,
-    paced,
-    permission_faults,
-)
+from demandops.decide.admission.admitted_request import Checkpoint, Throttle, admit, admitted, paced
 from demandops.decide.booking import Drain, apply
 from demandops.decide.changeset import Changeset, FileReader, ReleaseChange
 from demandops.decide.checks import collisions, quotas, version_difference
@@ -45,14 +36,8 @@ from demandops.model.demand import demand_goal
 from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Decommission, DemandRequest
 from demandops.model.ledger import claim_file
-from demandops.model.ledger.ledger import (
-    Changes,
-    ClaimChange,
-    Ledger,
-    World,
-    changes_on,
-    claim_changes,
-)
+from demandops.model.ledger import ledger as ledgers
+from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World
 from demandops.model.ledger.records import Instance, Wait
 from demandops.model.release import ServiceKey, ServiceRelease
 
@@ -170,7 +155,7 @@ def decide(
             checkpoint()
             # Look for nodes on which the demand is not refused. To try many nodes takes time, but
             # only a demand that is refused on the nodes chosen first takes this time.
-            if leaves_nodes_open(state, goal):
+            if admitted_request.leaves_nodes_open(state, goal):
                 checkpoint()
                 with suppress(Refused):
                     trials = _Trials(state, now, checkpoint)
@@ -213,9 +198,9 @@ class _Trials:
                 "too many nodes would have to be tried for this demand; name a node for each "
                 "application, or split the demand"
             )
-        request, config = completed(request, self._state), self._state.config
+        request, config = admitted_request.completed(request, self._state), self._state.config
         if next(admission.faults(request, config), None) or next(
-            permission_faults(request, config, self._checkpoint), None
+            admitted_request.permission_faults(request, config, self._checkpoint), None
         ):
             return False
         try:
@@ -323,7 +308,9 @@ def _booked(
     changed = [change.key for change in changes.claims]
     touched = dict.fromkeys((*changes.subjects(), *subjects))
     ledger, kept_keys = update_kept_claims(state.ledger, after, touched, now)
-    changes = replace(changes, claims=claim_changes(state.ledger, ledger, [*changed, *kept_keys]))
+    changes = replace(
+        changes, claims=ledgers.claim_changes(state.ledger, ledger, [*changed, *kept_keys])
+    )
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
@@ -408,7 +395,7 @@ def changeset_of_edit(
     state: State, before: Ledger, subjects: Iterable[Subject], read: FileReader
 ) -> changeset.Changeset:
     old = replace(state, ledger=before)
-    keys = affected_keys(old, state, changes_on(before, state.ledger, subjects))
+    keys = affected_keys(old, state, ledgers.changes_on(before, state.ledger, subjects))
     # a template that takes too long is no fault of the claim, so its release keeps its file
     return changeset.build_changeset(
         old, state, Changes(), keys, state.evaluate, read, keeps_late=True

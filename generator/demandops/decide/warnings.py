@@ -240,12 +240,6 @@ def policy_warnings(world: World) -> Iterator[Fault]:
             file = config.file_of(NODES_FILE, config.host_of(id))
             for text in (*drain.moved, *drain.stays):
                 yield fault("", f"'{id}' is drained: {text}").within(file)
-    yield from _unfit_places(config)
-    for path, text in following_overrides(world).stays:
-        yield fault("node", text).within(path)
-
-
-def _unfit_places(config: Config) -> Iterator[Fault]:
     placed = {  # a shared service is in several definitions, but in one file
         (service.file, service.name): service
         for services in config.services.values()
@@ -261,6 +255,8 @@ def _unfit_places(config: Config) -> Iterator[Fault]:
         for problem in problems:
             message = f"{problem}, so demands that need '{name}' are refused"
             yield fault(field, message).within(file)
+    for path, text in following_overrides(world).stays:
+        yield fault("node", text).within(path)
 
 
 def _connections_no_longer_allowed(world: World) -> Iterator[Fault]:

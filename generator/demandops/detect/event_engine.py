@@ -357,7 +357,9 @@ class EngineStep:
         if self._engine.hours:
             yield self._hours_due, self._look_at_hours
         if self._now < self._before.settled:
-            yield self._before.settled, self._look_at_counts
+            for rule in self._engine.rules.values():
+                if isinstance(rule, AreaRule):
+                    yield self._before.settled, partial(self._latch_count, rule)
         timeouts = self._engine.timeouts
         for who, last in self._seen.items():
             yield last.at + timeouts[last.source], partial(self._lose_silent, who, last)
@@ -375,11 +377,6 @@ class EngineStep:
             self._latch((rule.name, ()), rule, is_on, not is_on)
         self._hours_due = min(rule.schedule.next_check(self._now) for rule in self._engine.hours)
         self._due = min(self._due, self._hours_due)
-
-    def _look_at_counts(self) -> None:
-        for rule in self._engine.rules.values():
-            if isinstance(rule, AreaRule):
-                self._latch_count(rule)
 
     def _lose_silent(self, who: Who, last: Observation) -> None:
         if self._seen.get(who) is last:

@@ -15,25 +15,10 @@ from demandops.base.naming import message_type_problem
 from demandops.base.quoting import quoted
 from demandops.base.settings import API_VERSION
 from demandops.base.strict_yaml import located_in
-from demandops.detect.condition import (
-    Count,
-    FieldPath,
-    Hours,
-    Near,
-    Threshold,
-    Together,
-    topic_pattern_problem,
-)
-from demandops.model.config.base_model import (
-    CamelModel,
-    DnsLabel,
-    FileModel,
-    Items,
-    Text,
-    parse_file,
-    seconds_of,
-    without,
-)
+from demandops.detect import condition as conditions
+from demandops.detect.condition import Count, FieldPath, Hours, Near, Threshold, Together
+from demandops.model.config import base_model
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text
 from demandops.model.config.policy import Duration, Patterns, matches
 from demandops.model.demand import demand_goal, deployment_request_goal
 
@@ -337,8 +322,8 @@ class Source(CamelModel):
     the entity's position. An entity counts as gone when it has been silent for ``timeout``.
     """
 
-    topic: Annotated[Text, without(topic_pattern_problem)]
-    type: Annotated[Text, without(message_type_problem)]
+    topic: Annotated[Text, base_model.without(conditions.topic_pattern_problem)]
+    type: Annotated[Text, base_model.without(message_type_problem)]
     entity: FieldPath | None = None
     x: FieldPath | None = None
     y: FieldPath | None = None
@@ -354,7 +339,7 @@ class Source(CamelModel):
             )
         if bool(self.x) != bool(self.y):
             raise ValueError("names x or y alone; give both, or neither")
-        if seconds_of(self.timeout) < 1:
+        if base_model.seconds_of(self.timeout) < 1:
             raise ValueError("timeout must be one second or more")
         return self
 
@@ -401,7 +386,9 @@ class Rule(CamelModel):
                 "renew is for a deploymentRequest; leave it out, because the detector renews each "
                 "demand that has a lease"
             )
-        if seconds_of(self.retry) < 1 or (self.renew and seconds_of(self.renew) < 1):
+        if base_model.seconds_of(self.retry) < 1 or (
+            self.renew and base_model.seconds_of(self.renew) < 1
+        ):
             raise ValueError("retry and renew must be one second or more")
         return self
 
@@ -453,7 +440,7 @@ class RuleFile(FileModel):
 
 def read(text: str, file: str) -> RuleFile:
     with located_in(text):
-        rules = parse_file(RuleFile, text, file)
+        rules = base_model.parse_file(RuleFile, text, file)
         if faults := list(_faults(rules)):
             raise InvalidInput(each.within(file) for each in faults)
     return rules

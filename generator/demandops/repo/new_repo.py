@@ -30,10 +30,6 @@ from demandops.templating.evaluator import EVALUATE
 EXAMPLE_URL = "https://git.example/fleet/state-repo.git"
 
 _ENTRIES = re.compile(r"(?ms)^(clusters|nodes|brokers|charts):\n.*")
-_EXPERIMENT = "appdefs/object-detection-fusion/"
-_FIRST_STEP = (
-    " `init` created an example with four vehicles, a station, an edge and a cloud server."
-)
 
 
 def files(gitops: str = "flux", url: str = EXAMPLE_URL, *, example: bool = True) -> dict[str, str]:
@@ -69,7 +65,7 @@ def _without_example(contents: Mapping[str, str]) -> dict[str, str]:
         if path.startswith(("inventory/", "registry/charts"))
         else text
         for path, text in contents.items()
-        if not path.startswith(_EXPERIMENT)
+        if not path.startswith("appdefs/object-detection-fusion/")
     }
     images = files["registry/images.yaml"]
     start, end = images.index("  object-detection:"), images.index("  # Zenoh connections")
@@ -78,7 +74,8 @@ def _without_example(contents: Mapping[str, str]) -> dict[str, str]:
     files[policy] = files[policy].replace("perception", "fleet")
     nodes, example = "inventory/nodes.yaml", " These are examples; replace them\n# with yours."
     files[nodes] = files[nodes].replace(example, "\n#")
-    files["README.md"] = files["README.md"].replace(_FIRST_STEP, "")
+    said = " `init` created an example with four vehicles, a station, an edge and a cloud server."
+    files["README.md"] = files["README.md"].replace(said, "")
     return files
 
 

@@ -43,8 +43,6 @@ from demandops.templating.evaluator import EVALUATE
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
 _FIRST_WITH_MARKS = 2  # the first render version whose claims mark the further topics of a source
-# How many parts the path ``clusters/<cluster>/<access domain>`` has.
-_FOLDER_DEPTH = 3
 _NAMES = {"flux": "Flux", "argocd": "Argo CD"}
 
 
@@ -200,7 +198,8 @@ def _message(upgrade: Upgrade, keys: tuple[ClaimKey, ...]) -> str:
         why += f" instead of {old.render_version}"
     if upgrade.switches:
         why += f", for {_NAMES[new.gitops]} instead of {_NAMES[old.gitops]}"
-    counts = Counter("/".join(path.split("/")[:_FOLDER_DEPTH]) for path in upgrade.files)
+    # by the folder ``clusters/<cluster>/<access domain>``
+    counts = Counter("/".join(path.split("/")[:3]) for path in upgrade.files)
     trailers = [
         ("Operation", "upgrade"),
         ("From-Render-Version", str(old.render_version)),

@@ -33,9 +33,6 @@ from demandops.repo.load.snapshot import changed_kept_replicas
 # A commit of the generator may change generated files, reports, and the claims that its message
 # names. Some operations may change further files.
 
-_OWN_ROOTS = (*GENERATED_ROOTS, NOTES_ROOT)
-# Operations that may record or forget recent shutdowns.
-_RECORDING = ("shutdown", "join", "rollback")
 # The folders of the ledger that have records, such as recent shutdowns, instead of claims.
 _RECORDS = tuple(
     f"{root}/" for root in (records.MARKERS_ROOT, records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT)
@@ -58,7 +55,7 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     named = {f"{claim_file.segment(demand)}.yaml" for demand in demands}
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
-        if root in _OWN_ROOTS or (path == ROOT_FILE and operation == "upgrade"):
+        if root in (*GENERATED_ROOTS, NOTES_ROOT) or (path == ROOT_FILE and operation == "upgrade"):
             continue
         if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
             continue
@@ -98,11 +95,10 @@ def _is_canonical(commit: Commit, path: str) -> bool:
 def _may_record(commit: Commit, path: str, operation: str) -> bool:
     text = trees.read_text(commit.tree, path) or ""
     if path.startswith(f"{records.MARKERS_ROOT}/"):
-        return operation in _ENDING and (
-            not text or bool(records.read_ended_override({path: text}))
-        )
+        is_valid = not text or bool(records.read_ended_override({path: text}))
+        return operation in _ENDING and is_valid
     if path.startswith(f"{records.SHUTDOWNS_ROOT}/"):
-        return operation in _RECORDING
+        return operation in ("shutdown", "join", "rollback")
     record = records.read_replicas(text, path)
     is_canonical = record is not None and records.replicas_text(*record) == text
     return operation not in (*_REWRITING, *_ENDING) and (not text or is_canonical)
@@ -118,8 +114,6 @@ def _may_record(commit: Commit, path: str, operation: str) -> bool:
 # object ids mean equal files, and that plans and rendered files depend only on their input. It does
 # not rely on the generator's choice of the affected releases, but renders a release again if any
 # input of its plan changed (:class:`.TracedPlan`). Then it compares the ids of all generated files.
-
-_CHARTS = "/_charts/"
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +197,7 @@ class _Proof:
             charts = {
                 path: trees.text_of(blob)
                 for path, blob in trees.blobs(before, GENERATED_ROOTS)
-                if _CHARTS in path and path not in wanted
+                if "/_charts/" in path and path not in wanted
             }
             kept = release_file.kept_charts({}, charts, self.state)
             wanted |= {path: _blob(text) for path, text in kept.items()}

@@ -27,8 +27,8 @@ from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Ticket
 from demandops.serve.timing import timers
+from demandops.serve.timing.agenda import Agenda
 from demandops.serve.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
-from demandops.serve.timing.own_work import OwnWork
 from demandops.serve.timing.timers import LONGEST_EVALUATION_S, Backoff, PollTimer
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
@@ -115,7 +115,7 @@ class Worker:
         self._evaluator = Evaluator(repository, demands, approvals)
         self._timer = PollTimer(fetch_interval, repository.runtime, local=repository.always_current)
         self._lease_expiry = LeaseExpiry(repository.runtime)
-        self._own_work = OwnWork(repository.runtime)
+        self._agenda = Agenda(repository.runtime)
         self._ahead = ReadAhead()
         self._batch_limit = timers.LIMIT_LOCAL if repository.always_current else timers.LIMIT_REMOTE
         self._must_fetch = self._tip_is_fresh = False
@@ -204,7 +204,7 @@ class Worker:
         state, tip = self.snapshot.state, str(self.snapshot.commit)
         seconds = self._approvals.seconds_until_due(tip, LONGEST_WAIT_S)
         seconds = self._lease_expiry.seconds_until_due(state.ledger, seconds)
-        seconds = self._own_work.seconds_until_due(state, seconds)
+        seconds = self._agenda.seconds_until_due(state, seconds)
         fetch = self._timer.seconds_until_due()
         return seconds if fetch is None else min(seconds, fetch)
 
@@ -316,7 +316,7 @@ class Worker:
         before = commits.head.state
         result = ticket, self._evaluator.evaluate(commits, ticket)
         # those that wait get the room that this demand frees before the next demand can take it
-        self._own_work.waiting_turns.follow(commits, before)
+        self._agenda.waiting_turns.follow(commits, before)
         return result
 
     def _ended_leases(self, snapshot: Snapshot) -> list[Ticket]:
@@ -354,7 +354,7 @@ class Worker:
     # ---- following the state repo ----
 
     def _follow(self) -> None:
-        is_due = self._own_work.is_due(self.snapshot.state)
+        is_due = self._agenda.is_due(self.snapshot.state)
         try:
             if self._timer.start_if_due():
                 # a demand that arrives ends the fetch, because its push finds new commits too
@@ -368,7 +368,7 @@ class Worker:
             self._timer.request()  # the fetch is still due
         except StateRepoError as error:
             self._record_unreachable(error)
-            self._own_work.postpone()
+            self._agenda.postpone()
 
     def _check_proposals(self) -> None:
         if not self._approvals.is_due(str(self.snapshot.commit)):
@@ -420,7 +420,7 @@ class Worker:
                     log.error("%s (its last valid version, if any, stays in effect)", problem)
             for file in sorted({old.file for old in before} - {new.file for new in self._logged}):
                 log.info("%s is valid again", file or "the state repo")
-        self._own_work.commit_due(commits)
+        self._agenda.commit_due(commits)
         return commits
 
     def _record_published(self, commits: CommitBatch) -> None:

@@ -14,7 +14,7 @@ from demandops.model.demand.claim import ClaimKey
 from demandops.model.ledger import claim_file
 from demandops.repo import reader
 from demandops.repo.load import last_valid_config
-from demandops.repo.pull_request import merge_check
+from demandops.repo.merge_check import merge_check
 from demandops.repo.write.proposal_branch import branch_name
 
 from tests.kit import rig

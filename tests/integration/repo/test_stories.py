@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 import yaml
 from demandops.decide.state import rendered_files
-from demandops.repo.pull_request import merge_check
+from demandops.repo.merge_check import merge_check
 from demandops.serve import evaluation
 from demandops.serve.generator import Generator
 

@@ -16,7 +16,7 @@ from demandops.model.demand.claim import ClaimKey
 from demandops.model.ledger import claim_file
 from demandops.repo import reader
 from demandops.repo.load import last_valid_config
-from demandops.repo.pull_request import merge_check
+from demandops.repo.merge_check import merge_check
 from demandops.serve.generator import Generator
 
 from tests.kit import goals, rig

@@ -10,7 +10,7 @@ import jsonschema_rs
 import pytest
 import yaml
 from demandops.base.errors import Fault, InvalidInput
-from demandops.cli.repo import schema
+from demandops.cli.authoring import schema
 from demandops.detect import rule_file
 from demandops.detect.condition import entity_in
 from demandops.detect.observations import MessageReader, Unreadable

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from demandops.base.naming import PATTERN_WORDS
-from demandops.cli.repo.schema import SCHEMAS
+from demandops.cli.authoring.schema import SCHEMAS
 
 
 def patterns_of(schema: Any) -> set[str]:

@@ -8,7 +8,7 @@ from typing import Any
 import kubernetes_validate
 import pytest
 import yaml
-from demandops.repo.pull_request.rendered_charts import manifest_faults
+from demandops.repo.merge_check.rendered_charts import manifest_faults
 
 from tests.kit.goals import application, connection, goal, perception
 from tests.kit.golden import CASES, rendered

@@ -19,7 +19,7 @@ from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
 from demandops.model.config.policy import matches
 from demandops.render.gitops import expression_of, node_rule
-from demandops.repo.pull_request.rendered_charts import manifest_faults
+from demandops.repo.merge_check.rendered_charts import manifest_faults
 
 from tests.kit.config import configuration, edited, skeleton
 from tests.kit.memory import MemoryRepo

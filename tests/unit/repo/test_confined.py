@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 from demandops.decide.changeset import trial_releases
-from demandops.repo.pull_request import confined
-from demandops.repo.pull_request import helm as helm_runs
-from demandops.repo.pull_request.helm import (
+from demandops.repo.merge_check import confined
+from demandops.repo.merge_check import helm as helm_runs
+from demandops.repo.merge_check.helm import (
     HELM_BIN,
     Helm,
     Report,
@@ -20,7 +20,7 @@ from demandops.repo.pull_request.helm import (
     parsed_kinds,
     parsed_lint,
 )
-from demandops.repo.pull_request.rendered_charts import _Run
+from demandops.repo.merge_check.rendered_charts import _Run
 
 from tests.kit.config import edited
 from tests.kit.http import serving

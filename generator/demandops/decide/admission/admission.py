@@ -53,11 +53,8 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         yield from _id_faults(f"positions[{index}].node", node)
         yield from _node_faults(f"positions[{index}].node", node, config)
     if not request.demanded and not isinstance(request, Release | Renew):
-        yield fault(
-            "id" if request.is_reference else "applications",
-            "the request lists no application and no connection; list at least one",
-            code="empty",
-        )
+        message = "the request lists no application and no connection; list at least one"
+        yield fault("id" if request.is_reference else "applications", message, code="empty")
     for item in request.demanded:
         held = item.held
         # the placement itself reports that it found no node, so an empty node is no fault then
@@ -232,14 +229,13 @@ def _definition_faults(
     for service in services.values():
         if service.nodes and app.node in config.nodes and app.node not in service.runs_at:
             cluster = config.nodes[app.node].cluster
-            yield fault(
-                "node",
+            message = (
                 f"'{app.node}' is in cluster '{cluster}', where the application's service "
                 f"{service.name} has no node; choose a node in cluster "
                 f"{' or '.join(service.nodes)}, or ask for an entry for cluster '{cluster}' in the "
-                f"field nodes of {service.file}",
-                code="no-node",
+                f"field nodes of {service.file}"
             )
+            yield fault("node", message, code="no-node")
     for name in app.named:
         if name not in services:
             close = suggestion(name, [each.name for each in services.values() if each.is_placeable])
@@ -332,12 +328,11 @@ def _node_faults(where: str, node: str, config: Config) -> Iterator[Fault]:
             code="unknown-node",
         )
     elif node and node not in config.domain_of:
-        yield fault(
-            where,
+        message = (
             f"{quoted(node)} is not in any access domain; a platform engineer adds it to "
-            f"{config.place_of(DOMAINS_FILE)}",
-            code="no-access-domain",
+            f"{config.place_of(DOMAINS_FILE)}"
         )
+        yield fault(where, message, code="no-access-domain")
 
 
 def _id_faults(where: str, value: str) -> Iterator[Fault]:

@@ -38,12 +38,11 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         home = config.domain_of.get(item.held.home)  # the admission reports nodes without a domain
         longest = home.leases.longest if home else None
         if home and longest and lease_s is not None and lease_s > seconds_of(longest):
-            yield fault(
-                "lease",
+            message = (
                 f"is {duration_text(lease_s)}, but leases.longest of access domain '{home.name}' "
-                f"is {longest}; request a shorter lease, and renew it",
-                code="not-allowed",
+                f"is {longest}; request a shorter lease, and renew it"
             )
+            yield fault("lease", message, code="not-allowed")
 
 
 def needed_access(

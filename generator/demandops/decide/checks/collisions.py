@@ -14,15 +14,10 @@ from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
 from demandops.connections.connection import ClientKey
+from demandops.decide.planning import release_keys
 from demandops.decide.planning.flows import flows, outputs, usual_topic
 from demandops.decide.planning.planner import service_name
-from demandops.decide.planning.release_keys import (
-    ReleaseKey,
-    claims_needing,
-    is_needed,
-    keys_of,
-    keys_of_claims,
-)
+from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_of, keys_of_claims
 from demandops.decide.restoration import request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
@@ -79,7 +74,7 @@ def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault
 
 
 def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -> Iterator[Fault]:
-    claim = next(iter(claims_needing(after, key)), None)
+    claim = next(iter(release_keys.claims_needing(after, key)), None)
     if claim is None:
         return
     first = after.ledger.application(claim.subject.id) or claim.application
@@ -99,11 +94,10 @@ def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -
         )
         for clash, other in chain[tuple[str, ServiceKey | None]](publishers, connections):
             remedy = _remedy(key, other, service, name, after.config)
-            yield fault(
-                _field(request, key, service),
-                f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}",
-                code="conflict",
+            message = (
+                f"output {name} of {key.service} is {topic}, but {clash} '{key.node}'; {remedy}"
             )
+            yield fault(_field(request, key, service), message, code="conflict")
 
 
 def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterator[Fault]:
@@ -131,12 +125,11 @@ def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterato
             routes = (route for claim in claims for route in claim.connection.topics)
             read = {route.read_topic for route in routes if route.written_topic == flow.target}
             for topic in sorted(read - {flow.topic})[:1]:
-                yield item.fault(
-                    f"deliver[{flow.delivery}].topic",
+                message = (
                     f"connection '{id}' already brings {topic} to '{flow.receiver}' as "
-                    f"{flow.target}; choose another topic for this delivery",
-                    code="conflict",
+                    f"{flow.target}; choose another topic for this delivery"
                 )
+                yield item.fault(f"deliver[{flow.delivery}].topic", message, code="conflict")
 
 
 def _publishers(

@@ -8,14 +8,8 @@ from itertools import islice
 
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import Subject, SubjectKind
-from demandops.decide.planning.overrides import (
-    Traits,
-    fits,
-    has_labels,
-    suspended_by,
-    traits_of,
-    without_suspended,
-)
+from demandops.decide.planning import overrides
+from demandops.decide.planning.overrides import Traits, fits
 from demandops.decide.planning.release_keys import is_needed, keys_of, keys_of_claims
 from demandops.model.config.config import Config
 from demandops.model.config.override import Selector, format_time
@@ -42,7 +36,7 @@ def denial_faults(request: DemandRequest, after: World, changes: Changes) -> Ite
         # A selector that names services is compared with each service of the application, because
         # a service may run on another node than the application. Any other is compared with the
         # demand.
-        demanded, services = traits_of(item), list[Traits]()
+        demanded, services = overrides.traits_of(item), list[Traits]()
         if isinstance(item.held, Application):
             services = [
                 replace(demanded, nodes=(key.node,), service=key.service)
@@ -78,7 +72,7 @@ def _matched_field(selector: Selector, item: Demanded, config: Config) -> str:
         return "node"
     source = item.held.source
     at_source = not selector.nodes or matches(source, selector.nodes)
-    return "source" if at_source and has_labels(selector, source, config) else "target"
+    return "source" if at_source and overrides.has_labels(selector, source, config) else "target"
 
 
 def warnings(request: DemandRequest, world: World) -> Iterator[str]:
@@ -92,7 +86,7 @@ def warnings(request: DemandRequest, world: World) -> Iterator[str]:
     seen = set()
     requesters = set(request.requesters())
     for claim in claims:
-        override = suspended_by(claim, world)
+        override = overrides.suspended_by(claim, world)
         if override is None or claim.key in seen or not requesters & set(claim.requesters):
             continue
         seen.add(claim.key)
@@ -153,7 +147,7 @@ def _held(requester: str, world: World, domain: AccessDomain) -> int:
 
 
 def _running(node: str, world: World) -> int:
-    world = without_suspended(world)
+    world = overrides.without_suspended(world)
     ids = world.ledger.applications_at(node)
     subjects = (Subject(SubjectKind.APPLICATION, id) for id in ids)
     keys = {key for subject in subjects for key in keys_of(world, subject)}

@@ -11,16 +11,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from demandops.base.errors import Fault
+from demandops.decide.planning import release_keys
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.release_keys import (
-    ReleaseKey,
-    claims_needing,
-    contents,
-    newest_asked,
-    running_version,
-    same_version,
-    version_of_service,
-)
+from demandops.decide.planning.release_keys import ReleaseKey, contents, newest_asked, same_version
 from demandops.model.config.appdef import VersionPolicy
 from demandops.model.config.registry import ApplicationVersion, precedence
 from demandops.model.demand.claim import Claim
@@ -154,19 +147,19 @@ def _of_service(
 ) -> Iterator[Difference]:
     """Yield the differences of demanded applications, each with the version it asks for."""
     service, key, config = release.service, release.key, after.config
-    versions = {id: running_version(after, id) for id in release.applications}
+    versions = {id: release_keys.running_version(after, id) for id in release.applications}
     if len({contents(version, service) for version in versions.values() if version}) == 1:
         return
     for_what = f"for {key.topic} of '{key.source}'" if key.topic else f"on '{key.node}'"
     what = f"{key.service} {for_what}"
     for id, (item, asked) in demanded.items():
         others = [other for other in versions if other != id]
-        own, theirs = versions.get(id), version_of_service(after, service, others)
+        own, theirs = versions.get(id), release_keys.version_of_service(after, service, others)
         if own is None or contents(own, service) == contents(theirs, service):
             continue
         # The difference was there before the demand.
-        if same_version(running_version(before, id), own) and any(
-            claim.application.id == id for claim in claims_needing(before, key)
+        if same_version(release_keys.running_version(before, id), own) and any(
+            claim.application.id == id for claim in release_keys.claims_needing(before, key)
         ):
             continue
         # Versions of two definitions have names of their own, so the charts are compared.

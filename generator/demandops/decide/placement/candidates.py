@@ -17,16 +17,10 @@ from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
 from demandops.decide.placement.capacity import Room
 from demandops.decide.planning.overrides import with_overridden_nodes
+from demandops.model.config import inventory
 from demandops.model.config.appdef import Place, Service
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.model.config.inventory import (
-    Node,
-    Position,
-    condition_problem,
-    condition_texts,
-    meets_condition,
-    read_condition,
-)
+from demandops.model.config.inventory import Node, Position
 from demandops.model.demand.claim import Application, Claim, Requirement
 from demandops.model.demand.demand_request import Demanded
 from demandops.model.ledger.ledger import World
@@ -52,7 +46,7 @@ def requirement_of(service: Service) -> Requirement:
         place.role,
         tuple(sorted(place.labels.items())),
         tuple(sorted({*place.capabilities})),
-        tuple(sorted(condition_texts(place.properties))),
+        tuple(sorted(inventory.condition_texts(place.properties))),
     )
 
 
@@ -269,7 +263,7 @@ def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
         yield f"no node has the role {quoted(role)}{suggestion(role, roles)}"
     kinds = config.property_kinds
     for text in requirement.properties:
-        condition = read_condition(text)
+        condition = inventory.read_condition(text)
         if condition is None:  # the form of the demand has a fault
             continue
         if condition.name not in kinds:
@@ -277,7 +271,7 @@ def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
                 suggestion(condition.name, kinds) or f"; add it in {config.place_of(NODES_FILE)}"
             )
             yield f"no node has the property {quoted(condition.name)}{remedy}"
-        elif problem := condition_problem(condition, kinds[condition.name][0]):
+        elif problem := inventory.condition_problem(condition, kinds[condition.name][0]):
             yield problem
 
 
@@ -292,8 +286,8 @@ def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
         if capability not in node.capabilities:
             yield f"the capability {quoted(capability)}"
     for text in requirement.properties:
-        if not meets_condition(node.properties, text):
-            condition = read_condition(text)
+        if not inventory.meets_condition(node.properties, text):
+            condition = inventory.read_condition(text)
             actual = node.properties.get(condition.name) if condition else None
             has = "" if actual is None else f" (it has {strict_yaml.short_repr(actual)})"
             yield f"the property {quoted(text)}{has}"

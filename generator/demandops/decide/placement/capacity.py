@@ -14,13 +14,9 @@ from rpds import HashTrieMap
 
 from demandops.base.errors import Fault, Refused, fault
 from demandops.base.naming import Subject, SubjectKind
+from demandops.decide.planning import release_keys
 from demandops.decide.planning.planner import plan
-from demandops.decide.planning.release_keys import (
-    ReleaseKey,
-    affected_keys,
-    keys_of,
-    keys_of_claims,
-)
+from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.config.inventory import Node, amount_of, amount_text
 from demandops.model.demand.claim import Claim
@@ -57,7 +53,7 @@ def whole_usage(world: World) -> Usage:
     keys: dict[ReleaseKey, None] = {}
     for subject in world.ledger.claims:
         if subject.kind is SubjectKind.APPLICATION:
-            keys |= dict.fromkeys(keys_of(world, subject))
+            keys |= dict.fromkeys(release_keys.keys_of(world, subject))
     return Usage().plus(_requests(_plan_leniently(world, keys), world.config))
 
 
@@ -72,7 +68,7 @@ def growth(before: Plans, after: Plans, config: Config) -> dict[Need, int]:
 def growth_by(before: World, after: World, changes: Iterable[ClaimChange]) -> dict[Need, int]:
     if not after.config.limits_capacity:
         return {}
-    keys = affected_keys(before, after, changes)
+    keys = release_keys.affected_keys(before, after, changes)
     planned = _plan_leniently(before, keys), _plan_leniently(after, keys)
     return growth(*planned, after.config)
 
@@ -190,7 +186,7 @@ class Room:
             apart = claims[0].application.services
             keys = [
                 key
-                for key in keys_of_claims(after, claims)
+                for key in release_keys.keys_of_claims(after, claims)
                 if isinstance(key, ServiceKey)
                 and key.application is not None
                 and (key.service == service if service else key.service not in apart)

@@ -15,15 +15,8 @@ from types import MappingProxyType
 from demandops.base.errors import Fault
 from demandops.base.quoting import quoted
 from demandops.decide.admission import permission
-from demandops.decide.placement.candidates import (
-    Choice,
-    Chosen,
-    joined,
-    lacks,
-    on_node,
-    requirement_of,
-    shares,
-)
+from demandops.decide.placement import candidates
+from demandops.decide.placement.candidates import Choice, Chosen, joined, lacks, requirement_of
 from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.model.config.appdef import Service
@@ -193,7 +186,7 @@ def may_wait(request: DemandRequest, world: World, checkpoint: Callable[[], None
             checkpoint()
             for node in choice.nodes():
                 if world.config.domain_of[node].when_full == "wait":
-                    on_it = on_node(choice.app, node, choice.service, world)
+                    on_it = candidates.on_node(choice.app, node, choice.service, world)
                     claim = _claim(request, replace(item, held=on_it))
                     # A person approves only what can be booked at once, so what needs approval
                     # cannot wait.
@@ -240,7 +233,7 @@ def _shared_node(app: Application, service: Service, world: World) -> str:
     for topic in app.inputs.get(role, ()) if service.scope == "topic" else ():
         for claim in world.ledger.claims_reading(topic.source, topic.topic):
             other = world.ledger.application(claim.subject.id) or claim.application
-            if other.id == app.id or not shares(service, app, other):
+            if other.id == app.id or not candidates.shares(service, app, other):
                 continue
             if claim.application.inputs_from(role, topic.source, topic.topic):
                 return other.chosen_node(service.name)
@@ -342,7 +335,7 @@ def _with_services(
             continue
         text = f"service '{service.name}' of application '{app.id}' is placed on "
         placed = f"{text}{quoted(chosen.node)}, {chosen.why}"
-        held = on_node(choice.app, chosen.node, service, world)
+        held = candidates.on_node(choice.app, chosen.node, service, world)
         item = replace(item, held=held, placed=(*item.placed, placed))
         room.newly_placed[chosen.node] += 1
         room.book([_claim(request, item)])

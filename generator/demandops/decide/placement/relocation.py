@@ -17,23 +17,11 @@ from demandops.decide.admission import admission, permission
 from demandops.decide.booking import Drain, conflicts
 from demandops.decide.checks import collisions, quotas
 from demandops.decide.checks.collisions import Names
-from demandops.decide.placement.candidates import (
-    MOST_TRIED,
-    Choice,
-    Chosen,
-    joined,
-    on_node,
-    requirement_of,
-    shares,
-)
+from demandops.decide.placement import candidates
+from demandops.decide.placement.candidates import Choice, Chosen
 from demandops.decide.placement.capacity import Room, Usage
+from demandops.decide.planning import overrides
 from demandops.decide.planning.flows import Flow, connection_for, flows
-from demandops.decide.planning.overrides import (
-    kept_subjects,
-    suspended_by,
-    update_kept_claims,
-    with_overridden_nodes,
-)
 from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.restoration import Restoration, request_for
 from demandops.model.config.appdef import Service
@@ -203,7 +191,9 @@ def _moving_with(id: str, service: Service | None, node: str, world: World) -> l
     return [
         each
         for each, other in others.items()
-        if other and other.services.get(service.name) == node and shares(service, app, other)
+        if other
+        and other.services.get(service.name) == node
+        and candidates.shares(service, app, other)
     ]
 
 
@@ -216,7 +206,7 @@ def _why_fixed(claim: Claim, node: str, service: Service | None) -> str:
     if app.place is None:  # a claim has this only if the generator chose the node
         return f"demand '{claim.demand}' names the node"
     here = [name for name in app.named if name not in app.services]
-    return f"demand '{claim.demand}' names the node of {joined(here)}" if here else ""
+    return f"demand '{claim.demand}' names the node of {candidates.joined(here)}" if here else ""
 
 
 def applications_of(ledger: Ledger, node: str) -> list[str]:
@@ -232,7 +222,7 @@ def _moved(
 ) -> tuple[_Moved | str, int]:
     """Return the move to the best other node, or why there is none, and how many were tried."""
     places = (claim.application.place or Requirement() for claim in claims)
-    required = requirement_of(service) if service else reduce(Requirement.united, places)
+    required = candidates.requirement_of(service) if service else reduce(Requirement.united, places)
     inputs: dict[str, dict[InputTopic, None]] = {}
     for claim in claims:
         for role, topics in claim.application.inputs.items():
@@ -250,12 +240,12 @@ def _moved(
         for _, route in _carrying(world.ledger, claim.demand, flow)
         if flow.delivery is None and route.read_topic != route.written_topic
     }
-    for chosen in islice(choice.candidates(), MOST_TRIED):
+    for chosen in islice(choice.candidates(), candidates.MOST_TRIED):
         if route := renamed.get(chosen.node):
             problem = f"'{route.read_topic}' would not be renamed to '{route.written_topic}'"
             reasons.append(f"on {quoted(chosen.node)} {problem}")
             continue
-        move = partial(on_node, node=chosen.node, service=service, world=world)
+        move = partial(candidates.on_node, node=chosen.node, service=service, world=world)
         after, changes = with_moved(world, claims, move)
         moved_names = collisions.followed(names, world, after, affected_keys(world, after, changes))
         fault = next(_faults(world, after, changes, moved_names), None)
@@ -291,7 +281,7 @@ def following_overrides(world: World, subjects: Iterable[Subject] | None = None)
         ids = [*world.ledger.moved_applications()]
         if any(override.node for override in world.overrides):
             ids = sorted(world.ledger.subjects(SubjectKind.APPLICATION))
-    change = partial(with_overridden_nodes, world=world)
+    change = partial(overrides.with_overridden_nodes, world=world)
     moving = [
         id
         for id in dict.fromkeys(ids)
@@ -371,8 +361,8 @@ def _faults(
         yield from admission.faults(request, after.config)
         yield from permission.faults(request, after.config)
         yield from conflicts(request.demanded[0], others)
-        override = suspended_by(claim, after)
-        if override and change.before and not suspended_by(change.before, before):
+        override = overrides.suspended_by(claim, after)
+        if override and change.before and not overrides.suspended_by(change.before, before):
             yield Fault("denied", "", f"{claim.subject} would be denied by {override.path}")
     yield from quotas.quota_faults(before, after, Changes(changes))
     for change in changes:
@@ -452,7 +442,7 @@ def update_ledger(
     for override in expired:
         files |= _marker(override)
     after = replace(after, ledger=replace(after.ledger, ended=ended))
-    kept = (*kept_subjects(before.ledger), *kept_subjects(after.ledger))
+    kept = (*overrides.kept_subjects(before.ledger), *overrides.kept_subjects(after.ledger))
     update = update_claims(before.ledger, after, dict.fromkeys((*subjects, *kept)), now)
     moved = following_overrides(replace(after, ledger=update.ledger))
     keys = (*update.keys, *moved.keys)
@@ -464,7 +454,7 @@ def update_claims(
     before: Ledger, after: World, subjects: Iterable[Subject], now: datetime
 ) -> LedgerUpdate:
     subjects = tuple(subjects)
-    ledger, kept = update_kept_claims(before, after, subjects, now)
+    ledger, kept = overrides.update_kept_claims(before, after, subjects, now)
     moved = following_overrides(replace(after, ledger=ledger), subjects)
     keys = (*kept, *moved.keys)
     files = changed_claim_files(after.ledger, moved.ledger, keys)

@@ -210,21 +210,13 @@ def _kept_claim(
     if not before:
         return None
     last = max(before, key=lambda claim: (claim.booked, claim.demand))
-    if suspended_by(last, world) is not None:
-        return None  # nothing ran for this claim, so there is nothing to keep
-    for override in keeping_overrides(last, world):
-        name = OVERRIDE_PREFIX + override.name
-        return replace(
-            last,
-            demand=name,
-            request=name,
-            requesters=(override.owner,),
-            booked=now,
-            lease=None,
-            joined=False,
-            partial={},
-        )
-    return None
+    keeping = keeping_overrides(last, world)
+    # if it is suspended, nothing ran for this claim, so there is nothing to keep
+    if not keeping or suspended_by(last, world) is not None:
+        return None
+    name, who = OVERRIDE_PREFIX + keeping[0].name, (keeping[0].owner,)
+    last = replace(last, demand=name, request=name, requesters=who, booked=now)
+    return replace(last, lease=None, joined=False, partial={})
 
 
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:

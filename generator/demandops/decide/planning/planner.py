@@ -19,16 +19,10 @@ from demandops.base.naming import Subject, TopicKey
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection, ConnectionType, Route
 from demandops.connections.connection_types import route_faults
-from demandops.decide.planning import overrides
+from demandops.decide.planning import overrides, release_keys
 from demandops.decide.planning.flows import outputs, roots_of, topics_of_origin, usual_topic
 from demandops.decide.planning.overrides import without_suspended
-from demandops.decide.planning.release_keys import (
-    ReleaseKey,
-    claims_needing,
-    keys_of,
-    services_of,
-    version_of_service,
-)
+from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.appdef import Parameter, Scaling, Service
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override
@@ -71,11 +65,11 @@ def _unshaped(world: World, key: ReleaseKey) -> Release | None:
 
 
 def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
-    config, claims = world.config, claims_needing(world, key)
+    config, claims = world.config, release_keys.claims_needing(world, key)
     if not claims:
         return None
     apps = [claim.application for claim in claims]
-    service = services_of(config, _as_claimed(world, apps[0]).appdef)[key.service]
+    service = release_keys.services_of(config, _as_claimed(world, apps[0]).appdef)[key.service]
     node, domain = config.node_and_domain(key.node)
     parts = list(_parts(world, service, key, apps))
     inputs: dict[str, tuple[InputTopic, ...]] = {}
@@ -105,7 +99,7 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         requesters = tuple(sorted({who for names in holders for who in names}))
     further = service.root is not None and parts[0].inputs[service.root][0].further
     applications = tuple(dict.fromkeys(app.id for app in apps))
-    version = version_of_service(world, service, applications)
+    version = release_keys.version_of_service(world, service, applications)
     topics = [topic for role_topics in inputs.values() for topic in role_topics]
     needed = replicas_of(service.scaling, parameters, topics, claims, requesters)
     kept = world.ledger.kept.steps.get(key.instance)
@@ -168,7 +162,7 @@ def _parts(
 
 
 def _origin(config: Config, key: ServiceKey, role: str, app: Application) -> str:
-    return services_of(config, app.appdef)[key.service].inputs[role]
+    return release_keys.services_of(config, app.appdef)[key.service].inputs[role]
 
 
 def demanded_inputs(
@@ -406,7 +400,7 @@ class TracedPlan:
         stale = {unit for read in reads for unit in self._readers.pop(read, ())}
 
         def keys_needed(world: World, subject: Subject) -> tuple[ReleaseKey, ...]:
-            return tuple(keys_of(world, subject, strict=True))
+            return tuple(release_keys.keys_of(world, subject, strict=True))
 
         for subject in ledger.claims:
             if subject in stale or subject not in self._keys:

@@ -17,25 +17,9 @@ from pydantic import Field, StringConstraints, model_validator
 
 from demandops.base import strict_yaml
 from demandops.base.errors import sentences, suggestion
-from demandops.model.config.base_model import (
-    Approval,
-    CamelModel,
-    DnsLabel,
-    FileModel,
-    Items,
-    Positive,
-    Text,
-    Word,
-    seconds_of,
-)
-from demandops.model.config.inventory import (
-    LabelKey,
-    LabelValue,
-    NodeId,
-    PropertyName,
-    RequiredValue,
-    Resources,
-)
+from demandops.model.config import base_model, inventory
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
+from demandops.model.config.inventory import LabelKey, LabelValue, NodeId, PropertyName, Resources
 from demandops.model.config.policy import Duration
 
 # ---- the number of replicas of a service ----
@@ -84,7 +68,7 @@ class Scaling(CamelModel):
 
     min: Count = 1
     max: Annotated[Count, Field(ge=1)] = 1
-    per: Annotated[dict[Measure, Positive], Field(min_length=1)] | None = None
+    per: Annotated[dict[Measure, base_model.Positive], Field(min_length=1)] | None = None
     sizes: Sizes | None = None
     autoscaler: Annotated[dict[Resource, Percent], Field(min_length=1)] | None = None
     may_depend_on_requesters: bool = False
@@ -133,13 +117,15 @@ class Scaling(CamelModel):
         if self.down_after and not (self.per or self.sizes):
             own = " (an autoscaler has a delay of its own)" if self.autoscaler else ""
             yield f"'downAfter' does nothing without 'per' or 'sizes'{own}; remove 'downAfter'"
-        if self.down_after and seconds_of(self.down_after) < 1:
+        if self.down_after and base_model.seconds_of(self.down_after) < 1:
             yield "downAfter is zero; leave it out"
 
     # how long a service keeps replicas that no demand needs
     @property
     def kept_for(self) -> timedelta | None:
-        return timedelta(seconds=seconds_of(self.down_after)) if self.down_after else None
+        return (
+            timedelta(seconds=base_model.seconds_of(self.down_after)) if self.down_after else None
+        )
 
     @property
     def most(self) -> int:
@@ -173,7 +159,7 @@ class Place(CamelModel):
     role: Word | Literal[""] = ""
     labels: dict[LabelKey, LabelValue] = Field(default_factory=dict)
     capabilities: Items[Word] = ()
-    properties: dict[PropertyName, RequiredValue] = Field(default_factory=dict)
+    properties: dict[PropertyName, inventory.RequiredValue] = Field(default_factory=dict)
 
 
 class Input(CamelModel):
@@ -346,7 +332,7 @@ class ApplicationDefinition(FileModel):
     deployment_request: WireNames | None = None
     uses: dict[DnsLabel, dict[Word, str]] = Field(default_factory=dict)
     services: dict[DnsLabel, OwnService] = Field(default_factory=dict)
-    approval: Approval = "none"
+    approval: base_model.Approval = "none"
     versions: VersionPolicy = "refuse"
 
     @model_validator(mode="after")

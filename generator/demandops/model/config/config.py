@@ -10,16 +10,9 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from demandops.base import naming, strict_yaml
-from demandops.base.errors import (
-    MOST_FAULTS,
-    Fault,
-    InvalidInput,
-    Refused,
-    fault,
-    field_path,
-    suggestion,
-)
+from demandops.base import errors, naming, strict_yaml
+from demandops.base.errors import Fault, InvalidInput, Refused, fault, field_path, suggestion
+from demandops.model.config import registry
 from demandops.model.config.appdef import (
     ApplicationDefinition,
     Service,
@@ -30,15 +23,7 @@ from demandops.model.config.base_model import DnsLabel, faults_of, parse, parse_
 from demandops.model.config.inventory import Broker, Cluster, Kind, Node, id_in_domain, kind_of
 from demandops.model.config.override import OVERRIDES_ROOT, Override
 from demandops.model.config.policy import AccessDomain
-from demandops.model.config.registry import (
-    DEFAULT_SETTINGS,
-    ApplicationVersion,
-    Chart,
-    ClientsFile,
-    Image,
-    ImagePin,
-    VersionList,
-)
+from demandops.model.config.registry import ApplicationVersion, Chart, ClientsFile, Image, ImagePin
 from demandops.model.config.repo_settings import RepoSettings
 
 # ---- the whole configuration as one frozen, indexed value: :class:`Config` ----
@@ -106,8 +91,8 @@ class Config:
     hosts: Mapping[str, str] = field(default_factory=dict)
     # Every override; `demandops.model.ledger.ledger.World` knows which of them have ended
     overrides: Mapping[str, Override] = field(default_factory=dict)
-    clients: ClientsFile = DEFAULT_SETTINGS
-    versions: Mapping[str, VersionList] = field(default_factory=dict)
+    clients: ClientsFile = registry.DEFAULT_SETTINGS
+    versions: Mapping[str, registry.VersionList] = field(default_factory=dict)
     # For each collection, a map from each entry to the file that has the entry
     entry_files: Mapping[str, Mapping[str, str]] = field(
         default_factory=dict, compare=False, repr=False
@@ -365,7 +350,7 @@ class ConfigReader:
             where = place_of_collection(collection, self.files_of(collection))
             where = where.replace("inventory/", "")
             # thousands of names may be unknown, and only the first faults of a file are listed
-            is_listed = self._counts[file] < MOST_FAULTS
+            is_listed = self._counts[file] < errors.MOST_FAULTS
             hint = suggestion(name, self.places[collection]) if is_listed else ""
             self.add_fault(file, field, f"'{name}' is not in {where}{hint}")
 

@@ -5,19 +5,9 @@ from __future__ import annotations
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput, suggestion
 from demandops.connections import connection_types
+from demandops.model.config import config as configs
 from demandops.model.config.appdef import Deployed, ServiceDefinition
-from demandops.model.config.config import (
-    BROKERS_FILE,
-    CHARTS_FILE,
-    CLIENTS_FILE,
-    CLUSTERS_FILE,
-    DOMAINS_FILE,
-    IMAGES_FILE,
-    NODES_FILE,
-    VERSIONS_FILE,
-    Config,
-    ConfigReader,
-)
+from demandops.model.config.config import Config, ConfigReader
 from demandops.model.config.inventory import comparable_kind, kind_of
 from demandops.model.config.override import patched_settings
 from demandops.model.config.override_conflicts import check_override_conflicts
@@ -53,18 +43,18 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
     roles = {role for appdef in config.appdefs.values() for role in appdef.inputs}
     folders: dict[str, str] = {}
     for node in config.nodes.values():
-        file, place = reader.place_of(NODES_FILE, node.id)
+        file, place = reader.place_of(configs.NODES_FILE, node.id)
         other = folders.setdefault(folder := naming.object_name("", node.id), node.id)
         if other != node.id:
             message = f"'{other}' has the folder {folder} too; choose another id"
             reader.add_fault(file, f"{place}.id", message)
-        reader.check_reference(file, f"{place}.cluster", node.cluster, CLUSTERS_FILE)
+        reader.check_reference(file, f"{place}.cluster", node.cluster, configs.CLUSTERS_FILE)
         for peer in node.bridged:
-            reader.check_reference(file, f"{place}.bridged.{peer}", peer, NODES_FILE)
+            reader.check_reference(file, f"{place}.bridged.{peer}", peer, configs.NODES_FILE)
         for name, value in node.properties.items():
             kind, first = config.property_kinds[name]
             if kind_of(value) != kind and node.id not in config.hosts:  # once for each host
-                where = f"at '{first}' in {config.file_of(NODES_FILE, first)}"
+                where = f"at '{first}' in {config.file_of(configs.NODES_FILE, first)}"
                 message = f"is {kind_of(value)}, but the property is {kind} {where}"
                 message += "; give it the same type on all nodes"
                 reader.add_fault(file, f"{place}.properties.{name}", message)
@@ -73,40 +63,38 @@ def _check_inventory(config: Config, reader: ConfigReader) -> None:
                 message = f"'{role}' is not an input of any application{suggestion(role, roles)}"
                 reader.add_fault(file, f"{place}.topics.{role}", message)
     for broker in config.brokers.values():
-        file, place = reader.place_of(BROKERS_FILE, broker.node)
-        reader.check_reference(file, f"{place}.node", broker.node, NODES_FILE)
+        file, place = reader.place_of(configs.BROKERS_FILE, broker.node)
+        reader.check_reference(file, f"{place}.node", broker.node, configs.NODES_FILE)
 
 
 def _check_domains(config: Config, reader: ConfigReader) -> None:
     argocd = config.repo_settings.argocd if config.repo_settings.gitops == "argocd" else None
     seen: dict[str, str] = {}
     for domain in config.domains.values():
-        file, place = reader.place_of(DOMAINS_FILE, domain.name)
+        file, place = reader.place_of(configs.DOMAINS_FILE, domain.name)
         for broker in domain.broker_credentials:
             field = f"{place}.brokerCredentials.{broker}"
-            reader.check_reference(file, field, broker, BROKERS_FILE)
+            reader.check_reference(file, field, broker, configs.BROKERS_FILE)
         other = seen.setdefault(domain.namespace, domain.name)
         if other != domain.name:
-            reader.add_fault(
-                file,
-                f"{place}.namespace",
+            message = (
                 f"'{domain.namespace}' is already the namespace of '{other}'; give each "
-                "access domain its own namespace",
+                "access domain its own namespace"
             )
+            reader.add_fault(file, f"{place}.namespace", message)
         if argocd and domain.namespace == argocd.namespace:
-            reader.add_fault(
-                file,
-                f"{place}.namespace",
+            message = (
                 f"'{domain.namespace}' is Argo CD's own namespace, where an Application may do "
-                "all that Argo CD may; choose another namespace",
+                "all that Argo CD may; choose another namespace"
             )
+            reader.add_fault(file, f"{place}.namespace", message)
 
 
 def _check_host_network(config: Config, reader: ConfigReader) -> None:
     for node in config.nodes.values():
         domain = config.domain_of.get(node.id)
         if domain and domain.pod_security == "baseline" and node.host_network:
-            file, place = reader.place_of(NODES_FILE, node.id)
+            file, place = reader.place_of(configs.NODES_FILE, node.id)
             message = (
                 f"is true (the default), and podSecurity of access domain '{domain.name}' is "
                 "baseline, which forbids it; set 'hostNetwork: false' or "
@@ -114,7 +102,7 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
             )
             reader.add_fault(file, f"{place}.hostNetwork", message)
     closed = [d.name for d in config.domains.values() if d.pod_security == "baseline"]
-    for word, file in config.entry_files[CLIENTS_FILE].items():
+    for word, file in config.entry_files[configs.CLIENTS_FILE].items():
         if closed and config.clients.of(word).host_network:
             message = (
                 f"is true, and podSecurity of access domain '{closed[0]}' is baseline, which "
@@ -125,7 +113,7 @@ def _check_host_network(config: Config, reader: ConfigReader) -> None:
 
 def _check_charts(config: Config, reader: ConfigReader) -> None:
     for name, chart in config.charts.items():
-        file, place = reader.place_of(CHARTS_FILE, name)
+        file, place = reader.place_of(configs.CHARTS_FILE, name)
         _check_chart(file, place, chart, config, reader)
         for channel, source in chart.channels.items():
             _check_chart(file, f"{place}.channels.{channel}", source, config, reader)
@@ -175,16 +163,16 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
         defined.append((f"appdefs/{name}/service.yaml", "", name, shared))
     for file, where, name, service in defined:
         folder, _, own = file.rpartition("/")
-        reader.check_reference(file, f"{where}chart", service.chart, CHARTS_FILE)
+        reader.check_reference(file, f"{where}chart", service.chart, configs.CHARTS_FILE)
         for image in service.images:
-            reader.check_reference(file, f"{where}images", image, IMAGES_FILE)
+            reader.check_reference(file, f"{where}images", image, configs.IMAGES_FILE)
         if f"{folder}/{service.values}" not in config.files:
             message = f"'{service.values}' does not exist; add it beside {own}"
             reader.add_fault(file, f"{where}values", message)
         for word, value in (service.place.properties if service.place else {}).items():
             kind, first = config.property_kinds.get(word, (None, ""))
             if kind and comparable_kind(value) != kind:
-                registry = config.file_of(NODES_FILE, first)
+                registry = config.file_of(configs.NODES_FILE, first)
                 message = (
                     f"asks for {comparable_kind(value)}, but the property is {kind} at '{first}' "
                     f"in {registry}; ask for {kind}"
@@ -197,12 +185,11 @@ def _check_services(config: Config, reader: ConfigReader) -> None:
         if service.each or isinstance(service, ServiceDefinition):
             other = files.setdefault(name, file)
             if other != file:
-                reader.add_fault(
-                    file,
-                    where.rstrip("."),
+                message = (
                     f"'{name}' is defined in {other} too; choose another name, or define it once "
-                    f"in appdefs/{name}/service.yaml and use it in both",
+                    f"in appdefs/{name}/service.yaml and use it in both"
                 )
+                reader.add_fault(file, where.rstrip("."), message)
                 continue
         # releases of two services with one prefix could have the same name
         owner = prefixes.setdefault(service.prefix, (file, name))
@@ -218,8 +205,8 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
     for name, definition in config.definitions.items():
         file = f"appdefs/{name}/service.yaml"
         for cluster, node in definition.nodes.items():
-            reader.check_reference(file, f"nodes.{cluster}", cluster, CLUSTERS_FILE)
-            reader.check_reference(file, f"nodes.{cluster}", node, NODES_FILE)
+            reader.check_reference(file, f"nodes.{cluster}", cluster, configs.CLUSTERS_FILE)
+            reader.check_reference(file, f"nodes.{cluster}", node, configs.NODES_FILE)
             actual = config.nodes[node].cluster if node in config.nodes else cluster
             if actual != cluster:
                 message = f"'{node}' is in cluster '{actual}'; name a node of '{cluster}'"
@@ -243,18 +230,19 @@ def _check_uses(config: Config, reader: ConfigReader) -> None:
 def _check_versions(config: Config, reader: ConfigReader) -> None:
     for name, appdef in config.appdefs.items():
         # an invalid entry may be the missing one
-        is_unlisted = not reader.files_of(VERSIONS_FILE) or reader.is_missing(VERSIONS_FILE, name)
+        is_unlisted = not reader.files_of(configs.VERSIONS_FILE) or reader.is_missing(
+            configs.VERSIONS_FILE, name
+        )
         if appdef.versions != "refuse" and is_unlisted:
-            reader.add_fault(
-                f"appdefs/{name}/appdef.yaml",
-                "versions",
-                f"is {appdef.versions}, but {config.place_of(VERSIONS_FILE)} does not list the "
-                f"versions of '{name}'; add them there, or remove 'versions'",
+            message = (
+                f"is {appdef.versions}, but {config.place_of(configs.VERSIONS_FILE)} does not list "
+                f"the versions of '{name}'; add them there, or remove 'versions'"
             )
+            reader.add_fault(f"appdefs/{name}/appdef.yaml", "versions", message)
         if appdef.versions == "separate":
             _check_separate(name, config, reader)
     for name, listed in config.versions.items():
-        file, place = reader.place_of(VERSIONS_FILE, name)
+        file, place = reader.place_of(configs.VERSIONS_FILE, name)
         if name not in config.appdefs:
             # an appdef.yaml that exists but is invalid has faults of its own
             if f"appdefs/{name}/appdef.yaml" not in reader.files:
@@ -274,7 +262,7 @@ def _check_versions(config: Config, reader: ConfigReader) -> None:
                 if listed_chart is not None and listed_chart.at(wanted) is None:
                     sources = listed_chart.sources()
                     hint = suggestion(wanted, [source.version for source in sources])
-                    registry = config.file_of(CHARTS_FILE, chart)
+                    registry = config.file_of(configs.CHARTS_FILE, chart)
                     message = f"'{wanted}' is not a version of {chart} in {registry}{hint}"
                     reader.add_fault(file, f"{where}.charts.{chart}", message)
             for image in contents.images:
@@ -312,19 +300,18 @@ def _check_wire_types(config: Config, reader: ConfigReader) -> None:
         number = appdef.deployment_request.type
         other = seen.setdefault(number, appdef.name)
         if other != appdef.name:
+            message = f"{number} already names '{other}'; choose another number"
             reader.add_fault(
-                f"appdefs/{appdef.name}/appdef.yaml",
-                "deploymentRequest.type",
-                f"{number} already names '{other}'; choose another number",
+                f"appdefs/{appdef.name}/appdef.yaml", "deploymentRequest.type", message
             )
 
 
 def _check_overrides(config: Config, reader: ConfigReader) -> None:
     for override in config.overrides.values():
         for image in override.images or ():
-            reader.check_reference(override.path, f"images.{image}", image, IMAGES_FILE)
+            reader.check_reference(override.path, f"images.{image}", image, configs.IMAGES_FILE)
         if override.node is not None:
-            reader.check_reference(override.path, "node", override.node, NODES_FILE)
+            reader.check_reference(override.path, "node", override.node, configs.NODES_FILE)
         selected = [
             service
             for appdef, services in config.services.items()
@@ -343,12 +330,12 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
                 override.node in config.nodes
                 and override.node not in config.domain_of
                 and config.domains
-                and reader.is_complete(DOMAINS_FILE)
+                and reader.is_complete(configs.DOMAINS_FILE)
                 # a node that several domains match is in none, and has a fault of its own
                 and not any(matches(override.node, d.nodes) for d in config.domains.values())
             ):
                 message = f"'{override.node}' is not in any access domain; add it to one in "
-                message += config.place_of(DOMAINS_FILE)
+                message += config.place_of(configs.DOMAINS_FILE)
                 reader.add_fault(override.path, "node", message)
         if override.values and override.patches_clients():
             try:
@@ -359,10 +346,9 @@ def _check_overrides(config: Config, reader: ConfigReader) -> None:
         charts = {service.chart for service in selected} & {*config.charts}
         versions = {version for chart in charts for version in config.charts[chart].versions()}
         if override.version and versions and override.version not in versions:
-            reader.add_fault(
-                override.path,
-                "version",
+            message = (
                 f"'{override.version}' is not a version or channel that "
-                f"{config.place_of(CHARTS_FILE)} has for a selected chart"
-                f"{suggestion(override.version, versions)}",
+                f"{config.place_of(configs.CHARTS_FILE)} has for a selected chart"
+                f"{suggestion(override.version, versions)}"
             )
+            reader.add_fault(override.path, "version", message)

@@ -20,17 +20,8 @@ from pydantic import (
 from demandops.base import strict_yaml
 from demandops.base.naming import id_problem, message_type_problem, topic_problem
 from demandops.base.quoting import quoted
-from demandops.model.config.base_model import (
-    CamelModel,
-    DnsLabel,
-    FileModel,
-    Items,
-    Text,
-    Visible,
-    Word,
-    readable_by,
-    without,
-)
+from demandops.model.config import base_model
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
 
 # ---- properties of nodes: typed values, and the conditions of ``place`` on them ----
 #
@@ -183,7 +174,7 @@ SecretKey = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_][A-Za-z0-9_.
 
 _ENDPOINT = re.compile(r"(tcp|udp|ws)/[^\s/#?]+:\d{1,5}")
 # A Zenoh endpoint whose protocol needs no certificates, like `tcp/host:7447`
-Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), Visible]
+Endpoint = Annotated[str, StringConstraints(pattern=f"^{_ENDPOINT.pattern}$"), base_model.Visible]
 
 
 class Tls(CamelModel):
@@ -283,7 +274,7 @@ Quantity = Annotated[
         lambda value: str(value) if type(value) in (int, float) else value,
         json_schema_input_type=str | int | float,
     ),
-    readable_by(amount_of),
+    base_model.readable_by(amount_of),
 ]
 
 # A name of a resource: `cpu`, `memory`, `gpu`, `nvidia.com/gpu`
@@ -294,9 +285,9 @@ ResourceName = Annotated[
 # How much of each resource a node has, or a service requests
 Resources = dict[ResourceName, Quantity]
 
-NodeId = Annotated[str, without(id_problem)]
-Topic = Annotated[str, without(topic_problem)]
-MessageType = Annotated[str, without(message_type_problem)]
+NodeId = Annotated[str, base_model.without(id_problem)]
+Topic = Annotated[str, base_model.without(topic_problem)]
+MessageType = Annotated[str, base_model.without(message_type_problem)]
 
 # The label that selects a node by its id, as in the reference
 NODE_LABEL = "node_id"

@@ -77,20 +77,18 @@ def load(files: Mapping[str, str]) -> Config:
     reader = ConfigReader(files)
     repository = reader.read_file(ROOT_FILE, RepoSettings)
     if repository and repository.render_version > RENDER_VERSION:
-        reader.add_fault(
-            ROOT_FILE,
-            "renderVersion",
+        message = (
             f"is {repository.render_version}, but this generator renders version "
             f"{RENDER_VERSION}; write {RENDER_VERSION}, or update the generator if `demandops "
-            "upgrade` of a newer one wrote this",
+            "upgrade` of a newer one wrote this"
         )
+        reader.add_fault(ROOT_FILE, "renderVersion", message)
     if repository and getattr(repository, repository.gitops) is None:
-        reader.add_fault(
-            ROOT_FILE,
-            repository.gitops,
+        message = (
             f"is missing, but 'gitops' is {repository.gitops}; add it, with the 'url' from which "
-            "the clusters fetch this repo",
+            "the clusters fetch this repo"
         )
+        reader.add_fault(ROOT_FILE, repository.gitops, message)
     _refuse_unread(reader)
     nodes = reader.read_items(NODES_FILE, NodesFile, "nodes", Node, "id")
     domains = reader.read_items(DOMAINS_FILE, AccessDomainsFile, "domains", AccessDomain, "name")
@@ -156,12 +154,11 @@ def _refuse_unread(reader: ConfigReader) -> None:
             continue
         if collection_of(path) is None and not any(name.startswith(".") for name in names):
             stems = [PurePosixPath(file).stem for file in COLLECTIONS if file.startswith(folder)]
-            reader.add_fault(
-                path,
-                "",
+            message = (
                 f"is not read; only <name>.yaml and <name>/*.yaml in {folder}/ are read, where "
-                f"<name> is one of {', '.join(sorted(stems))}; rename the file, or remove it",
+                f"<name> is one of {', '.join(sorted(stems))}; rename the file, or remove it"
             )
+            reader.add_fault(path, "", message)
 
 
 def _read_definitions(
@@ -220,12 +217,11 @@ def _read_overrides(reader: ConfigReader) -> Mapping[str, Override]:
             continue
         stem = name.removesuffix(".yaml")
         if stem == name or not is_override_name(stem):
-            reader.add_fault(
-                path,
-                "",
+            message = (
                 "is not an override file; rename it to overrides/<name>.yaml, where <name> has up "
-                "to 63 lower-case letters, digits and '-' between them, or remove it",
+                "to 63 lower-case letters, digits and '-' between them, or remove it"
             )
+            reader.add_fault(path, "", message)
             continue
         file = reader.read_file(path, OverrideFile)
         if file is not None:
@@ -318,13 +314,12 @@ def _domains_of_nodes(
                 for name, pattern in sorted(matching.items())[:_MOST_DOMAINS]
             )
             file, place = reader.place_of(NODES_FILE, node)
-            reader.add_fault(
-                file,
-                f"{place}.id",
+            message = (
                 f"'{node}' is in the access domains {by}; narrow these patterns so that only one "
                 "domain matches the node, and list the other domains under 'accessDomains' of the "
-                "node",
+                "node"
             )
+            reader.add_fault(file, f"{place}.id", message)
         elif matching:
             owner[node] = domains[next(iter(matching))]
     return MappingProxyType(owner)

@@ -18,17 +18,8 @@ from pydantic import AfterValidator, Field, StringConstraints, ValidationError, 
 from demandops.base.errors import InvalidInput, sentences
 from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
-from demandops.model.config.base_model import (
-    DnsLabel,
-    FileModel,
-    FrozenModel,
-    Items,
-    Text,
-    Visible,
-    faults_of,
-    readable_by,
-    without,
-)
+from demandops.model.config import base_model
+from demandops.model.config.base_model import DnsLabel, FileModel, FrozenModel, Items, Text, Visible
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId
 from demandops.model.config.policy import matches
 from demandops.model.config.registry import ClientSettings, Image, ImagePin, MqttClientSettings
@@ -143,12 +134,17 @@ class OverrideFile(FileModel):
     kind: Literal["Override"]
     reason: Line
     owner: Annotated[
-        str, StringConstraints(max_length=100), without(id_problem), AfterValidator(_one_line)
+        str,
+        StringConstraints(max_length=100),
+        base_model.without(id_problem),
+        AfterValidator(_one_line),
     ]
     priority: Annotated[int, Field(ge=-1_000_000, le=1_000_000)] = 0
-    expires: Annotated[str, readable_by(parse_time)] | None = None
+    expires: Annotated[str, base_model.readable_by(parse_time)] | None = None
     select: Annotated[Items[Selector], AfterValidator(_not_empty)]
-    values: Annotated[dict[str, Any], Field(min_length=1), readable_by(_finite)] | None = None
+    values: (
+        Annotated[dict[str, Any], Field(min_length=1), base_model.readable_by(_finite)] | None
+    ) = None
     version: Annotated[str, StringConstraints(min_length=1, max_length=63), Visible] | None = None
     images: Annotated[dict[DnsLabel, ImagePin], Field(min_length=1)] | None = None
     replicas: Annotated[int, Field(ge=0, le=1000)] | None = None
@@ -283,7 +279,7 @@ def patched_settings(settings: Settings, patch: Mapping[str, Any], file: str) ->
         # one override may select clients of several types, of which only MQTT has further fields
         return settings.model_validate({k: v for k, v in data.items() if k not in of_mqtt - own})
     except ValidationError as error:
-        raise InvalidInput(faults_of(error, type(settings), file, ("values",))) from None
+        raise InvalidInput(base_model.faults_of(error, type(settings), file, ("values",))) from None
 
 
 def by_rank(overrides: Iterable[Override]) -> tuple[Override, ...]:

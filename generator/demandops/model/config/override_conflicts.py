@@ -10,7 +10,7 @@ import json
 import re
 from bisect import bisect_left, insort
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 
 from demandops.connections import connection_types
 from demandops.model.config.config import (
@@ -53,12 +53,11 @@ def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
     for override in by_rank(config.overrides[name] for name in rivals):
         for rival in by_rank(rivals[override.name].values())[:_MOST_SHOWN]:
             names = " and ".join(f"'{name}'" for name in contested_effects(rival, override))
-            reader.add_fault(
-                override.path,
-                "priority",
+            message = (
                 f"is {override.priority}, as in {rival.path}, and both overrides may set {names} "
-                "of the same release; change one of the priorities, or select different releases",
+                "of the same release; change one of the priorities, or select different releases"
             )
+            reader.add_fault(override.path, "priority", message)
 
 
 def _leaves(path: tuple[str, ...], patch: object) -> Iterator[tuple[tuple[str, ...], str]]:
@@ -171,22 +170,18 @@ def may_match_same_release(
         return False
     for name in _separating_fields(first, second, config, shares_clients):
         left, right = getattr(first, name), getattr(second, name)
-        if left and right and not _any_overlap(left, right):
+        if not (left and right):
+            continue
+        plain = [{text for text in side if not {*text} & {*"*?"}} for side in (left, right)]
+        # two texts without wildcards overlap only if they are equal, and lists of names may be long
+        if plain[0].isdisjoint(plain[1]) and not any(
+            patterns_overlap(pattern, other)
+            for pattern in left
+            for other in ({*right} - plain[1] if pattern in plain[0] else right)
+        ):
             return False
     left, right = first.labels or {}, second.labels or {}
     return all(left[key] == right[key] for key in left if key in right)
-
-
-def _any_overlap(left: Iterable[str], right: Iterable[str]) -> bool:
-    plain = [{text for text in side if not {*text} & {*"*?"}} for side in (left, right)]
-    if plain[0] & plain[1]:
-        return True
-    # two texts without wildcards overlap only if they are equal, and lists of names may be long
-    return any(
-        patterns_overlap(first, second)
-        for first in left
-        for second in ({*right} - plain[1] if first in plain[0] else right)
-    )
 
 
 def _selects_services(selector: Selector) -> bool:

@@ -16,22 +16,12 @@ from pydantic import BeforeValidator, Field, StringConstraints, model_validator
 
 from demandops.base.errors import suggestion
 from demandops.base.quoting import quoted
-from demandops.model.config.base_model import (
-    Approval,
-    CamelModel,
-    DnsLabel,
-    FileModel,
-    FrozenModel,
-    Items,
-    Positive,
-    Text,
-    readable_by,
-    seconds_of,
-)
+from demandops.model.config import base_model
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel, Items
 from demandops.model.config.inventory import Credentials, NodeId, RosDomainId
 
-Duration = Annotated[str, readable_by(seconds_of)]
-Patterns = Annotated[tuple[Text, ...], Field(strict=False, min_length=1)]
+Duration = Annotated[str, base_model.readable_by(base_model.seconds_of)]
+Patterns = Annotated[tuple[base_model.Text, ...], Field(strict=False, min_length=1)]
 
 
 def matches(name: str, patterns: tuple[str, ...]) -> bool:
@@ -57,8 +47,8 @@ class Rule(CamelModel):
     applications: Patterns = ("*",)
     nodes: Patterns = ("*",)
     brokers: Patterns = ("*",)
-    peers: Items[Text] = ()
-    approval: Approval | None = None
+    peers: Items[base_model.Text] = ()
+    approval: base_model.Approval | None = None
 
 
 class Quotas(CamelModel):
@@ -68,9 +58,9 @@ class Quotas(CamelModel):
     ``demands_per_minute`` limits the demands that one generator receives from a requester.
     """
 
-    claims_per_requester: Positive | None = None
-    services_per_node: Positive | None = None
-    demands_per_minute: Positive | None = None
+    claims_per_requester: base_model.Positive | None = None
+    services_per_node: base_model.Positive | None = None
+    demands_per_minute: base_model.Positive | None = None
 
 
 class LeasePolicy(CamelModel):
@@ -96,11 +86,15 @@ class LeasePolicy(CamelModel):
     def _consistent(self) -> LeasePolicy:
         for name in ("default", "longest"):
             value = getattr(self, name)
-            if value is not None and seconds_of(value) < 1:
+            if value is not None and base_model.seconds_of(value) < 1:
                 raise ValueError(f"{name} is zero; leave it out, or give a longer duration")
         if self.deployment_requests and self.default is None:
             raise ValueError("'deploymentRequests' needs a default lease; add 'default'")
-        if self.default and self.longest and seconds_of(self.default) > seconds_of(self.longest):
+        if (
+            self.default
+            and self.longest
+            and base_model.seconds_of(self.default) > base_model.seconds_of(self.longest)
+        ):
             message = f"'default' ({self.default}) is above 'longest' ({self.longest})"
             raise ValueError(f"{message}; lower 'default' or raise 'longest'")
         return self
@@ -189,12 +183,12 @@ class AccessDomain(CamelModel):
     name: DnsLabel
     namespace: DnsLabel
     service_account: DnsLabel = "demandops"
-    nodes: Items[Text] = ("*",)
+    nodes: Items[base_model.Text] = ("*",)
     rules: Items[Rule] = ()
     quotas: Quotas = Quotas()
     leases: LeasePolicy = LeasePolicy()
     network: Literal["open", "namespace"] = "open"
-    approval: Approval = "none"
+    approval: base_model.Approval = "none"
     when_full: Literal["refuse", "wait"] = "refuse"
     kinds: Items[KindByWord] | None = None
     pod_security: Literal["baseline", "host-network", "privileged"] = "host-network"

@@ -14,16 +14,8 @@ from typing import Annotated, Any, Literal
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from demandops.base.errors import sentences, suggestion
-from demandops.model.config.base_model import (
-    CamelModel,
-    DnsLabel,
-    FileModel,
-    FrozenModel,
-    Items,
-    Text,
-    Visible,
-    Word,
-)
+from demandops.model.config import base_model
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel, Visible
 from demandops.model.config.inventory import Rmw
 
 ChartVersion = Annotated[
@@ -69,7 +61,7 @@ class Chart(ChartSource):
     A demand may request a channel by name, or one of the versions.
     """
 
-    channels: dict[Word, ChartSource] = Field(default_factory=dict)
+    channels: dict[base_model.Word, ChartSource] = Field(default_factory=dict)
 
     @model_validator(mode="after")
     def _distinct(self) -> Chart:
@@ -186,7 +178,7 @@ class VersionList(CamelModel):
     """The versions of one application definition, its default version, and its channels."""
 
     default: ChartVersion
-    channels: dict[Word, ChartVersion] = Field(default_factory=dict)
+    channels: dict[base_model.Word, ChartVersion] = Field(default_factory=dict)
     versions: dict[ChartVersion, VersionContents]
 
     @model_validator(mode="after")
@@ -277,7 +269,9 @@ class ClientSettings(CamelModel):
     Kubernetes core/v1 Probe.
     """
 
-    env: Annotated[dict[_EnvName, Text], AfterValidator(_free)] = Field(default_factory=dict)
+    env: Annotated[dict[_EnvName, base_model.Text], AfterValidator(_free)] = Field(
+        default_factory=dict
+    )
     resources: Resources = Resources()
     host_network: bool | None = None
     startup_probe: dict[str, Any] = Field(default_factory=dict)
@@ -294,7 +288,7 @@ class MqttClientSettings(ClientSettings):
 
     launch_file: _LaunchFile = "standalone.launch.xml"
     rmw: Rmw | None = None
-    messages: Items[_Package] = ()
+    messages: base_model.Items[_Package] = ()
 
 
 class ClientsFile(FileModel):

@@ -8,16 +8,8 @@ from typing import Annotated, Literal
 from pydantic import StringConstraints, model_validator
 
 from demandops.base.quoting import quoted
-from demandops.model.config.base_model import (
-    CamelModel,
-    DnsLabel,
-    FileModel,
-    FrozenModel,
-    Items,
-    Positive,
-    Visible,
-    without,
-)
+from demandops.model.config import base_model
+from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, FrozenModel, Positive
 
 ROOT_FILE = "demandops.yaml"
 
@@ -45,7 +37,7 @@ def _git_url_problem(text: str) -> str:
     )
 
 
-GitUrl = Annotated[str, without(_git_url_problem), Visible]
+GitUrl = Annotated[str, base_model.without(_git_url_problem), base_model.Visible]
 
 
 class Flux(FrozenModel):
@@ -86,7 +78,7 @@ def _web_url_problem(text: str) -> str:
     )
 
 
-WebUrl = Annotated[str, without(_web_url_problem), Visible]
+WebUrl = Annotated[str, base_model.without(_web_url_problem), base_model.Visible]
 
 
 class Proposals(FrozenModel):
@@ -101,7 +93,9 @@ class Proposals(FrozenModel):
     forge: Literal["none", "gitlab", "github", "gitea"] = "none"
     url: WebUrl | None = None
     api: WebUrl | None = None
-    labels: Items[Annotated[str, StringConstraints(pattern=r"^[^\s,][^\n\r,]*$"), Visible]] = ()
+    labels: base_model.Items[
+        Annotated[str, StringConstraints(pattern=r"^[^\s,][^\n\r,]*$"), base_model.Visible]
+    ] = ()
 
     @model_validator(mode="after")
     def _complete(self) -> Proposals:

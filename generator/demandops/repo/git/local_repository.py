@@ -15,18 +15,10 @@ from pygit2 import Oid, Repository
 from demandops.base.errors import StateRepoError, Unsound
 from demandops.base.quoting import quoted
 from demandops.base.settings import MAIN_BRANCH
+from demandops.repo.git import repository as repositories
 from demandops.repo.git.objects import NewObjects, sync_folder
 from demandops.repo.git.remote_repository import HAS_PASSWORD, HAS_TOKEN, Notify, RemoteRepository
-from demandops.repo.git.repository import (
-    MAIN,
-    PushDenied,
-    StateRepository,
-    Unavailable,
-    disk_error,
-    git_environment,
-    missing_main,
-    unopened,
-)
+from demandops.repo.git.repository import PushDenied, StateRepository, Unavailable
 
 # ---- a bare repository on this disk ----
 
@@ -48,7 +40,7 @@ class LocalRepository(StateRepository):
         try:
             self.objects = Repository(str(path))
         except pygit2.GitError as error:
-            if reason := unopened(path, error):
+            if reason := repositories.unopened(path, error):
                 raise reason from None
             remedy = f"make one with `demandops init {path} --bare`"
             if any(path.iterdir()):  # `demandops init` would refuse this folder
@@ -62,7 +54,9 @@ class LocalRepository(StateRepository):
             self._require_usable(path)
             _ = self.objects[self.tip()].peel(pygit2.Commit).tree
         except (pygit2.GitError, KeyError, OSError) as error:
-            raise disk_error(error, self.address) or self._unreadable(str(error)) from None
+            raise repositories.disk_error(error, self.address) or self._unreadable(
+                str(error)
+            ) from None
 
     def _unreadable(self, what: str) -> StateRepoError:
         return StateRepoError(
@@ -75,7 +69,7 @@ class LocalRepository(StateRepository):
         checked = subprocess.run(
             ["git", "fsck", "--no-dangling", "--no-progress"],
             cwd=self.objects.path,
-            env=os.environ | git_environment(),
+            env=os.environ | repositories.git_environment(),
             capture_output=True,
             text=True,
             errors="replace",
@@ -116,12 +110,12 @@ class LocalRepository(StateRepository):
     def tip(self) -> Oid:
         main = self.objects.references.get(self.main_reference)
         if main is None:
-            raise missing_main(self.address)
+            raise repositories.missing_main(self.address)
         if not isinstance(main.target, Oid):
             raise StateRepoError(
                 f"the branch '{MAIN_BRANCH}' of {self.address} is only another name of "
                 f"{main.target}; make it a branch: git -C {self.address} update-ref --no-deref "
-                f"{MAIN} {main.target}"
+                f"{repositories.MAIN} {main.target}"
             )
         return main.target
 
@@ -131,12 +125,12 @@ class LocalRepository(StateRepository):
     def publish(self, expected: Oid, commit: Oid) -> bool:
         if self.tip() != expected:
             return False
-        reference = self.objects.references[MAIN]
+        reference = self.objects.references[repositories.MAIN]
         try:
             with self.new.packed(commit):
                 reference.set_target(commit, "demandops")
         except (pygit2.GitError, OSError) as error:
-            reason = disk_error(error, self.address)
+            reason = repositories.disk_error(error, self.address)
             if isinstance(reason, PushDenied) and self.tip() != expected:
                 return False  # even if the new tip is ``commit``: it may not be synced
             if reason is not None:
@@ -148,7 +142,7 @@ class LocalRepository(StateRepository):
         return True
 
     def write_anew(self, since: str) -> None:
-        branch = Path(self.objects.path) / MAIN
+        branch = Path(self.objects.path) / repositories.MAIN
         lock = branch.with_name(f"{branch.name}.lock")
         try:
             with self.new.packed_anew(self.tip(), since), lock.open("x") as file:
@@ -159,7 +153,7 @@ class LocalRepository(StateRepository):
                 sync_folder(branch.parent)
         except (pygit2.GitError, OSError) as error:
             self._break_stale_lock()
-            reason = disk_error(error, self.address)
+            reason = repositories.disk_error(error, self.address)
             # PushDenied would be wrong, because the commits are on main
             if not isinstance(reason, Unsound | Unavailable):
                 reason = Unavailable(str(reason or f"{self.address} cannot be written: {error}"))
@@ -167,7 +161,7 @@ class LocalRepository(StateRepository):
 
     def _break_stale_lock(self) -> None:
         # its age counts from when this process first saw it, by the monotonic clock
-        lock = Path(self.objects.path) / f"{MAIN}.lock"
+        lock = Path(self.objects.path) / f"{repositories.MAIN}.lock"
         try:
             status = lock.lstat()
         except FileNotFoundError:

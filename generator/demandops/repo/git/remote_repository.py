@@ -19,20 +19,9 @@ from pygit2 import Oid, Repository
 from demandops.base.errors import StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.settings import MAIN_BRANCH
+from demandops.repo.git import repository as repositories
 from demandops.repo.git.objects import NewObjects
-from demandops.repo.git.repository import (
-    MAIN,
-    TIMEOUT_S,
-    DiskFull,
-    FetchInterrupted,
-    PushDenied,
-    RemoteAway,
-    StateRepository,
-    Unavailable,
-    access_error,
-    git_environment,
-    missing_main,
-)
+from demandops.repo.git.repository import MAIN, DiskFull, FetchInterrupted, RemoteAway, Unavailable
 from demandops.repo.git.slow_git import SlowGit
 
 _REMOTE_MAIN = f"refs/remotes/origin/{MAIN_BRANCH}"
@@ -122,7 +111,7 @@ def without_secrets(text: str) -> str:
     return _USER.sub(r"\1", HAS_PASSWORD.sub(r"\1", text))
 
 
-class RemoteRepository(StateRepository):
+class RemoteRepository(repositories.StateRepository):
     """A state repo behind a URL, in a bare clone. Git runs with the user's configuration."""
 
     always_current = False
@@ -204,7 +193,10 @@ class RemoteRepository(StateRepository):
         partial.rename(self._folder)
 
     def _fetch(
-        self, repo: git.Repo, urgent: Callable[[], bool] = lambda: False, timeout: float = TIMEOUT_S
+        self,
+        repo: git.Repo,
+        urgent: Callable[[], bool] = lambda: False,
+        timeout: float = repositories.TIMEOUT_S,
     ) -> None:
         # The refspec is not in git's configuration. If it were, a push that outlives its generator
         # would move the reference.
@@ -221,7 +213,7 @@ class RemoteRepository(StateRepository):
             with self.new.packed(commit):
                 self.push(f"{commit}:{MAIN}", f"{MAIN}:{expected}")
         except (pygit2.GitError, OSError) as error:
-            raise access_error(error, f"the clone {self._folder}") from None
+            raise repositories.access_error(error, f"the clone {self._folder}") from None
         except git.GitCommandError as error:
             if _REMOTE_MOVED.search(str(error)):  # git sent nothing
                 return False
@@ -287,7 +279,7 @@ class RemoteRepository(StateRepository):
         else:
             is_final = bool(_NO_PERMISSION.search(_NO_FILE.sub("", text)))
         if is_final:
-            return PushDenied(f"{self.address} rejects the push: {reason}")
+            return repositories.PushDenied(f"{self.address} rejects the push: {reason}")
         return RemoteAway(f"{self.address} cannot be pushed to: {reason}")
 
     def _read_remote(
@@ -296,7 +288,7 @@ class RemoteRepository(StateRepository):
         command: Sequence[str],
         *references: str,
         urgent: Callable[[], bool] = lambda: False,
-        timeout: float = TIMEOUT_S,
+        timeout: float = repositories.TIMEOUT_S,
     ) -> str:
         command = (*command, "--quiet", "origin", *references)
         try:
@@ -304,7 +296,7 @@ class RemoteRepository(StateRepository):
         except git.GitCommandError as error:
             text = without_secrets(str(error.stderr))
         if "couldn't find remote ref" in text:
-            raise missing_main(self.address)
+            raise repositories.missing_main(self.address)
         if error_here := self._error_of_clone(text):
             raise error_here
         failed = "read" if command[0] == "ls-remote" else "fetched"
@@ -332,11 +324,11 @@ class RemoteRepository(StateRepository):
         repo: git.Repo,
         *command: str,
         urgent: Callable[[], bool] = lambda: False,
-        timeout: float = TIMEOUT_S,
+        timeout: float = repositories.TIMEOUT_S,
     ) -> tuple[str, str]:
         if self._aborted:
             raise RemoteAway(f"{self.address}: the connection was aborted")
-        with repo.git.custom_environment(**git_environment()):
+        with repo.git.custom_environment(**repositories.git_environment()):
             guard = repo.git.execute(  # keep the guard: its garbage collection ends the process
                 [repo.git.GIT_PYTHON_GIT_EXECUTABLE, *command],
                 as_process=True,

@@ -68,29 +68,24 @@ class Signer:
                 f"signing with {self.key} took more than {_TIMEOUT_S} s; check whether its agent "
                 "waits for a confirmation"
             ) from None
-        if done.returncode:
-            raise SigningFailed(_key_fault(self.key, done.stderr.decode("utf-8", "replace")))
-        return done.stdout.decode("ascii").rstrip("\n")
-
-
-def _key_fault(key: Path, output: str) -> str:
-    output = output.replace(str(key), "the key")  # the path may have any of the words below
-    if "UNPROTECTED PRIVATE KEY" in output or "bad permissions" in output:
-        return f"signing key {key} can be read by others; run: chmod 600 {key}"
-    if "Permission denied" in output:
-        return f"signing key {key} cannot be read; run as its owner, or name another key"
-    if "passphrase" in output:
-        return (
-            f"signing key {key} has a passphrase; run `ssh-add {key}` and name {key}.pub, so that "
-            "the agent signs"
-        )
-    last = next((line for line in reversed(output.strip().splitlines()) if line.strip()), "")
-    if "agent" in output or "No private key found" in output:
-        return (
-            f"signing key {key} is public, and no agent signs for it ({last.strip()}); run "
-            "`ssh-add` with the private key, and set SSH_AUTH_SOCK for this program too"
-        )
-    return f"signing key {key} cannot sign: {last.strip()}; name a private SSH key"
+        if not done.returncode:
+            return done.stdout.decode("ascii").rstrip("\n")
+        output = done.stderr.decode("utf-8", "replace")
+        output = output.replace(str(self.key), "the key")  # its path may have any of these words
+        last = next((line for line in reversed(output.strip().splitlines()) if line.strip()), "")
+        if "UNPROTECTED PRIVATE KEY" in output or "bad permissions" in output:
+            why = f"can be read by others; run: chmod 600 {self.key}"
+        elif "Permission denied" in output:
+            why = "cannot be read; run as its owner, or name another key"
+        elif "passphrase" in output:
+            why = f"has a passphrase; run `ssh-add {self.key}` and name {self.key}.pub, so that "
+            why += "the agent signs"
+        elif "agent" in output or "No private key found" in output:
+            why = f"is public, and no agent signs for it ({last.strip()}); run `ssh-add` with the "
+            why += "private key, and set SSH_AUTH_SOCK for this program too"
+        else:
+            why = f"cannot sign: {last.strip()}; name a private SSH key"
+        raise SigningFailed(f"signing key {self.key} {why}")
 
 
 def create_commit(

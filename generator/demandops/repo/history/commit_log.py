@@ -66,7 +66,10 @@ def parse(message: str) -> MessageText:
             trailers.clear()  # a paragraph with any other line is text for people
             break
         if _QUOTED.fullmatch(value):
-            value = _ESCAPES.sub(_unescaped, value[1:-1])
+            value = _ESCAPES.sub(
+                lambda m: m[0][1] if m[0][1] in '\\"' else m[0].encode().decode("unicode_escape"),
+                value[1:-1],
+            )
         trailers.setdefault(key, []).append(value)
     return MessageText(lines[0], next(whys, ""), trailers)
 
@@ -77,11 +80,6 @@ def _encoded(key: str, value: str) -> str:
         return value
     text = escaped(value.replace("\\", r"\\").replace('"', r"\""))
     return f'"{_EDGES.sub(_SPACE, harmless(text))}"'
-
-
-def _unescaped(escape: re.Match[str]) -> str:
-    letter = escape[0][1]
-    return letter if letter in '\\"' else escape[0].encode().decode("unicode_escape")
 
 
 # ---- the history: commits with their trailers, and which commits changed a path ----

@@ -26,11 +26,7 @@ from demandops.model.ledger.records import Instance, Steps
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log
 from demandops.repo.load import last_valid_config, ledger_files
-from demandops.repo.load.last_valid_config import (
-    ConfigSource,
-    LastValidConfig,
-    load_last_valid_config,
-)
+from demandops.repo.load.last_valid_config import ConfigSource, LastValidConfig
 from demandops.templating.evaluator import DEMAND_S, EVALUATE, processor_time
 
 Progress = Callable[[int, int], None]
@@ -210,7 +206,7 @@ def _last_valid_config(repo: Repository, before: Snapshot, to: Oid) -> LastValid
     )
     result = _judged.get(key)
     if result is None:
-        result = load_last_valid_config(
+        result = last_valid_config.load_last_valid_config(
             repo,
             before.config_source,
             before.last_valid_commit,

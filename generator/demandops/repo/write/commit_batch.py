@@ -23,12 +23,7 @@ from demandops.decide.booking import Drain
 from demandops.decide.changeset import Change, Changeset, ReleaseChange
 from demandops.decide.decision import Decision, changeset_of_edit, decide
 from demandops.decide.decision import scale_down as scaled_down
-from demandops.decide.placement.relocation import (
-    changed_override_files,
-    end_override,
-    update_claims,
-    update_ledger,
-)
+from demandops.decide.placement import relocation
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import NODES_FILE
 from demandops.model.config.override import Override
@@ -151,7 +146,7 @@ class CommitBatch:
         if not files:
             return
         overrides = [
-            *changed_override_files(before.state, state),
+            *relocation.changed_override_files(before.state, state),
             *change.overrides,
             *commit_message.keep_override_paths(keys),
         ]
@@ -181,7 +176,7 @@ class CommitBatch:
             try:
                 marked = last_valid_config.end_markers_at(self._tree)
                 state, subjects = accepted.snapshot.state, accepted.subjects
-                applied = update_ledger(before.state, state, subjects, marked, now)
+                applied = relocation.update_ledger(before.state, state, subjects, marked, now)
                 state = replace(state, ledger=applied.ledger)
                 change = self.render_all(state, applied.files)
             except InvalidInput as error:
@@ -189,7 +184,7 @@ class CommitBatch:
         if change is None:
             # with the configuration as before, only the subjects that people changed are rendered
             state, old, subjects = accepted.snapshot.state, before.state.ledger, accepted.subjects
-            applied = update_claims(old, state, subjects, now)
+            applied = relocation.update_claims(old, state, subjects, now)
             touched = claim_changes(state.ledger, applied.ledger, applied.keys)
             state = state.with_ledger(applied.ledger, touched)
             subjects = tuple(dict.fromkeys((*subjects, *(edit.key.subject for edit in touched))))
@@ -210,7 +205,7 @@ class CommitBatch:
 
     def end_override(self, override: Override, now: datetime) -> None:
         # InvalidInput is raised if the state without the override cannot be planned or rendered
-        applied = end_override(self.head.state, override, now)
+        applied = relocation.end_override(self.head.state, override, now)
         state = replace(self.head.state, ledger=applied.ledger)
         change = self.render_all(state, applied.files)
         more = state_in_effect.trailers_of(self.head)

@@ -19,7 +19,7 @@ from pathlib import Path
 from demandops.base.errors import Fault, fault
 from demandops.base.quoting import quoted
 from demandops.repo.git import child_processes
-from demandops.repo.pull_request import confined
+from demandops.repo.merge_check import confined
 
 # The environment variable that names the program, instead of ``helm`` on ``PATH``.
 HELM_BIN = "HELM_BIN"

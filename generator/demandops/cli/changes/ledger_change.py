@@ -14,11 +14,11 @@ import click
 
 from demandops.base.errors import Fault, InvalidInput, Refused
 from demandops.base.runtime import REAL
-from demandops.cli.actions import person_change
+from demandops.cli.changes import person_change
 from demandops.cli.json_output import Json, claim_data, faults_of, output_option, show
 from demandops.cli.output import busy, console, errors, progress
+from demandops.cli.queries.diff import release_lines
 from demandops.cli.target import dry_run_option, names_of, signing_option, writable_repo_option
-from demandops.cli.views.diff import release_lines
 from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision, decide
 from demandops.model.config.config import CONFIG_ROOTS

@@ -14,9 +14,9 @@ from demandops.base import settings
 from demandops.base.errors import StateRepoError, fault
 from demandops.base.runtime import REAL
 from demandops.cli import target
+from demandops.cli.authoring import schema
 from demandops.cli.json_output import Json, output_option, show
 from demandops.cli.output import Progress, busy, errors, progress
-from demandops.cli.repo import schema
 from demandops.render.gitops import bootstrap_path, domains_by_cluster
 from demandops.repo import new_repo, reader
 from demandops.repo import upgrade as upgrading

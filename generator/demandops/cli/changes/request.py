@@ -21,8 +21,8 @@ from demandops.base.errors import (
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
-from demandops.cli.actions import ledger_change
-from demandops.cli.actions.ledger_change import started_generator
+from demandops.cli.changes import ledger_change
+from demandops.cli.changes.ledger_change import started_generator
 from demandops.cli.json_output import Json, faults_of, output_option, print_json
 from demandops.cli.output import console, errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option

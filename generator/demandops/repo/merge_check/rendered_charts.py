@@ -37,7 +37,7 @@ from demandops.model.config.policy import matches
 from demandops.model.release import ServiceRelease
 from demandops.render.gitops import path_of
 from demandops.render.manifests import values_of
-from demandops.repo.pull_request.helm import HELM_BIN, Helm, Report
+from demandops.repo.merge_check.helm import HELM_BIN, Helm, Report
 from demandops.templating import charts
 from demandops.templating.values import SchemaTask
 

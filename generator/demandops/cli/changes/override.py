@@ -13,10 +13,10 @@ from demandops.base.naming import id_problem
 from demandops.base.quoting import quoted
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import read_input
-from demandops.cli.actions import person_change
-from demandops.cli.actions.person_change import Edit, EditOptions, selector, writable
+from demandops.cli.authoring.scaffold import document
+from demandops.cli.changes import person_change
+from demandops.cli.changes.person_change import Edit, EditOptions, selector, writable
 from demandops.cli.output import errors
-from demandops.cli.repo.scaffold import document
 from demandops.cli.target import names_of
 from demandops.model.config.base_model import seconds_of
 from demandops.model.config.load import is_override_name

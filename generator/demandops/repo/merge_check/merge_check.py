@@ -34,9 +34,9 @@ from demandops.model.ledger.ledger import Ledger, World, changes_on
 from demandops.render.gitops import BOOTSTRAP_ROOT, path_of
 from demandops.repo.git import tree as trees
 from demandops.repo.load import ledger_files
-from demandops.repo.pull_request import edited_checkout, rendered_charts
-from demandops.repo.pull_request.edited_checkout import Base, author_of, base_of, files_of
-from demandops.repo.pull_request.rendered_charts import RenderedCharts
+from demandops.repo.merge_check import edited_checkout, rendered_charts
+from demandops.repo.merge_check.edited_checkout import Base, author_of, base_of, files_of
+from demandops.repo.merge_check.rendered_charts import RenderedCharts
 from demandops.templating import charts
 from demandops.templating.evaluator import EVALUATE
 from demandops.views import release_causes

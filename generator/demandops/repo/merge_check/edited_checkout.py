@@ -37,7 +37,6 @@ from demandops.repo.load import state_in_effect
 # where it can, and a person has to write only the reason into it.
 
 _VALUES = (("spec", "values"), ("spec", "source", "helm", "valuesObject"))  # Flux, Argo CD
-_IMAGE_KEYS = {"repository", "tag", "digest"}
 _REFERENCE = re.compile(
     r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:[0-9a-f]{64}))?"
 )
@@ -125,7 +124,7 @@ def _merge_patch(
             inner = _merge_patch(was, value, names, pins)
             pin = {part: str(text) for part, text in inner.items() if text}
             name = names.get(str(was.get("repository")))
-            if name and pin and inner.keys() <= _IMAGE_KEYS:
+            if name and pin and inner.keys() <= {"repository", "tag", "digest"}:
                 pins[name] = pin
             elif inner:
                 patch[key] = inner
@@ -239,17 +238,24 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         return None
     with reading(str(folder), repo):
         target = revision or next((name for name in _DEFAULTS if name in repo.references), "")
+        head = repo.head.peel(Commit)
         try:
-            head = repo.head.peel(Commit).id
-            tip = revisions.resolve(repo, head, target, REAL.now()) if target else None
-        except StateRepoError:
+            tip = revisions.resolve(repo, head.id, target, REAL.now()) if target else None
+            common = repo.merge_base(head.id, tip.id) if tip is not None else None
+        except (StateRepoError, pygit2.GitError, KeyError):
             if repo.is_shallow:
                 raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
             raise
-        commit = _started_from(repo, target, tip)
+        if common is None and repo.is_shallow:
+            raise StateRepoError(_SHALLOW)
+        if common is None and target:
+            raise StateRepoError(
+                f"HEAD and {target} have no commit in common; name the merge target with --base"
+            )
+        commit = head if common is None else trees.commit_of(repo, common)
         base = Base(str(commit.id), trees.texts(commit.tree, _ROOTS), None, False)
         if tip is not None:
-            _, newer = repo.ahead_behind(head, tip.id)
+            _, newer = repo.ahead_behind(head.id, tip.id)
             merged = trees.texts(tip.tree, GENERATED_ROOTS) if newer else {}
             name = target.removeprefix("refs/remotes/").removeprefix("refs/heads/")
             base = replace(base, target=name, newer=newer, merged=merged)
@@ -258,25 +264,6 @@ def base_of(folder: Path, revision: str | None) -> Base | None:
         except (InvalidInput, StateRepoError):
             return base
         return replace(base, state=snapshot.state, valid=not snapshot.problems)
-
-
-def _started_from(repo: Repository, target: str, tip: Commit | None) -> Commit:
-    head = repo.head.peel(Commit)
-    try:
-        common = repo.merge_base(head.id, tip.id) if tip is not None else None
-    except (pygit2.GitError, KeyError):
-        if repo.is_shallow:
-            raise StateRepoError(f"{quoted(target)}: {_SHALLOW}") from None
-        raise
-    if common is not None:
-        return trees.commit_of(repo, common)
-    if repo.is_shallow:
-        raise StateRepoError(_SHALLOW)
-    if not target:
-        return head
-    raise StateRepoError(
-        f"HEAD and {target} have no commit in common; name the merge target with --base"
-    )
 
 
 def author_of(folder: Path) -> str:

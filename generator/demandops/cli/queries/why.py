@@ -14,9 +14,9 @@ from demandops.base.runtime import REAL
 from demandops.cli import json_output
 from demandops.cli.json_output import Json, commit_data, override_data, release_data, time_text
 from demandops.cli.output import at_option, busy
+from demandops.cli.queries.diff import loaded
+from demandops.cli.queries.get import effect_words
 from demandops.cli.target import names_of, state_repo_option
-from demandops.cli.views.diff import loaded
-from demandops.cli.views.get import effect_words
 from demandops.decide.planning.overrides import suspended_by, without_suspended
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.base_model import duration_text

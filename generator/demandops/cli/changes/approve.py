@@ -9,12 +9,12 @@ import click
 from demandops.base.errors import InvalidInput, suggestion
 from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
-from demandops.cli.actions import person_change
-from demandops.cli.actions.person_change import warned_if_unnamed
+from demandops.cli.changes import person_change
+from demandops.cli.changes.person_change import warned_if_unnamed
 from demandops.cli.json_output import output_option, show
 from demandops.cli.output import errors
+from demandops.cli.queries.diff import differences, entry_lines, release_lines
 from demandops.cli.target import names_of, signing_option, writable_repo_option
-from demandops.cli.views.diff import differences, entry_lines, release_lines
 from demandops.repo.reader import Reader
 from demandops.repo.write import person_commit
 from demandops.repo.write.person_commit import CommitDetails

@@ -142,7 +142,7 @@ class WaitingTurns:
 # ---- all of this work, in its order ----
 
 
-class OwnWork:
+class Agenda:
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._override_expiry = OverrideExpiry()

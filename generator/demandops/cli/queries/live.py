@@ -17,11 +17,11 @@ from demandops.base.quoting import one_line
 from demandops.base.runtime import REAL
 from demandops.cli.json_output import commit_data
 from demandops.cli.output import errors, painted, progress, read_by
+from demandops.cli.queries.get import KINDS, Source
+from demandops.cli.queries.log import log_table
+from demandops.cli.queries.status import Status, releases_table
 from demandops.cli.table import Table
 from demandops.cli.target import clusters_option, state_repo_option
-from demandops.cli.views.get import KINDS, Source
-from demandops.cli.views.log import log_table
-from demandops.cli.views.status import Status, releases_table
 from demandops.cluster import clusters_file
 from demandops.repo import reader
 from demandops.repo.reader import Reader

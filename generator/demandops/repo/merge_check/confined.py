@@ -20,8 +20,8 @@ _LIMITS = {resource.RLIMIT_AS: MEMORY, resource.RLIMIT_FSIZE: 64 << 20, resource
 _NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
 
 
-def _confine(seconds: int) -> None:
-    for limit, most in (_LIMITS | {resource.RLIMIT_CPU: seconds}).items():
+if __name__ == "__main__":
+    for limit, most in (_LIMITS | {resource.RLIMIT_CPU: int(sys.argv[1])}).items():
         _, hard = resource.getrlimit(limit)
         allowed = most if hard == resource.RLIM_INFINITY else min(most, hard)
         with suppress(ValueError, OSError):
@@ -31,10 +31,6 @@ def _confine(seconds: int) -> None:
     # kernels and containers allow neither; then the program's own settings must do.
     if unshare and unshare(_NEW_USER | _NEW_NETWORK):
         unshare(_NEW_NETWORK)
-
-
-if __name__ == "__main__":
-    _confine(int(sys.argv[1]))
     try:
         os.execv(sys.argv[2], sys.argv[2:])  # noqa: S606 - no shell is wanted
     except OSError as error:

@@ -11,18 +11,18 @@ import click
 
 from demandops.base.errors import InvalidInput, StateRepoError
 from demandops.base.settings import data_folder
-from demandops.cli.actions.override import override_text
+from demandops.cli.authoring import scaffold
+from demandops.cli.authoring.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
+from demandops.cli.changes.override import override_text
 from demandops.cli.json_output import Command, output_option, show
 from demandops.cli.output import busy
-from demandops.cli.repo import scaffold
-from demandops.cli.repo.scaffold import LIBRARY_FOLDER, ApplicationPlan, ServicePlan
 from demandops.decide.state import State, try_configuration
 from demandops.model.config.config import CONFIG_ROOTS, DOMAINS_FILE, Config
 from demandops.model.config.load import load
 from demandops.model.config.registry import Image
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo import new_repo
-from demandops.repo.pull_request import edited_checkout
+from demandops.repo.merge_check import edited_checkout
 from demandops.templating.evaluator import EVALUATE
 
 _IMAGE = re.compile(r"(?P<repository>.+?)(?::(?P<tag>[^:/@]+))?(?:@(?P<digest>sha256:.*))?")
