@@ -22,13 +22,13 @@ from demandops.cluster.rollouts import RolloutWatcher
 from demandops.repo.reader import Reader
 from demandops.serve.generator import Generator
 from demandops.serve.http_server import PushWebhook
-from demandops.serve.timing.timers import DEFAULT_INTERVAL, parse_interval
+from demandops.serve.timing.pauses_and_limits import DEFAULT_INTERVAL, parse_interval
 from demandops.web.follower import Follower
 from demandops.web.server import WebServer
 from rclpy.logging import get_logger
 
 from demandops_ros import node_parameters, ros_process
-from demandops_ros.node import DemandNode
+from demandops_ros.demand_node import DemandNode
 
 _TASK_S = 5.0
 

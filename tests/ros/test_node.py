@@ -26,7 +26,7 @@ from demandops.cluster.health import Health
 from demandops.serve.queue import Receipt
 from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.actions import DemandAdapter
-from demandops_ros.node import DemandNode
+from demandops_ros.demand_node import DemandNode
 from demandops_ros.ros_process import RosLogHandler
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_action_status_default

@@ -10,7 +10,7 @@ from demandops.base.errors import Fault, Refused, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection
-from demandops.decide.restoration import Restoration, restore
+from demandops.decide.rollback import Restoration, restore
 from demandops.model.demand.claim import (
     Application,
     Claim,

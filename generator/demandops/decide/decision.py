@@ -16,7 +16,7 @@ from typing import Literal
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.naming import Subject
-from demandops.decide import changeset, restoration, warnings
+from demandops.decide import changeset, rollback, warnings
 from demandops.decide.admission import admission, admitted_request, permission
 from demandops.decide.admission.admitted_request import Checkpoint, Throttle, admit, admitted, paced
 from demandops.decide.booking import Drain, apply
@@ -28,7 +28,7 @@ from demandops.decide.planning.flows import flows, without_idle_deliveries
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.planner import is_bridged
 from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, keys_of_claims
-from demandops.decide.restoration import Restoration
+from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
 from demandops.model.config.config import Config
 from demandops.model.config.override import format_time
@@ -225,7 +225,7 @@ def _decided(
         request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
     if isinstance(request, Restoration):
         request = relocation.with_restored_moves(request, state)
-        faults = list(restoration.faults(request, state))
+        faults = list(rollback.faults(request, state))
         if faults:
             raise Refused(faults)
     on_stage("admitted")
@@ -415,7 +415,7 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
             and {*claim.requesters} <= {*old.requesters}
         ):
             continue
-        wanted, config = restoration.request_for(claim), after.config
+        wanted, config = rollback.request_for(claim), after.config
         malformed = list(admission.faults(wanted, config))
         allowed = chain(
             permission.faults(wanted, config),

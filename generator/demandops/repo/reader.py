@@ -16,7 +16,7 @@ from demandops.base.errors import Fault, InvalidInput, StateRepoError
 from demandops.base.runtime import REAL
 from demandops.base.strict_yaml import FieldLines, with_lines
 from demandops.decide.changeset import FileReader
-from demandops.decide.restoration import Restoration
+from demandops.decide.rollback import Restoration
 from demandops.decide.state import rendered_files
 from demandops.model.config.config import Config
 from demandops.repo import verification

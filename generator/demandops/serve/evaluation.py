@@ -9,7 +9,7 @@ from typing import Any
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, Withdrawn, fault, internal
 from demandops.base.settings import API_VERSION
 from demandops.decide.decision import Decision, Outcome, decide
-from demandops.decide.restoration import Restoration
+from demandops.decide.rollback import Restoration
 from demandops.model.demand.demand_request import Decommission
 from demandops.repo.git.repository import StateRepository, disk_error
 from demandops.repo.git.signing import SigningFailed
@@ -21,7 +21,7 @@ from demandops.serve.approvals.approvals import Approvals, Result
 from demandops.serve.approvals.proposal import is_release
 from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.serve.queue import Receipt, Ticket
-from demandops.serve.timing.timers import RateLimit, within
+from demandops.serve.timing.pauses_and_limits import RateLimit, within
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 # ---- a rollback as a goal: plain data that passes queue and journal like a demand ----

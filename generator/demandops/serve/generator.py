@@ -24,7 +24,7 @@ from demandops.repo.write.journal import Slot
 from demandops.serve.approvals.approvals import Approvals
 from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.queue import Listener, Ticket
-from demandops.serve.timing.timers import Heartbeat
+from demandops.serve.timing.pauses_and_limits import Heartbeat
 from demandops.serve.worker import RemoteStatus, Worker
 
 log = logging.getLogger("demandops")

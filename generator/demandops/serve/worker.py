@@ -26,10 +26,10 @@ from demandops.serve.approvals.approvals import Approvals, Result
 from demandops.serve.demand_lifecycle import Demands
 from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Ticket
-from demandops.serve.timing import timers
+from demandops.serve.timing import pauses_and_limits
 from demandops.serve.timing.agenda import Agenda
 from demandops.serve.timing.expiry import LONGEST_WAIT_S, LeaseExpiry
-from demandops.serve.timing.timers import LONGEST_EVALUATION_S, Backoff, PollTimer
+from demandops.serve.timing.pauses_and_limits import LONGEST_EVALUATION_S, Backoff, PollTimer
 from demandops.templating.evaluator import DEMAND_S, processor_time
 
 # ---- whether the remote can be reached, for logs and diagnostics ----
@@ -104,7 +104,7 @@ class Worker:
         demands: Demands,
         approvals: Approvals,
         fetch_interval: float,
-        heartbeat: timers.Heartbeat,
+        heartbeat: pauses_and_limits.Heartbeat,
     ) -> None:
         self.snapshot = snapshot
         self.listeners: list[Callable[[Config], None]] = []
@@ -117,13 +117,17 @@ class Worker:
         self._lease_expiry = LeaseExpiry(repository.runtime)
         self._agenda = Agenda(repository.runtime)
         self._ahead = ReadAhead()
-        self._batch_limit = timers.LIMIT_LOCAL if repository.always_current else timers.LIMIT_REMOTE
+        self._batch_limit = (
+            pauses_and_limits.LIMIT_LOCAL
+            if repository.always_current
+            else pauses_and_limits.LIMIT_REMOTE
+        )
         self._must_fetch = self._tip_is_fresh = False
         self._packs_since_tidy = 0
         self._logged: list[errors.Fault] = []
         self._warned_of_signers = False
         self._ends_soon = self._runtime.event()
-        self._rest = timers.Rest(repository.runtime)
+        self._rest = pauses_and_limits.Rest(repository.runtime)
         self._warn_if_unsigned()
 
     # ---- from any thread ----
@@ -279,7 +283,7 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
-            if number and (is_late or timers.may_take_long(ticket.goal)):
+            if number and (is_late or pauses_and_limits.may_take_long(ticket.goal)):
                 part, left = part[:number], part[number:] + left
                 break
             self._approvals.withdraw_released(results, ticket, commits.head.state)

@@ -29,9 +29,9 @@ from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from demandops_ros import ros_process
 from demandops_ros.actions import DemandError, GoalSender
 from demandops_ros.client import DemandClient
+from demandops_ros.demand_node import LATCHED, Diagnostics
 from demandops_ros.detector import detect_command
 from demandops_ros.messages import fill_message
-from demandops_ros.node import LATCHED, Diagnostics
 
 log = logging.getLogger("demandops")
 

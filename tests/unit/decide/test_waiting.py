@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.decide.restoration import Restoration
+from demandops.decide.rollback import Restoration
 from demandops.model.demand.demand_request import Decommission
 from demandops.model.ledger import records
 from demandops.model.ledger.records import in_turn

@@ -11,7 +11,7 @@ from typing import Any
 import yaml
 from demandops.decide.decision import faults_of_edit
 from demandops.decide.planning.flows import with_booked_topics_marked
-from demandops.decide.restoration import Restoration
+from demandops.decide.rollback import Restoration
 from demandops.model.demand.claim import Claim
 from demandops.model.ledger.claim_file import path_of
 from demandops.model.ledger.ledger import ClaimChange

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from demandops.decide.changeset import trial_releases
-from demandops.repo.merge_check import confined
+from demandops.repo.merge_check import confined_process
 from demandops.repo.merge_check import helm as helm_runs
 from demandops.repo.merge_check.helm import (
     HELM_BIN,
@@ -28,7 +28,15 @@ from tests.kit.memory import MemoryRepo
 
 
 def confine(code: str, *arguments: str, seconds: int = 60) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-IS", confined.__file__, str(seconds), sys.executable, "-c", code]
+    command = [
+        sys.executable,
+        "-IS",
+        confined_process.__file__,
+        str(seconds),
+        sys.executable,
+        "-c",
+        code,
+    ]
     return subprocess.run([*command, *arguments], capture_output=True, text=True, check=False)
 
 
@@ -55,7 +63,7 @@ def test_it_has_only_so_much(code: str, tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_program_that_cannot_run_is_told() -> None:
-    command = [sys.executable, "-IS", confined.__file__, "1", "/nowhere/helm"]
+    command = [sys.executable, "-IS", confined_process.__file__, "1", "/nowhere/helm"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.stderr == "Error: /nowhere/helm cannot be run: No such file or directory\n"
 

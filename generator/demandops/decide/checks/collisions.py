@@ -18,7 +18,7 @@ from demandops.decide.planning import release_keys
 from demandops.decide.planning.flows import flows, outputs, usual_topic
 from demandops.decide.planning.planner import service_name
 from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_of, keys_of_claims
-from demandops.decide.restoration import request_for
+from demandops.decide.rollback import request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.demand.claim import Application, Claim, ClaimKey

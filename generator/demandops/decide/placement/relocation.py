@@ -23,7 +23,7 @@ from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning import overrides
 from demandops.decide.planning.flows import Flow, connection_for, flows
 from demandops.decide.planning.release_keys import affected_keys
-from demandops.decide.restoration import Restoration, request_for
+from demandops.decide.rollback import Restoration, request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.override import Override, format_time
 from demandops.model.demand.claim import (

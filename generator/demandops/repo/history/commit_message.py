@@ -22,7 +22,7 @@ from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.decide.booking import Drain
 from demandops.decide.changeset import Changeset, ReleaseChange
 from demandops.decide.decision import Decision
-from demandops.decide.restoration import Restoration
+from demandops.decide.rollback import Restoration
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.model.demand.claim import OVERRIDE_PREFIX, ClaimKey

@@ -11,7 +11,7 @@ from pygit2 import Oid, Repository, Tree
 from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.naming import Subject
-from demandops.decide.restoration import Restoration
+from demandops.decide.rollback import Restoration
 from demandops.model.demand.claim import Claim, ClaimKey, Lease
 from demandops.model.ledger import claim_file
 from demandops.model.ledger.ledger import ClaimChange, Ledger

@@ -19,7 +19,7 @@ from pathlib import Path
 from demandops.base.errors import Fault, fault
 from demandops.base.quoting import quoted
 from demandops.repo.git import child_processes
-from demandops.repo.merge_check import confined
+from demandops.repo.merge_check import confined_process
 
 # The environment variable that names the program, instead of ``helm`` on ``PATH``.
 HELM_BIN = "HELM_BIN"
@@ -90,7 +90,13 @@ class Helm:
             "HELM_PLUGINS": str(home / "plugins"),
             **child_processes.mark(),
         }
-        command = [sys.executable, "-IS", confined.__file__, str(_CPU_SECONDS), self.program]
+        command = [
+            sys.executable,
+            "-IS",
+            confined_process.__file__,
+            str(_CPU_SECONDS),
+            self.program,
+        ]
         # files, because a pipe would keep in memory whatever a hostile chart prints
         files = home / "out", home / "err"
         with files[0].open("wb") as out, files[1].open("wb") as err:
@@ -108,7 +114,7 @@ class Helm:
             except subprocess.TimeoutExpired:
                 code = -1
         if code not in (0, 1):  # a signal, or 2 from Go, for example if it gets no memory
-            limits = f"{_CPU_SECONDS} s or {confined.MEMORY >> 30} GiB"
+            limits = f"{_CPU_SECONDS} s or {confined_process.MEMORY >> 30} GiB"
             return -1, "", f"Error: helm crashed, or took more than {limits}"
         if files[0].stat().st_size > _MOST_OUTPUT:
             return -1, "", f"Error: helm printed more than {_MOST_OUTPUT >> 20} MiB"

@@ -17,7 +17,7 @@ from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import in_turn
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.timing.expiry import RETRY, OverrideExpiry, ScaleDown
-from demandops.serve.timing.timers import within
+from demandops.serve.timing.pauses_and_limits import within
 
 # ---- drained nodes: placed applications and services move off them ----
 #

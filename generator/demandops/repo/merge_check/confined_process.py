@@ -1,6 +1,6 @@
 """Runs a program that must not reach the network, and that ends.
 
-Call it as ``confined.py SECONDS PROGRAM ARG…``; the seconds are those of processors.
+Call it as ``confined_process.py SECONDS PROGRAM ARG…``; the seconds are those of processors.
 
 A process of its own, without site packages, because limits that a fork sets in a program with
 threads may block it.

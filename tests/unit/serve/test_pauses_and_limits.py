@@ -16,7 +16,7 @@ from demandops.model.demand.claim import Application, Claim, Lease
 from demandops.model.demand.demand_request import Demanded, Join
 from demandops.model.ledger.ledger import Ledger
 from demandops.serve.timing.expiry import LeaseExpiry
-from demandops.serve.timing.timers import (
+from demandops.serve.timing.pauses_and_limits import (
     FIRST_PAUSE_S,
     LONGEST_AWAY_S,
     LONGEST_TURN_S,

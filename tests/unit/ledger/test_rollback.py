@@ -10,7 +10,7 @@ from random import Random
 import pytest
 from demandops.base.errors import Fault, Refused
 from demandops.decide.decision import Decision, decide
-from demandops.decide.restoration import Restoration
+from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
 from demandops.model.demand.claim import Claim, Lease
 from demandops.model.ledger.ledger import Ledger
