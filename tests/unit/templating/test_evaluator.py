@@ -173,8 +173,12 @@ def test_every_process_gives_the_same_faults(of: str) -> None:
     assert "0x" not in str(faults)
 
 
-def test_threads_do_not_wait_for_each_other(shared: Evaluator) -> None:
-    started, results = threading.Barrier(4), list[str]()
+def test_threads_do_not_wait_for_each_other(
+    shared: Evaluator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    started, results, children = threading.Barrier(4), list[str](), list[Any]()
+    child = process_module._Child
+    monkeypatch.setattr(process_module, "_Child", lambda: children.append(child()) or children[-1])
 
     def endless() -> None:
         started.wait()
@@ -193,6 +197,10 @@ def test_threads_do_not_wait_for_each_other(shared: Evaluator) -> None:
     for thread in others:
         thread.join()
     assert results == ["1", "1", "1"]
+    for each in children:  # so that nothing runs on beside other tests
+        each._process.kill()
+    hang.join()
+    assert results[-1] == "ended"
 
 
 def test_the_child_has_neither_environment_nor_descriptors_of_its_parent(
