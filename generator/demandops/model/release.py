@@ -36,8 +36,8 @@ class Autoscaler:
 
 
 def overridden(replicas: int | Autoscaler, number: int) -> int | Autoscaler:
-    # Where an autoscaler owns the number, the GitOps controller ignores ``spec.replicas``. So the
-    # number is set as both bounds of the autoscaler.
+    # Where an autoscaler owns the number, the manifest tells the GitOps controller to ignore
+    # ``spec.replicas``. So the number is set as both bounds of the autoscaler.
     if isinstance(replicas, Autoscaler):
         return Autoscaler(number, number, replicas.targets)
     return number
@@ -58,8 +58,8 @@ class ServiceKey:
     are set if the service runs once for each topic; then the applications that need the service on
     this node for this topic share the instance. If none of these is set, the applications that need
     the service on this node share the instance. With ``for_cluster``, the applications in the
-    node's cluster share it. ``version`` is set if the service runs for each topic and belongs to a
-    separate instance of an application.
+    node's cluster share it. ``version`` is set if the service runs for each topic and belongs to an
+    application that runs in a version of its own beside others (``versions: separate``).
     """
 
     service: str
@@ -80,7 +80,7 @@ class ServiceKey:
 
     @property
     def instance(self) -> Instance:
-        # of the record of kept replicas in the ledger
+        # the key of the ledger's record of kept replicas
         named = (self.service, self.node, self.application, self.source, self.topic, self.version)
         scope = "cluster" if self.for_cluster else ""
         return ("replicas", *(name or "" for name in named), scope)
@@ -107,7 +107,7 @@ class ServiceRelease:
     outputs: Mapping[str, str]
     parameters: Mapping[str, object]
     replicas: int | Autoscaler
-    keeps: Kept | None  # while the service keeps more replicas than its demands need
+    keeps: Kept | None  # while the service still has more replicas than its demands need
     applications: tuple[str, ...]
     requesters: tuple[str, ...]
     shaping: Shaping = UNSHAPED
@@ -125,13 +125,12 @@ class ServiceRelease:
 
     @property
     def description(self) -> str:
-        # as commit messages say it
         for_whom = self.key.source or self.key.application
         what = f"{self.key.service} {self.key.version}".rstrip()
         return f"{what} on {self.node.id}" + (f" for {for_whom}" if for_whom else "")
 
     def facts(self) -> list[str]:
-        # commit messages show changed lines
+        # one fact a line, because a commit message shows the lines that changed
         until = f" until {format_time(self.keeps.until)}" if self.keeps else ""
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),

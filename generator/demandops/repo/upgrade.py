@@ -42,14 +42,15 @@ from demandops.templating.evaluator import EVALUATE
 
 _ATTEMPTS = 10
 _PAUSE_S = 0.1
-_FIRST_WITH_MARKS = 2  # the first render version whose claims mark the further topics of a source
+# Before this render version, claims did not mark a source's further topics, so the marks are added.
+_FIRST_WITH_MARKS = 2
 _NAMES = {"flux": "Flux", "argocd": "Argo CD"}
 
 
 @dataclass(frozen=True, slots=True)
 class UpgradeRequest:
     gitops: str | None = None  # the new GitOps controller; None keeps the current one
-    # where a controller without a section in demandops.yaml fetches; None: as the current one does
+    # what the new controller fetches if demandops.yaml has no section for it; None: the current URL
     url: str | None = None
 
 
@@ -117,7 +118,7 @@ def _plan(
     files[ROOT_FILE] = _root(before, old, request)
     config = load(files)
     state = State(config, snapshot.state.ledger, EVALUATE)
-    # people's changes since the generator's last commit are applied too
+    # people may have edited since the state in effect; their edits are checked and applied too
     start = state_in_effect.start_at(objects, tip)
     edits = ledger_files.claims_by_people(objects, start.last_valid_commit, tip, start.state.ledger)
     refused = list(faults_of_edit(start.state, state, edits))

@@ -31,7 +31,7 @@ REST_OF_BAG = "the rest of the bag"
 
 class RecordedBag:
     def __init__(self, path: Path, file: RuleFile) -> None:
-        """Open a bag, which must have a topic that the rules read: its folder or an MCAP file."""
+        """Open a bag, a folder or an MCAP file, with at least one topic that the rules read."""
         try:
             self._reader = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
             self._reader.open()
@@ -43,7 +43,8 @@ class RecordedBag:
         self.topics: set[str] = set()
         # Topics that match a source by name, but not by their message type.
         self.unread: dict[str, str] = {}
-        # The number of unreadable messages by topic and reason, each once for a source.
+        # How many messages could not be read, by topic and reason. One that two sources read counts
+        # twice.
         self.left_out: dict[tuple[str, str], int] = {}
         for connection in self._reader.connections:
             for name, source in file.sources.items():
@@ -68,7 +69,8 @@ class RecordedBag:
 
     @property
     def span(self) -> tuple[float, float]:
-        # of the first and the last message of all topics, in seconds since 1970
+        # of the first and the last message of all topics, in seconds since 1970; the library's end
+        # is a nanosecond after the last message
         return self._reader.start_time / 1e9, (self._reader.end_time - 1) / 1e9
 
     def observations(self) -> Iterator[Observation]:
@@ -100,8 +102,8 @@ class RecordedBag:
 
 # ---- the picture of a replay ----
 #
-# The upper part of the picture is a map with tracks and areas. In the lower part, each event, up to
-# the 200th, has a row that shows when the event lasted.
+# The upper part is a map with tracks and areas. Below, each rule with its entities (at most 200) has
+# a row with a bar from each start to its stop.
 
 _WIDTH, _MAP, _ROW, _LEFT, _RIGHT, _EDGE = 1000, 600, 22, 300, 30, 30
 _COLORS = ("#0b6e99", "#c2410c", "#15803d", "#7e22ce", "#b91c1c", "#4d7c0f", "#be185d", "#1d4ed8")
@@ -110,7 +112,7 @@ Span = tuple[float, float]
 
 
 def svg(replay: Replay) -> str:
-    spans: dict[Key, list[Span]] = {}  # of each event; the end of one that lasts is inf
+    spans: dict[Key, list[Span]] = {}  # by rule and entities; inf: not stopped
     for event, _ in replay.events:
         if event.starts:
             spans.setdefault(event.key, []).append((event.at, inf))

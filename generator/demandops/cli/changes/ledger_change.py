@@ -51,7 +51,7 @@ def booked(generator: Generator, goal: Json) -> Receipt:
 
 @contextmanager
 def started_generator(state_repo: str, signing_key: Path | None) -> Iterator[Generator]:
-    # within the block, SIGTERM acts like Ctrl-C
+    # within the block, SIGTERM acts like Ctrl-C, because both must close the generator
     before = signal.getsignal(signal.SIGTERM)
     with suppress(ValueError):  # only the main thread may set a handler
         signal.signal(signal.SIGTERM, signal.default_int_handler)
@@ -153,7 +153,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
         if dry_run or row["outcome"] == "unchanged":
             return
         person_change.confirm("Continue?", yes, output)
-    # through the journal, like a demand, so it may run beside other generators
+    # booked by a generator through the journal, like a demand, so others may run meanwhile
     with started_generator(state_repo, signing_key) as generator:
         person_change.warned_if_unnamed(by)
         try:
@@ -299,7 +299,7 @@ def _consequences(decision: Decision | None) -> Json:
 
 
 def _roll_back(state_repo: str, goal: Json, signing_key: Path | None, base: str) -> Json:
-    """Roll back with a generator; return what differs from the consequences on ``base``."""
+    """Return the outcome, and the consequences if they are not those on ``base``."""
     try:
         with started_generator(state_repo, signing_key) as generator:
             receipt = booked(generator, goal)

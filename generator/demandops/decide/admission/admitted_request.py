@@ -47,7 +47,7 @@ Held = Application | Connection
 def with_chosen_domains(
     request: AnyRequest, config: Config, ledger: Ledger
 ) -> tuple[AnyRequest, list[Fault]]:
-    """Choose a domain for each node; there is a fault for each node with several domains."""
+    """Choose a domain for each node; a node that may be used in several domains is a fault."""
     if not config.hosts:
         return request, []
     faults: list[Fault] = []
@@ -68,7 +68,7 @@ def with_chosen_domains(
 
 
 def _with_short_names(held: Held, config: Config) -> Held:
-    # <node>@<first domain> is the same node as <node>, which is the name in the configuration
+    # so that a node has one name in claims: <node>@<first domain> is the same node as <node>
     def short(name: str) -> str:
         node, _, domain = name.rpartition("@")
         own = config.domain_of.get(node)
@@ -149,7 +149,7 @@ def _separated(app: Application, config: Config) -> Application:
     version = versions.get(app.version)
     if appdef is None or appdef.versions != "separate" or version is None:
         return app
-    # two names of one version have the same rank
+    # the default may have several names, such as channels; they have the same rank
     if version.rank == versions[""].rank:
         return replace(app, version=version.name)
     suffix = f"@{version.name}"
@@ -241,14 +241,14 @@ def admit(
     request, not_placed = placement.with_chosen_nodes(
         request, state, state.usage(), trial, checkpoint
     )
-    # what was booked must be released, however long that takes
+    # a release has no budget: what was booked must be released, however long that takes
     checkpoint = checkpoint if request.adds_claims else lambda: None
     checkpoint()
     request = completed(request, state)
     _refuse(admission.size_faults(request, limits))  # derived connections count as well
     checkpoint()
-    # A field that is malformed was left out, so faults of its content would be wrong. The faults of
-    # form and of content that remain are reported together, to be mended in one go.
+    # The parser leaves out a malformed field, so faults of its content would be wrong. The faults
+    # of form and of content that remain are reported together, to be mended in one go.
     malformed = {each.field for each in faults}
     around_malformed = {parent for field in malformed for parent in _with_parents(field)}
     content = [
@@ -283,7 +283,8 @@ def completed(request: DemandRequest, state: State) -> DemandRequest:
     """Return a request, whose nodes are chosen, with all else that the generator adds."""
     config, ledger = state.config, state.ledger
     request = permission.with_lease_terms(request, config)
-    if request.is_reference:  # its clients list their connections and shut down what they listed
+    # clients of the reference list their connections, and later shut down just what they listed
+    if request.is_reference:
         request = flows.with_further_topics(request, ledger, config)
     else:
         request = flows.with_implied_connections(request, ledger, config)

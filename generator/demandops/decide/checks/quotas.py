@@ -21,8 +21,8 @@ from demandops.model.release import ServiceKey
 
 # ---- denials: a demand is refused if an override with ``deny`` selects what it asks for ----
 #
-# A demand that only repeats existing claims is never denied. If an override suspends these claims,
-# the requester gets a warning.
+# Such an override suspends existing claims that it selects. A demand that only repeats them is not
+# refused; its requester gets a warning.
 
 
 def denial_faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[Fault]:
@@ -102,7 +102,8 @@ def warnings(request: DemandRequest, world: World) -> Iterator[str]:
 def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Fault]:
     """Yield a fault for each quota that the booking exceeds and whose count it raises.
 
-    Suspended claims count as claims, but nothing runs for them.
+    Suspended claims count for ``claimsPerRequester``. Their services do not run, and so do not
+    count for ``servicesPerNode``.
     """
     domain_of = after.config.domain_of
     booked = [change.after for change in changes.claims if change.after]
@@ -112,8 +113,7 @@ def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Faul
     }
     for (_, requester), domain in sorted(domains.items(), key=lambda pair: pair[0]):
         most = domain.quotas.claims_per_requester
-        # The ledger counts a requester's claims in all domains, so at least as many as those in
-        # this domain. It has this count at hand, so most demands need no search.
+        # The ledger has the count in all domains at hand. If even that fits, no search is needed.
         if most is None or after.ledger.count_of_requester(requester) <= most:
             continue
         count = _held(requester, after, domain)
@@ -123,7 +123,7 @@ def quota_faults(before: World, after: World, changes: Changes) -> Iterator[Faul
     touched = [claim for change in changes.claims if (claim := change.after or change.before)]
     apps = [claim.application for claim in touched if claim.is_on_application]
     nodes = {node for app in apps for node in app.needed_nodes()}
-    # A service for a cluster runs at a node that only its definition names.
+    # A service that runs once for each cluster runs at the node that its definition names.
     nodes |= {
         service.runs_at[app.node]
         for app in apps

@@ -32,7 +32,7 @@ _INDEXED = ("nodes", "services", "applications", "connections", "appdefs")
 def check_override_conflicts(config: Config, reader: ConfigReader) -> None:
     contests = defaultdict[tuple[int, tuple[str, ...]], list[tuple[Override, str]]](list)
     for override in by_rank(config.overrides.values()):
-        # (what, token) for all that the override sets; another token contradicts it
+        # (setting, value as text): of equal priority, another value of a setting contradicts it
         settings: list[tuple[tuple[str, ...], str]] = [
             ((name,), str(value))
             for name in _SINGLE
@@ -195,8 +195,9 @@ def shares_any_clients(config: Config) -> bool:
 def _separating_fields(
     first: Selector, second: Selector, config: Config, shares_clients: bool
 ) -> Iterator[str]:
-    # A release has only one service and one node. But a shared service has many applications and
-    # requesters, and a Zenoh bridge has many connections.
+    # Yield the fields whose patterns must overlap for one release to match both selectors. A
+    # release has one service and runs at one node. But a shared service has many applications, and
+    # a Zenoh bridge many connections, so these fields count only if no such release can match.
     yield from ("services", "nodes")
     may_match_shared_service = any(
         service.scope != "application"

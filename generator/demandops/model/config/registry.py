@@ -1,6 +1,6 @@
 """The registry: sources and versions of charts, images and applications, and how clients run.
 
-A chart is in a folder of the state repo (the default), an OCI registry or an HTTP chart repository.
+A chart is in a folder of the state repo, an OCI registry or an HTTP chart repository.
 """
 
 from __future__ import annotations
@@ -137,7 +137,7 @@ class ImagesFile(FileModel):
 
 
 class ImagePin(FrozenModel):
-    """Changes to an image of the registry.
+    """What a version or an override changes of an image in ``registry/images.yaml``.
 
     An absent field changes nothing, except that a new tag removes the image's digest, and a new
     digest its tag (:meth:`over`).
@@ -197,7 +197,7 @@ class VersionList(CamelModel):
 class VersionsFile(FileModel):
     """``registry/versions.yaml``, and files of ``registry/versions/``; a repo may have none.
 
-    An application definition without an entry here has the versions of its charts.
+    A definition without an entry here has no versions of its own: those of its charts count.
     """
 
     kind: Literal["Versions"]
@@ -209,11 +209,12 @@ Precedence = tuple[tuple[int, ...], bool, tuple[tuple[bool, int, str], ...], str
 
 def precedence(version: str) -> Precedence:
     # by the rules of Semantic Versioning 2.0.0 (item 11)
-    numbers, _, before = version.partition("-")
+    numbers, _, prerelease = version.partition("-")
     words = (
-        (not word.isdigit(), int(word) if word.isdigit() else 0, word) for word in before.split(".")
+        (not word.isdigit(), int(word) if word.isdigit() else 0, word)
+        for word in prerelease.split(".")
     )
-    return tuple(map(int, numbers.split("."))), not before, tuple(words), version
+    return tuple(map(int, numbers.split("."))), not prerelease, tuple(words), version
 
 
 @dataclass(frozen=True)
@@ -227,8 +228,8 @@ class ApplicationVersion:
 
     @cached_property
     def rank(self) -> tuple[Precedence, ...]:
-        # equal keys mean the same version
-        # without a list of versions, a version is that of the charts
+        # for comparison: equal ranks mean the same version
+        # a definition without a list of versions is compared by the versions of its charts
         charts = (chart.version for _, chart in sorted(self.charts.items()))
         return tuple(map(precedence, [self.name] if self.name else charts))
 

@@ -1,7 +1,9 @@
 """Demand requests: one class for each operation on the ledger.
 
 Goals of ROS actions and YAML files are parsed into these values. The admission checks them, and the
-booking carries them out. Further classes are ``Wait``, ``Drain`` and ``Restoration``.
+booking carries them out. "The reference" is the application manager of the paper, whose action
+``DeploymentRequest`` is served too. Requests that nobody sends stand where they are made: ``Wait``
+in :mod:`.records`, ``Drain`` in :mod:`.booking`, ``Restoration`` in :mod:`.rollback`.
 """
 
 from __future__ import annotations
@@ -29,7 +31,7 @@ class Demanded:
     requesters: tuple[str, ...]
     place: Place
     term: Term | None = None
-    # the type of an application's derived connections; ``auto``: any type, ``none``: none
+    # the type of the connections that an application implies; ``auto``: any, ``none``: makes none
     connect: str = "none"
     # how a connection differs from the requested one, for a warning in the receipt
     note: str = ""
@@ -48,7 +50,7 @@ class DemandRequest:
     demanded: tuple[Demanded, ...] = ()
     # Empty in the reference's requests; `claim.demand_id` makes one for each item
     demand: str = ""
-    # Those of the request as a whole: a release lists nothing, but has requesters
+    # of the request as a whole: `Release` lists no items, but has requesters
     own_requesters: tuple[str, ...] = ()
 
     operation: ClassVar[str]  # as in commits and files
@@ -115,12 +117,12 @@ class Expire(DemandRequest):
 
 @dataclass(frozen=True, slots=True)
 class Decommission(DemandRequest):
-    """An operator's request to release what needs a node or names a requester: its ``id``."""
+    """An operator's request to release all that needs the node, or names the requester, ``id``."""
 
     kinds: frozenset[str] = frozenset()  # `node`, `requester` or both
     by: str = ""  # the operator as `name <email>`
     reason: str = ""
-    # The names that the node has in its access domains; the admission fills them in
+    # one name for each access domain of the node; the admission fills them in
     nodes: tuple[str, ...] = ()
 
     operation = "decommission"
@@ -131,7 +133,7 @@ class Decommission(DemandRequest):
         return isinstance(data, dict) and data.get("kind") == "Decommission"
 
     def goal(self) -> dict[str, Any]:
-        # `parse` reads it; without `nodes`
+        # without `nodes`, which the admission finds again when the journal is read
         data = {"kind": "Decommission", "name": self.id, "as": sorted(self.kinds), "by": self.by}
         return data | ({"reason": self.reason} if self.reason else {})
 
