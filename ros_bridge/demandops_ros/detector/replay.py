@@ -102,8 +102,8 @@ class RecordedBag:
 
 # ---- the picture of a replay ----
 #
-# The upper part is a map with tracks and areas. Below, each rule with its entities (at most 200) has
-# a row with a bar from each start to its stop.
+# The upper part is a map with tracks and areas. Below, each rule with its entities (at most 200)
+# has a row with a bar from each start to its stop.
 
 _WIDTH, _MAP, _ROW, _LEFT, _RIGHT, _EDGE = 1000, 600, 22, 300, 30, 30
 _COLORS = ("#0b6e99", "#c2410c", "#15803d", "#7e22ce", "#b91c1c", "#4d7c0f", "#be185d", "#1d4ed8")
