@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -23,8 +24,10 @@ from demandops.decide.decision import decide
 from tests.kit import goals
 from tests.kit.clock import Clock
 from tests.kit.cluster import Letters
+from tests.kit.generator import wait_until
 from tests.kit.golden import requests_of, start
 from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.kube_api import kube_api
 from tests.kit.limits import PATIENCE_S
 from tests.kit.memory import NOW, MemoryRepo
 
@@ -128,6 +131,32 @@ def test_closing_answers_the_rollouts_that_are_still_followed(tmp_path: Path) ->
     followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
     status.close()
     assert followed.result(PATIENCE_S).state == "waiting"
+
+
+def test_what_is_healthy_is_read_again_and_what_failed_before_is_told(tmp_path: Path) -> None:
+    clock, told = Clock(NOW), list[str]()
+    target = Target(ClusterDomain("c", "d", "ns"), "r", is_service=False)
+    key = ("Deployment", "ns", "r")
+    with kube_api() as api:
+        api.flux("ns", "d", "a")
+        api.deployment("ns", "r")
+        reached = ClusterAccess(kubeconfig=kubeconfig(tmp_path, api.url))
+        status = RolloutWatcher({"c": reached}, Letters(), runtime=clock)
+        follow = partial(status.follow, "a", [target], "healthy")
+        assert follow(60).result(PATIENCE_S).state == "healthy"
+        api._items["deployments", "ns", "r"]["status"]["availableReplicas"] = 0  # no watch tells it
+        assert follow(-1).result(PATIENCE_S).reason == "0 of 1 replicas are available"
+        late = follow(60, lambda state, text: told.append(state))
+        failed = {"type": "ReplicaFailure", "status": "True", "message": "no room"}
+        api.put("deployments", "ns", "r", {"conditions": [failed]})
+        wait_until(lambda: "failing" in told, "the failure is told")
+        api.deployment("ns", "r", available=0)
+        cache = status._caches["c"]
+        wait_until(lambda: "conditions" not in cache.objects()[key]["status"], "it is retried")
+        clock.pass_(61)
+        reason = "0 of 1 replicas are available; before: no room"
+        assert late.result(PATIENCE_S).reason == reason
+        status.close()
 
 
 ITEM = {"metadata": {"name": "of-params", "resourceVersion": "1"}, "data": {"params.yml": "a"}}
