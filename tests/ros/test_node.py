@@ -119,6 +119,7 @@ def test_a_level_that_is_not_reached_is_reported_with_what_became_of_the_demand(
         error, _ = answers.given.pop()
         told = f"Deployment ns/one: is still being removed; the demand is {outcome} in a commit"
         assert (error.level, str(error)) == ("healthy", told)
+        assert adapter.result(error, "pushed").code == "not-healthy"
 
 
 def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> None:
