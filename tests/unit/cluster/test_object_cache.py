@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -90,6 +91,33 @@ def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:
     read.read_once([OVER, CHILDREN])
     assert read.why_unknown([OVER]).startswith("MaxRetryError")
     assert read.why_unknown([CHILDREN]) == read.why_unknown([OVER])
+
+
+def test_a_watch_that_lags_takes_nothing_back(tmp_path: Path) -> None:
+    def item(name: str, version: int) -> dict[str, Any]:
+        return {"metadata": {"name": name, "resourceVersion": str(version)}}
+
+    is_over = Event()
+
+    def events() -> Iterator[bytes]:
+        for seen in (item("one", 9), item("two", 11)):
+            yield json.dumps({"type": "MODIFIED", "object": seen}).encode() + b"\n"
+        is_over.wait(PATIENCE_S)
+
+    def answer(call: Call) -> Answer:
+        if "watch=" in call.path:
+            return Answer(headers={"Content-Type": "application/json"}, body=events())
+        return Answer.json({"metadata": {"resourceVersion": "8"}, "items": [item("one", 10)]})
+
+    with serving(answer) as server:
+        reached = ClusterAccess(kubeconfig=kubeconfig(tmp_path, server.url))
+        cache = ObjectCache("c-its", reached, lambda: None)
+        cache.watch([DEPLOYMENTS])
+        wait_until(lambda: len(cache.objects()) == 2, "both events have come")
+        one = cache.objects()["Deployment", "perception", "one"]
+        assert one["metadata"]["resourceVersion"] == "10"
+        cache.close()
+        is_over.set()
 
 
 AWAY = "http://127.0.0.1:1"
