@@ -116,6 +116,8 @@ def test_a_watch_that_lags_takes_nothing_back(tmp_path: Path) -> None:
         wait_until(lambda: len(cache.objects()) == 2, "both events have come")
         one = cache.objects()["Deployment", "perception", "one"]
         assert one["metadata"]["resourceVersion"] == "10"
+        cache.refresh([DEPLOYMENTS])
+        assert len(cache.objects()) == 1, "what is listed no longer is gone"
         cache.close()
         is_over.set()
 
