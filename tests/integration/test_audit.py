@@ -12,6 +12,7 @@ import pytest
 from demandops.cli.main import run as run_command
 from demandops.model.config.override import format_time
 from demandops.model.ledger.claim_file import read
+from demandops.model.ledger.records import SHUTDOWNS_ROOT
 
 from tests.integration.conftest import On
 from tests.kit.cli import Ran, Run
@@ -264,20 +265,23 @@ class TestVerifyByDifferences:
         assert row["holds"]
 
     @pytest.mark.parametrize(
-        "path",
+        ("path", "operation"),
         [
-            "policy/access-domains.yaml",
-            "ledger/connections/00/x-0/y-0.yaml",
-            "overrides/a",
-            "claim",
+            ("policy/access-domains.yaml", "join"),
+            ("ledger/connections/00/x-0/y-0.yaml", "join"),
+            ("overrides/a", "join"),
+            (f"{SHUTDOWNS_ROOT}/x.yaml", "put"),
+            ("claim", "join"),  # of the demand that the commit names, but with a comment
+            ("claim", "follow"),  # of a demand that the commit does not name
         ],
     )
     def test_what_is_not_the_generators_to_write(
-        self, played: GitRepo, verdict: Callable[..., Any], path: str
+        self, played: GitRepo, verdict: Callable[..., Any], path: str, operation: str
     ) -> None:
-        files, message = played.files(), FORGED
-        if path == "claim":  # of the demand that the commit names, but with a comment
+        files, message = played.files(), FORGED.replace("join", operation)
+        if path == "claim":
             path = next(iter(played.files("ledger/connections/")))
-            message = FORGED.replace("none", read(files[path], path).demand)
+            demand = read(files[path], path).demand
+            message = message.replace("none", demand if operation == "join" else "none")
         row = verdict({path: files.get(path, "# nothing\n") + "# more\n"}, message, FORGER)
         assert (row["holds"], row["touched"]) == (False, [path])

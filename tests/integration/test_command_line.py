@@ -16,6 +16,7 @@ from typing import Any
 import pygit2
 import pytest
 import yaml
+from demandops.base.errors import Unsound
 from demandops.cli.queries import bookkeeping
 
 from tests.integration.conftest import On
@@ -240,16 +241,23 @@ class TestStateRepo:
         assert str(tmp_path / "file") in self.refused(demandops, "request -", state.path)
 
 
-def test_a_fault_of_the_program_has_a_code_of_its_own(
-    on: On, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("error", "told"),
+    [
+        (RuntimeError("boom"), "error: a fault of demandops itself: RuntimeError: boom\nplease"),
+        (Unsound("the disk fails"), "error: the disk fails\n"),
+    ],
+)
+def test_a_fault_of_the_program_or_its_machine_has_a_code_of_its_own(
+    on: On, monkeypatch: pytest.MonkeyPatch, error: Exception, told: str
 ) -> None:
     def broken(*args: object) -> None:
-        raise RuntimeError("boom")
+        raise error
 
     monkeypatch.setattr(bookkeeping, "derive", broken)
     ran = on("bookkeeping")
     assert (ran.code, ran.out) == (3, "")
-    assert ran.err.startswith("error: a fault of demandops itself: RuntimeError: boom\nplease")
+    assert ran.err.startswith(told)
 
 
 class TestProcess:

@@ -238,6 +238,14 @@ def test_a_key_that_is_gone_later_is_told_to_the_requester(
         assert state.tip != before
 
 
+def sign_again(state: GitRepo, sign: Callable[[bytes], str]) -> None:
+    """Replace the newest commit by the same with a signature."""
+    repo = pygit2.Repository(str(state.path))
+    content = repo[state.tip].read_raw()
+    made = repo.create_commit_with_signature(content.decode(), sign(content), "gpgsig")
+    repo.references["refs/heads/main"].set_target(made)
+
+
 class TestVerify:
     @pytest.fixture
     def rows(self, on: On, state: GitRepo) -> Callable[[int], list[dict[str, Any]]]:
@@ -278,12 +286,32 @@ class TestVerify:
     def test_a_commit_cannot_vouch_for_itself(
         self, on: On, state: GitRepo, key: Path, tmp_path: Path
     ) -> None:
+        forger = keygen(tmp_path / "forger")
         state.commit({SIGNERS: listed(key)})
         forged = "Forged\n\nOperation: join\nRender-Version: 2\n"
-        state.commit({SIGNERS: listed(keygen(tmp_path / "forger"))}, forged, FORGER)
+        state.commit({SIGNERS: listed(forger)}, forged, FORGER)
+        for signs, told in ((None, "is not signed, but "), (forger, "is signed, but not by a key")):
+            if signs:
+                sign_again(state, Signer(signs).sign)
+            (row,) = on("verify", "main~1..main", "-o", "json").json()
+            assert (row["holds"], row["touched"]) == (False, [SIGNERS])
+            assert row["signature"].startswith(told)
+
+    def test_a_gpg_signature_that_this_machine_trusts_does_not_hold(
+        self, on: On, book: Book, state: GitRepo, key: Path, tmp_path: Path, monkeypatch: Any
+    ) -> None:
+        gpg = tmp_path / "gpg"
+        gpg.write_text("#!/bin/sh\nprintf '\\n[GNUPG:] %s\\n' 'GOODSIG 1 x' TRUST_ULTIMATE\n")
+        gpg.chmod(0o755)
+        for name, value in {"COUNT": "1", "KEY_0": "gpg.program", "VALUE_0": str(gpg)}.items():
+            monkeypatch.setenv(f"GIT_CONFIG_{name}", value)
+        state.commit({SIGNERS: listed(key)})
+        book("a")
+        armor = "-----{} PGP SIGNATURE-----"
+        sign_again(state, lambda _: f"{armor.format('BEGIN')}\n\nx\n{armor.format('END')}")
+        assert git(state, "log", "-1", "--format=%G?") == "G"
         (row,) = on("verify", "main~1..main", "-o", "json").json()
-        assert (row["holds"], row["touched"]) == (False, [SIGNERS])
-        assert row["signature"].startswith("is not signed, but ")
+        assert row["signature"].startswith("is signed, but not by a key")
 
     def test_a_signature_of_another_commit_does_not_hold(
         self, book: Book, on: On, state: GitRepo, key: Path

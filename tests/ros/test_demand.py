@@ -197,6 +197,13 @@ def test_a_demand_of_a_client_that_died_ends_and_one_that_is_renewed_does_not(
     assert booked() == set()
 
 
+def test_a_held_demand_that_has_ended_is_put_again(vehicle: DemandClient) -> None:
+    with vehicle.demand("lost", connections=[link("lost")], lease=3) as held:
+        first = held.commit
+        vehicle.release("lost")
+        wait_until(lambda: held.commit != first, "the demand is put again")
+
+
 def test_the_bookkeeping_is_published_and_latched(
     vehicle: DemandClient, raw: SingleThreadedExecutor
 ) -> None:

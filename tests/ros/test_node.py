@@ -119,6 +119,7 @@ def test_a_level_that_is_not_reached_is_reported_with_what_became_of_the_demand(
         error, _ = answers.given.pop()
         told = f"Deployment ns/one: is still being removed; the demand is {outcome} in a commit"
         assert (error.level, str(error)) == ("healthy", told)
+        assert adapter.result(error, "pushed").code == "not-healthy"
 
 
 def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> None:
@@ -317,18 +318,22 @@ def test_a_goal_stays_open_until_a_person_has_decided(
     person.policy(approval="required")
     served = serve(str(bare))
     client.ready()
-    sent = [client.send(connection(number)) for number in (1, 2, 3)]
+    sent = [client.send(connection(number)) for number in (1, 2, 3, 4)]
 
     def branches() -> list[str]:
         lines = [line for one in sent for line in one.feedback]
         return [line.split()[2] for line in lines if line.startswith("awaiting approval: ")]
 
-    client.wait(lambda: len(branches()) == 3)
-    (approved, denied, gone), (yes, no, _) = sent, branches()
+    client.wait(lambda: len(branches()) == 4)
+    (approved, denied, gone, released), (yes, no, *_) = sent, branches()
     assert not any(one.answered for one in sent)
     assert client.cancel(gone)
     client.wait(lambda: gone.answered)
     assert gone.status == "cancelled"
+    assert client.call(connection(4) | {"shutdown": True}).status == "succeeded"
+    client.wait(lambda: released.answered)
+    assert released.status == "aborted"
+    assert released.message == "was released by a later request before it was approved"
     git(bare, "branch", "--delete", "--force", no)
     client.wait(lambda: denied.answered)
     assert denied.status == "aborted"

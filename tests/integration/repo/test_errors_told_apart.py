@@ -300,6 +300,16 @@ def test_a_failure_of_a_disk_is_no_refusal_by_the_remote(
     assert str(error) == f"{url} cannot be pushed to: {reason}"
 
 
+@pytest.mark.parametrize("rule", ["fatal: pack exceeds maximum allowed size", "fsckObjects: null"])
+def test_a_push_against_a_rule_of_the_server_is_not_tried_again(
+    url: str, tmp_path: Path, rule: str
+) -> None:
+    repository = RemoteRepository(url, tmp_path / "clone.git", print, allow_offline=False)
+    words = f"remote: {rule}\n!\tabc:refs/heads/main\t[remote rejected] (unpacker error)"
+    error = repository.push_error(gitpython.GitCommandError(["push"], 1, words.encode()))
+    assert isinstance(error, PushDenied)
+
+
 def lose(repo: Path, tmp_path: Path, spec: str) -> str:
     """Remove an object from a bare repository; return its id."""
     lost = rig.git(repo, "rev-parse", spec).strip()

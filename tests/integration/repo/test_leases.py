@@ -18,6 +18,7 @@ from demandops.base import settings
 from demandops.model.demand.claim import Claim
 from demandops.repo.write.journal import JournalEntry, Slot
 from demandops.serve.generator import Generator
+from demandops.serve.timing.pauses_and_limits import LIMIT_LOCAL
 
 from tests.kit import goals, rig
 from tests.kit.clock import Clock
@@ -98,7 +99,10 @@ def test_a_renewal_that_waits_counts_before_the_end_that_came_meanwhile(
     # by the record, the lease ended 40 s ago; the renewal came before, while no generator ran
     received = (clock.now() + timedelta(seconds=50)).isoformat()
     slot = Slot(settings.data_home(str(bare)))
-    slot.journal.append([JournalEntry("op-renew", renew("d"), received, rig.tip(bare))])
+    # so many others before it that it is not in the first batch
+    others = {f"op-{number}": renew("nothing") for number in range(LIMIT_LOCAL)}
+    for operation, goal in (others | {"op-renew": renew("d")}).items():
+        slot.journal.append([JournalEntry(operation, goal, received, rig.tip(bare))])
     slot.close()
     clock.pass_(100)
     with rig.running(bare, runtime=clock) as generator:

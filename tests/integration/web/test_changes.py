@@ -283,11 +283,13 @@ def _assert_taken_over(follower: Follower, look: Look) -> None:
 
 
 def test_a_state_repo_that_is_away_is_told_and_followed_again(
-    bare: Path, follower: Follower, look: Look
+    bare: Path, follower: Follower, look: Look, client: TestClient
 ) -> None:
     with away(bare):
         wait_until(lambda: follower.newest.unread, "the page knows that the state repo is away")
         page = look("/", status=200)
         assert "The state repo cannot be read" in page.text
         assert "may be out of date" in look("/demands").texts("aside")[0]
+        assert client.get("/health").status_code == 503
     wait_until(lambda: not follower.newest.unread, "the page follows again")
+    assert client.get("/health").status_code == 200

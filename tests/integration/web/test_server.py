@@ -95,6 +95,11 @@ def test_clients_that_neither_ask_nor_read_are_cut_off(
     page.close()
 
 
+def test_a_server_that_only_this_machine_reaches_takes_no_other_name(served: WebServer) -> None:
+    with asking(served, "GET / HTTP/1.1\nHost: attacker.example\n\n") as asked:
+        assert asked.recv(12) == b"HTTP/1.1 400"
+
+
 def test_however_many_clients_hold_connections_open_health_is_told(served: WebServer) -> None:
     """The oldest connection that waits for its client gives way, and no stream of events does."""
     with ExitStack() as stack:

@@ -16,7 +16,7 @@ from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease
 from demandops.web import fleet_map, time_line
 from demandops.web.follower import Follower
-from demandops.web.lists import Filter, rows_of
+from demandops.web.lists import Filter, page_of, rows_of
 from demandops.web.not_ready import remedy_of
 from demandops.web.release_view import explained_demand
 from demandops.web.situation import CommitState, Situation
@@ -166,6 +166,12 @@ def test_rows_are_sorted_by_any_column_both_ways(look: Look) -> None:
     down = look("/connections", sort="topic").texts("tr")[1:]
     up = look("/connections", sort="-topic").texts("tr")[1:]
     assert down == up[::-1] and len(down) == 3
+
+
+def test_the_last_page_has_the_rest() -> None:
+    assert page_of(range(5), 9, 2) == (range(4, 5), 3, 3)
+    assert page_of(range(4), 2, 2) == (range(2, 4), 2, 2)
+    assert page_of((), 0, 2) == ((), 1, 1)
 
 
 def test_a_release_is_explained(look: Look, state: GitRepo) -> None:

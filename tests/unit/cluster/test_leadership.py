@@ -160,6 +160,16 @@ def test_one_that_may_not_lead_yet_leaves_a_free_lease(server: Server) -> None:
     assert one.leads
 
 
+def test_one_that_took_the_lease_but_got_no_answer_leads_at_the_next_try(server: Server) -> None:
+    calls = count()
+    server.trouble = lambda: "after" if next(calls) == 1 else ""
+    one = Process(server)
+    server.turns.sleep(1)
+    assert (one.leads, bool(server.spec["holderIdentity"])) == (False, True)
+    server.turns.sleep(2)
+    assert one.leads
+
+
 def cannot_renew(server: Server) -> None:
     server.trouble = lambda: "before"
 

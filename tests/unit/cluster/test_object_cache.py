@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from threading import Event
 from typing import Any
@@ -23,8 +25,10 @@ from demandops.decide.decision import decide
 from tests.kit import goals
 from tests.kit.clock import Clock
 from tests.kit.cluster import Letters
+from tests.kit.generator import wait_until
 from tests.kit.golden import requests_of, start
 from tests.kit.http import Answer, Call, kubeconfig, serving
+from tests.kit.kube_api import kube_api
 from tests.kit.limits import PATIENCE_S
 from tests.kit.memory import NOW, MemoryRepo
 
@@ -89,6 +93,35 @@ def test_a_cluster_that_is_away_is_asked_once(tmp_path: Path) -> None:
     assert read.why_unknown([CHILDREN]) == read.why_unknown([OVER])
 
 
+def test_a_watch_that_lags_takes_nothing_back(tmp_path: Path) -> None:
+    def item(name: str, version: int) -> dict[str, Any]:
+        return {"metadata": {"name": name, "resourceVersion": str(version)}}
+
+    is_over = Event()
+
+    def events() -> Iterator[bytes]:
+        for seen in (item("one", 9), item("two", 11)):
+            yield json.dumps({"type": "MODIFIED", "object": seen}).encode() + b"\n"
+        is_over.wait(PATIENCE_S)
+
+    def answer(call: Call) -> Answer:
+        if "watch=" in call.path:
+            return Answer(headers={"Content-Type": "application/json"}, body=events())
+        return Answer.json({"metadata": {"resourceVersion": "8"}, "items": [item("one", 10)]})
+
+    with serving(answer) as server:
+        reached = ClusterAccess(kubeconfig=kubeconfig(tmp_path, server.url))
+        cache = ObjectCache("c-its", reached, lambda: None)
+        cache.watch([DEPLOYMENTS])
+        wait_until(lambda: len(cache.objects()) == 2, "both events have come")
+        one = cache.objects()["Deployment", "perception", "one"]
+        assert one["metadata"]["resourceVersion"] == "10"
+        cache.refresh([DEPLOYMENTS])
+        assert len(cache.objects()) == 1, "what is listed no longer is gone"
+        cache.close()
+        is_over.set()
+
+
 AWAY = "http://127.0.0.1:1"
 
 
@@ -128,6 +161,32 @@ def test_closing_answers_the_rollouts_that_are_still_followed(tmp_path: Path) ->
     followed = status.follow("a" * 40, [target], "reconciled", timeout=600)
     status.close()
     assert followed.result(PATIENCE_S).state == "waiting"
+
+
+def test_what_is_healthy_is_read_again_and_what_failed_before_is_told(tmp_path: Path) -> None:
+    clock, told = Clock(NOW), list[str]()
+    target = Target(ClusterDomain("c", "d", "ns"), "r", is_service=False)
+    key = ("Deployment", "ns", "r")
+    with kube_api() as api:
+        api.flux("ns", "d", "a")
+        api.deployment("ns", "r")
+        reached = ClusterAccess(kubeconfig=kubeconfig(tmp_path, api.url))
+        status = RolloutWatcher({"c": reached}, Letters(), runtime=clock)
+        follow = partial(status.follow, "a", [target], "healthy")
+        assert follow(60).result(PATIENCE_S).state == "healthy"
+        api._items["deployments", "ns", "r"]["status"]["availableReplicas"] = 0  # no watch tells it
+        assert follow(-1).result(PATIENCE_S).reason == "0 of 1 replicas are available"
+        late = follow(60, lambda state, text: told.append(state))
+        failed = {"type": "ReplicaFailure", "status": "True", "message": "no room"}
+        api.put("deployments", "ns", "r", {"conditions": [failed]})
+        wait_until(lambda: "failing" in told, "the failure is told")
+        api.deployment("ns", "r", available=0)
+        cache = status._caches["c"]
+        wait_until(lambda: "conditions" not in cache.objects()[key]["status"], "it is retried")
+        clock.pass_(61)
+        reason = "0 of 1 replicas are available; before: no room"
+        assert late.result(PATIENCE_S).reason == reason
+        status.close()
 
 
 ITEM = {"metadata": {"name": "of-params", "resourceVersion": "1"}, "data": {"params.yml": "a"}}

@@ -8,6 +8,7 @@ from dataclasses import replace
 from math import inf
 from pathlib import Path
 from threading import Event, Timer
+from time import monotonic
 
 import pytest
 from demandops.base.errors import InvalidInput
@@ -171,6 +172,37 @@ def test_a_cluster_that_is_away_is_logged_without_its_secret_and_holds_up_nobody
         assert server.calls
     assert "cluster 'away' was not woken ([Errno 111] Connection refused; check that" in caplog.text
     assert "secret" not in caplog.text
+
+
+def test_a_new_kubeconfig_counts_at_the_next_try(
+    api: KubeApi, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    state, _ = start("experiment")
+    file = kubeconfig(tmp_path, "http://127.0.0.1:1")
+    waker = ReconcileTrigger({"c-its": ClusterAccess(kubeconfig=file)}, lambda since: ("", None))
+    waker(state.config)
+    wait_until(lambda: "was not woken" in caplog.text, "the first try")
+    kubeconfig(tmp_path, api.url)
+    wait_until(lambda: api.patches, "the next try")
+    waker.close()
+
+
+def test_two_calls_are_a_second_apart() -> None:
+    state, _ = start("experiment")
+    at: list[float] = []
+
+    def answer(call: Call) -> Answer:
+        at.append(monotonic())
+        return Answer()
+
+    with serving(answer) as server:
+        hook = ClusterAccess(receiver=f"{server.url}/hook/abc")
+        waker = ReconcileTrigger({"c-its": hook}, lambda since: ("", None))
+        for number in (1, 2):
+            waker(state.config)
+            wait_until(lambda: len(at) == number, f"call {number}")  # noqa: B023
+        waker.close()
+    assert at[1] - at[0] >= 1
 
 
 def test_an_odd_object_keeps_no_cluster_from_being_woken(api: KubeApi, tmp_path: Path) -> None:

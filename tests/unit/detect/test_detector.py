@@ -106,6 +106,14 @@ def test_a_changed_demand_is_wanted_with_the_values_of_the_events_start() -> Non
     assert changes(started(rule("a", near=NEAR)), changed) == {("a", ("car1",)): wanted}
 
 
+def test_a_changed_demand_is_not_wanted_without_the_values_that_a_restart_lost() -> None:
+    detector = Detector(file_of(rule("a", near=NEAR)), 0)
+    books = {"demands": {"a/car1": entry("r")}}
+    assert detector.resume(booked_events(detector.file, books), 0, 5)
+    changed = rule("a", near=NEAR, demand=demand(demand="{entity}", positions=POSITIONS))
+    assert changes(detector, changed) == {}
+
+
 def test_an_entity_that_does_not_come_back_after_a_restart_is_gone() -> None:
     detector = Detector(file_of(*RULES), 0)
     booked = booked_events(file_of(*RULES), {"demands": {"puts/bus1": entry("r")}})

@@ -234,6 +234,14 @@ def test_it_is_set_forward_and_a_full_term_is_granted(
         assert ended(expiry, ledger) == over
 
 
+def test_the_claims_of_a_demand_end_together(clock: Clock, expiry: LeaseExpiry) -> None:
+    ledger = leased(("d", 60, 0), ("d", 600, 0))
+    clock.set_by(3600)
+    for seconds, over in ((0, []), (61, []), (540, ["d", "d"])):
+        clock.pass_(seconds)
+        assert ended(expiry, ledger) == over
+
+
 def test_a_step_that_nobody_looked_at_is_noticed_later(clock: Clock, expiry: LeaseExpiry) -> None:
     ledger = leased(("a", 60, 0))
     clock.pass_(50)
