@@ -9,7 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from functools import partial
-from typing import Any
+from typing import Any, TypeGuard
 
 from demandops.base.errors import DemandOpsError, NotReached, Unsound, Withdrawn
 from demandops.base.quoting import one_line, quoted
@@ -115,6 +115,21 @@ class _Goal:
 
     def __str__(self) -> str:
         return f"goal {quoted(self.adapter.name(self.message))}"
+
+
+def awaits_releases(outcome: Receipt | BaseException, level: Level) -> TypeGuard[Receipt]:
+    # a waiting demand has no releases yet
+    return isinstance(outcome, Receipt) and level != "pushed" and outcome.outcome != "waiting"
+
+
+def rollout_answer(
+    receipt: Receipt, level: Level, health: Health
+) -> tuple[Receipt | NotReached, Level]:
+    if health.reaches(level):
+        return receipt, level
+    prefix = f"{health.object}: " if health.object else ""
+    message = f"{prefix}{health.reason}; the demand is {receipt.outcome} in {receipt.commit}"
+    return NotReached(level, message), "pushed"
 
 
 class DemandNode(Node):  # type: ignore[misc]
@@ -359,8 +374,8 @@ class DemandNode(Node):  # type: ignore[misc]
         if isinstance(outcome, Unsound):  # send no answer: the process ends
             return
         level = goal.adapter.answer_level(goal.message) or self._level
-        if not isinstance(outcome, Receipt) or level == "pushed" or outcome.outcome == "waiting":
-            self._finish(goal, outcome)  # a waiting demand has no releases yet
+        if not awaits_releases(outcome, level):
+            self._finish(goal, outcome)
             return
         status, problem = self._status, "this node has no access to the clusters"
         if status is not None:
@@ -372,15 +387,11 @@ class DemandNode(Node):  # type: ignore[misc]
         rolled_out = status.follow(
             outcome.commit, outcome.targets, level, self._timeout_s, partial(self._tell, goal)
         )
-        self._after(goal, rolled_out, partial(self._answer_rollout, outcome, level))
 
-    def _answer_rollout(self, receipt: Receipt, level: Level, goal: _Goal, health: Health) -> None:
-        if health.reaches(level):
-            self._finish(goal, receipt, level)
-            return
-        prefix = f"{health.object}: " if health.object else ""
-        message = f"{prefix}{health.reason}; the demand is {receipt.outcome} in {receipt.commit}"
-        self._finish(goal, NotReached(level, message))
+        def answer(goal: _Goal, health: Health) -> None:
+            self._finish(goal, *rollout_answer(outcome, level, health))
+
+        self._after(goal, rolled_out, answer)
 
     def _finish(
         self, goal: _Goal, outcome: Receipt | BaseException, reached: Level = "pushed"

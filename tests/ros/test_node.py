@@ -11,22 +11,21 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import rclpy
 from action_msgs.msg import GoalStatusArray
 from builtin_interfaces.msg import Time
+from demandops.base.errors import NotReached
 from demandops.base.quoting import is_visible
 from demandops.base.settings import DEFAULT_ACTION_NAME
 from demandops.cluster.health import Health
 from demandops.serve.queue import Receipt
 from demandops_interfaces.srv import GetBookkeeping
 from demandops_ros.actions import DemandAdapter
-from demandops_ros.demand_node import DemandNode
+from demandops_ros.demand_node import awaits_releases, rollout_answer
 from demandops_ros.ros_process import RosLogHandler
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.qos import qos_profile_action_status_default
@@ -94,32 +93,23 @@ def test_a_hostile_id_stands_on_one_line_in_result_and_log(shared: Served, calle
     assert is_visible(told[0]) and len(told[0]) < 5000
 
 
-@dataclass
-class Answers:
-    """What a node's methods need to answer a goal; it keeps the answers."""
-
-    _level: str = "healthy"
-    _status: Any = None
-    given: list[Any] = field(default_factory=list)
-
-    def _finish(self, goal: Any, outcome: Any, reached: str = "pushed") -> None:
-        self.given.append((outcome, reached))
-
-
-def test_a_level_that_is_not_reached_is_reported_with_what_became_of_the_demand() -> None:
-    adapter, answers = DemandAdapter(), Answers(_status=object())
-    goal: Any = SimpleNamespace(adapter=adapter, message=adapter.action.Goal(answer=2))
-    waiting = Receipt("o", "d", "waiting", "a commit")
-    DemandNode._answer(answers, goal, waiting)  # type: ignore[arg-type]
-    assert answers.given.pop() == (waiting, "pushed"), "a demand that waits gets no further"
+@pytest.mark.parametrize("outcome", ["booked", "released"])
+def test_a_level_that_is_not_reached_is_told_with_what_became_of_the_demand(outcome: Any) -> None:
+    receipt = Receipt("o", "d", outcome, "a commit")
     health = Health("reconciled", "is still being removed", "Deployment ns/one")
-    for outcome in ("booked", "released"):
-        receipt = Receipt("o", "d", outcome, "a commit")  # type: ignore[arg-type]
-        DemandNode._answer_rollout(answers, receipt, "healthy", goal, health)  # type: ignore[arg-type]
-        error, _ = answers.given.pop()
-        told = f"Deployment ns/one: is still being removed; the demand is {outcome} in a commit"
-        assert (error.level, str(error)) == ("healthy", told)
-        assert adapter.result(error, "pushed").code == "not-healthy"
+    assert rollout_answer(receipt, "reconciled", health) == (receipt, "reconciled")
+    error, reached = rollout_answer(receipt, "healthy", health)
+    assert isinstance(error, NotReached) and (error.level, reached) == ("healthy", "pushed")
+    told = f"Deployment ns/one: is still being removed; the demand is {outcome} in a commit"
+    assert str(error) == told
+    assert DemandAdapter().result(error, "pushed").code == "not-healthy"
+
+
+def test_only_a_booked_demand_waits_for_its_releases() -> None:
+    assert awaits_releases(Receipt("o", "d", "booked", "a commit"), "healthy")
+    assert not awaits_releases(Receipt("o", "d", "booked", "a commit"), "pushed")
+    assert not awaits_releases(Receipt("o", "d", "waiting", "a commit"), "healthy")
+    assert not awaits_releases(NotReached("healthy", "no"), "healthy")
 
 
 def test_a_debug_record_is_no_information(capfd: pytest.CaptureFixture[str]) -> None:
