@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from math import inf
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -18,7 +17,7 @@ import rclpy
 import yaml
 from builtin_interfaces.msg import Time
 from demandops.detect.rule_file import read
-from demandops_ros.detector.detector_node import DetectorNode
+from demandops_ros.detector.detector_node import read_bookkeeping
 from diagnostic_msgs.msg import DiagnosticArray
 from geometry_msgs.msg import PoseStamped
 from rclpy.executors import SingleThreadedExecutor
@@ -249,18 +248,13 @@ def test_leases_are_renewed_and_rules_are_reloaded_and_a_refused_demand_is_tried
     assert served.bookkeeping()["services"] == {}
 
 
-def test_bookkeeping_that_cannot_be_read_is_told_and_the_next_one_is_used(
+def test_bookkeeping_that_cannot_be_read_is_told_and_is_not_used(
     caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(logging.getLogger("demandops"), "propagate", True)
-    node = SimpleNamespace(
-        _detector=SimpleNamespace(file=read(rules_of(), "rules.yaml")),
-        _bookkeeping=None,
-    )
+    file = read(rules_of(), "rules.yaml")
     odd = ["", "null", "[]", "{", "[" * 100_000, '{"demands": []}', '{"demands": {"a": 1}}']
-    for text in (*odd, '{"demands": {}}'):
-        assert node._bookkeeping is None
-        DetectorNode._hear_books(node, SimpleNamespace(bookkeeping_json=text))
-    assert node._bookkeeping == {"demands": {}}
+    assert [read_bookkeeping(text, file) for text in odd] == [None] * len(odd)
+    assert read_bookkeeping('{"demands": {}}', file) == {"demands": {}}
     assert [record.levelname for record in caplog.records] == ["WARNING"] * len(odd)
     assert all("the bookkeeping cannot be read (" in line for line in caplog.messages)

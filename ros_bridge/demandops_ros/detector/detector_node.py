@@ -215,6 +215,20 @@ _UNHEARD_CLOCK = 0.0
 _SET_CLOCK_S = 1.0
 
 
+def read_bookkeeping(text: str, file: RuleFile) -> Mapping[str, Any] | None:
+    try:
+        bookkeeping: Mapping[str, Any] = json.loads(text)
+        booked_events(file, bookkeeping)
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        log.warning(
+            "the bookkeeping cannot be read (%r); check who publishes it; the next one is waited "
+            "for",
+            error,
+        )
+        return None
+    return bookkeeping
+
+
 class DetectorNode(Node):  # type: ignore[misc]
     def __init__(self, rules: str | None) -> None:
         super().__init__("demandops_detector")
@@ -271,17 +285,8 @@ class DetectorNode(Node):  # type: ignore[misc]
     # ---- start: find the demands of the earlier run ----
 
     def _hear_books(self, message: Any) -> None:  # noqa: ANN401 - a generated class
-        try:
-            bookkeeping = json.loads(message.bookkeeping_json)
-            booked_events(self._detector.file, bookkeeping)
-        except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
-            log.warning(
-                "the bookkeeping cannot be read (%r); check who publishes it; the next one is "
-                "waited for",
-                error,
-            )
-            return
-        self._bookkeeping = bookkeeping
+        heard = read_bookkeeping(message.bookkeeping_json, self._detector.file)
+        self._bookkeeping = self._bookkeeping if heard is None else heard
 
     def _say_what_is_missing(self) -> None:
         self._patience.cancel()
