@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 import yaml
-from demandops.model.demand.claim import Application
+from demandops.model.demand.demand import Application
 
 from tests.kit.config import skeleton
 from tests.kit.goals import CLOUD, application, connection, goal

@@ -22,7 +22,7 @@ from demandops.decide.admission.admitted_request import admit
 from demandops.decide.booking import apply
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.load import load
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.ledger import Ledger
 from demandops.repo.history import commit_message
 from demandops.serve.generator import Generator
@@ -129,7 +129,7 @@ def _lay_down(path: Path, edges: int, vehicles: int, further: int) -> None:
         for place in range(vehicles):
             request = admit(state, goal(edge_id(number), vehicle_id(number, place)))
             ledger, _ = apply(ledger, request, now)
-    files |= {claim_file.path_of(claim.key): claim_file.text_of(claim) for claim in ledger}
+    files |= {claim_files.path_of(claim.key): claim_files.text_of(claim) for claim in ledger}
     files |= rendered_files(State(config, ledger, state.evaluate))
     repo = pygit2.init_repository(str(path), bare=True, initial_head="main")
     pygit2.option(pygit2.enums.Option.ENABLE_FSYNC_GITDIR, 0)  # no fsync for now

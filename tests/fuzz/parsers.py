@@ -29,7 +29,8 @@ from demandops.detect.detector import Detector, Want
 from demandops.detect.observations import MessageReader, Observation, Unreadable
 from demandops.model.config import base_model, override
 from demandops.model.config.load import load
-from demandops.model.ledger import claim_file, records
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
 from demandops.repo.forge import ForgeError, Gitea, GitHub
 from demandops.repo.git import local_repository as addresses
 from demandops.repo.history import commit_log, revisions
@@ -204,14 +205,14 @@ def set_key(data: bytes) -> None:
 def claim(data: bytes) -> None:
     text, path = _text(data), "ledger/applications/00/x/x.yaml"
     try:
-        claim_file.read(text, path)
+        claim_files.read(text, path)
     except InvalidInput as error:
         (found, *_) = error.faults
         if not found.message.startswith("the ids in this file belong to "):
             raise
         path = found.message.removeprefix("the ids in this file belong to ").partition(";")[0]
-    read = claim_file.read(text, path)
-    assert claim_file.read(claim_file.text_of(read), path) == read
+    read = claim_files.read(text, path)
+    assert claim_files.read(claim_files.text_of(read), path) == read
     assert read.lease is None or read.lease.has_ended(NOW) in (True, False)
 
 
@@ -329,7 +330,7 @@ def revision(data: bytes) -> None:
 def moment(data: bytes) -> None:
     text = _text(data)
     for read, form in (
-        (claim_file.parse_timestamp, claim_file.format_timestamp),
+        (claim_files.parse_timestamp, claim_files.format_timestamp),
         (override.parse_time, override.format_time),
         (base_model.seconds_of, "{}s".format),
     ):

@@ -26,9 +26,9 @@ from demandops.decide.state import try_configuration
 from demandops.model.config.base_model import parse_file
 from demandops.model.config.load import load
 from demandops.model.config.override import Override, OverrideFile
-from demandops.model.demand.claim import ClaimKey
 from demandops.model.demand.demand_goal import _value_problem
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.history import commit_log, commit_message
 from demandops.repo.write.proposal_branch import branch_name
 from demandops.serve.approvals import proposal
@@ -166,9 +166,9 @@ def _below_its_folder(path: str) -> None:
 
 def ledger_path(ids: tuple[str, str]) -> None:
     for kind in SubjectKind:
-        path = claim_file.path_of(ClaimKey(Subject(kind, ids[0]), ids[1]))
+        path = claim_files.path_of(ClaimKey(Subject(kind, ids[0]), ids[1]))
         _below_its_folder(path)
-        assert claim_file.kind_of(path) is kind, path
+        assert claim_files.kind_of(path) is kind, path
 
 
 def name_of_object(ids: tuple[str, str]) -> None:

@@ -18,8 +18,9 @@ from demandops.decide.decision import Decision, decide, scale_down
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import Config
 from demandops.model.config.load import load
-from demandops.model.demand.claim import Claim
-from demandops.model.ledger import claim_file, records
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import RecentShutdowns
 from demandops.views.bookkeeping import as_data, bookkeeping
@@ -181,14 +182,14 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 def is_of_ledger(path: str) -> bool:
     roots = (records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT, records.WAITING_ROOT)
-    return bool(claim_file.kind_of(path)) or path.startswith(roots)
+    return bool(claim_files.kind_of(path)) or path.startswith(roots)
 
 
 def ledger_in(files: Mapping[str, str]) -> Ledger:
     """Return the ledger in ``files``; files that do not belong to a ledger are ignored."""
     booked = {path: text for path, text in files.items() if is_of_ledger(path)}
-    claims = [path for path in booked if claim_file.kind_of(path)]
-    ledger = rebuilt(claim_file.read(booked.pop(path), path) for path in claims)
+    claims = [path for path in booked if claim_files.kind_of(path)]
+    ledger = rebuilt(claim_files.read(booked.pop(path), path) for path in claims)
     return replace(
         ledger,
         shutdowns=records.read_all_shutdowns(booked),

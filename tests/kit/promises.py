@@ -7,7 +7,8 @@ from itertools import combinations
 from random import Random
 from typing import Any
 
-from demandops.model.demand.claim import Application, Claim, demand_id
+from demandops.model.demand.demand import Application
+from demandops.model.ledger.claim import Claim, demand_id
 
 from tests.model.leases import Goal, Subject, name_by_message
 

@@ -10,8 +10,7 @@ from demandops.model.config.override import OverrideFile
 from demandops.model.config.policy import AccessDomainsFile
 from demandops.model.config.registry import ChartsFile, ClientsFile, ImagesFile, VersionsFile
 from demandops.model.config.repo_settings import RepoSettings
-from demandops.model.demand.demand_goal import DemandGoal
-from demandops.model.demand.deployment_request_goal import WireGoal
+from demandops.model.demand.goals import DemandGoal, WireGoal
 from pydantic import BaseModel
 
 from tests.kit import plain_yaml

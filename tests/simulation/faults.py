@@ -25,8 +25,9 @@ from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning import overrides, planner, release_keys
 from demandops.model.config.appdef import Scaling
 from demandops.model.config.config import Config
-from demandops.model.demand.claim import Claim, Lease
-from demandops.model.ledger import claim_file, ledger
+from demandops.model.demand.demand import Lease
+from demandops.model.ledger import claim, ledger
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.records import RecentShutdowns, Wait, WaitingDemand
 from demandops.repo.git.remote_repository import RemoteRepository
 from demandops.repo.load import snapshot
@@ -308,7 +309,7 @@ def bring_back_what_was_deleted(
     for claim in before.state.ledger:
         if ledger.get(claim.key) is None:
             ledger = ledger.replace(claim.key, claim)
-            files[claim_file.path_of(claim.key)] = claim_file.text_of(claim)
+            files[claim_files.path_of(claim.key)] = claim_files.text_of(claim)
     follow(batch, advance, before, now)
     if files:
         author = batch._objects[advance.snapshot.commit].author

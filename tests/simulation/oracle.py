@@ -13,8 +13,8 @@ from typing import Any
 
 import pygit2
 from demandops.base.errors import InvalidInput, TurnedDown
-from demandops.model.demand.claim import Claim
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import Claim
 from demandops.repo import verification
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import MAIN
@@ -114,9 +114,9 @@ class Oracle:
         tree = trees.commit_of(self.world.remote, commit).tree
         found = {}
         for path, blob in trees.blobs(tree, ["ledger"]):
-            if claim_file.kind_of(path):
+            if claim_files.kind_of(path):
                 if blob.id not in self._parsed:
-                    self._parsed[blob.id] = claim_file.read(trees.text_of(blob), path)
+                    self._parsed[blob.id] = claim_files.read(trees.text_of(blob), path)
                 found[path] = self._parsed[blob.id]
         return found
 

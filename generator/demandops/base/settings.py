@@ -15,7 +15,7 @@ from typing import Final
 API_VERSION: Final = "demandops/v1"
 
 # `apiVersion` of every claim file
-LEDGER_API_VERSION = "demandops.ledger/v2"
+LEDGER_API_VERSION = "demandops.ledger/v3"
 
 # The version of rendering. It is increased whenever the same ledger and configuration render to
 # other bytes than before.

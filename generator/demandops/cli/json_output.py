@@ -18,8 +18,9 @@ from demandops.cli.output import painted, print_lines, terminal_width
 from demandops.cli.table import Table
 from demandops.model.config.override import Override, format_time
 from demandops.model.config.registry import ImagePin
-from demandops.model.demand.claim import Claim, Lease
-from demandops.model.ledger import claim_file
+from demandops.model.demand.demand import Lease
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import path_of
@@ -113,12 +114,12 @@ def claim_data(claim: Claim) -> Json:
         "demand": claim.demand,
         "request": claim.request,
         "version": (app and app.version) or None,
-        "place": claim_file.place_data(app.place) if app and app.place else None,
+        "place": claim_files.place_data(app.place) if app and app.place else None,
         "services": dict(sorted(app.services.items())) if app and app.services else None,
         "requesters": list(claim.requesters),
         "since": time_data(claim.booked),
         "lease": lease_data(claim.lease),
-        "file": claim_file.path_of(claim.key),
+        "file": claim_files.path_of(claim.key),
     }
 
 

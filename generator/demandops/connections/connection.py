@@ -9,13 +9,13 @@ from dataclasses import dataclass, field, fields, replace
 from operator import attrgetter
 from typing import Annotated, Any, ClassVar, Literal, Protocol, TypeVar
 
-from pydantic import Field
+from pydantic import Field, PlainSerializer, PlainValidator, Strict, StrictBool
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import Fault, fault
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.base.quoting import quoted
-from demandops.model.config.base_model import FrozenModel, without
+from demandops.model.config.base_model import PART, Items, plain_number, without
 from demandops.model.config.config import CLIENTS_FILE, Config, ConfigReader
 from demandops.model.config.inventory import Node
 from demandops.model.config.override import UNSHAPED, Shaping, patched_settings
@@ -27,26 +27,38 @@ from demandops.model.config.registry import ClientSettings
 # All valid options are here. Each connection type knows which of them it supports.
 
 
+MessageType = Annotated[
+    str, without(lambda value: naming.message_type_problem(value) if value else "")
+]
+
+
 @dataclass(frozen=True, slots=True)
 class Route:
-    """One topic that a connection carries.
+    """A topic of a connection; without ``target`` it has the same name at both ends.
 
     An option that has its default leaves the client's own behavior unchanged.
     """
 
-    source: str  # the topic's name on the source node
-    target: str
-    type: str = ""  # the ROS message type, like `std_msgs/msg/String`
-    reverse: bool = False  # messages go from the target to the source
+    __pydantic_config__: ClassVar = PART
+
+    source: str = ""  # the topic's name on the source node
+    target: str = ""
+    type: MessageType = ""  # the ROS message type, like `std_msgs/msg/String`
+    reverse: StrictBool = False  # messages go from the target to the source
     # Options of MQTT; with `primitive`, the payload is plain text or a number, not a ROS message
-    qos: int = 0
-    retained: bool = False
-    primitive: bool = False
+    qos: Annotated[int, Strict(), Field(ge=0, le=2)] = 0
+    retained: StrictBool = False
+    primitive: StrictBool = False
     # Options of the clients' ROS publishers and subscribers
-    reliability: str = ""
-    durability: str = ""
-    queue: int = 0
-    rate: float = 0.0  # the highest one in Hz; 0 for all messages
+    reliability: Literal["", "reliable", "best_effort"] = ""
+    durability: Literal["", "volatile", "transient_local"] = ""
+    queue: Annotated[int, Strict(), Field(ge=0, le=100_000)] = 0
+    # the highest one in Hz; 0 for all messages
+    rate: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False), plain_number] = 0.0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "source", naming.absolute_topic(self.source))
+        object.__setattr__(self, "target", naming.absolute_topic(self.target) or self.source)
 
     def options(self) -> dict[str, Any]:
         return {
@@ -78,26 +90,8 @@ _DEFAULTS = tuple(
 )
 
 
-MessageType = Annotated[
-    str, without(lambda value: naming.message_type_problem(value) if value else "")
-]
-
-
-class RouteOptions(FrozenModel):
-    """The options of a route in messages and files; the defaults are those of :class:`Route`."""
-
-    type: MessageType = ""
-    reverse: bool = False
-    qos: Annotated[int, Field(ge=0, le=2)] = 0
-    retained: bool = False
-    primitive: bool = False
-    reliability: Literal["", "reliable", "best_effort"] = ""
-    durability: Literal["", "volatile", "transient_local"] = ""
-    queue: Annotated[int, Field(ge=0, le=100_000)] = 0
-    rate: Annotated[float, Field(ge=0, le=100_000, allow_inf_nan=False, strict=False)] = 0.0
-
-    def route(self, source: str, target: str) -> Route:
-        return Route(source, target, **self.model_dump(include=set(RouteOptions.model_fields)))
+# The options of a route, in the order of its fields
+ROUTE_OPTIONS = tuple(name for name, _ in _DEFAULTS)
 
 
 def faults(where: str, routes: Iterable[Route]) -> Iterator[Fault]:
@@ -158,6 +152,21 @@ def merged_routes(routes: Iterable[Route]) -> tuple[Route, ...]:
 # ---- connections ----
 
 
+def _type_field() -> PlainValidator:
+    # called when a reader is built, because the types' modules need this one
+    from demandops.connections.connection_types import type_named, type_word  # noqa: PLC0415
+
+    word = type_word("auto")
+
+    def read(value: object) -> ConnectionType | None:
+        if value is None or isinstance(value, ConnectionType):
+            return value
+        checked = word.func(value)  # type: ignore[call-arg]
+        return None if checked == "auto" else type_named(str(checked))
+
+    return PlainValidator(read, json_schema_input_type=word.json_schema_input_type)
+
+
 @dataclass(frozen=True, slots=True)
 class Connection:
     """One connection and the topics that it carries.
@@ -166,12 +175,19 @@ class Connection:
     duplicates (:meth:`booked`).
     """
 
-    id: str
-    type: ConnectionType | None  # None if a demand leaves it open
-    source: str
-    target: str
-    broker: str  # empty if the generator chooses one
-    topics: tuple[Route, ...]
+    __pydantic_config__: ClassVar = PART
+
+    id: str = ""
+    # None if a demand leaves it open
+    type: Annotated[
+        ConnectionType | None,
+        _type_field(),
+        PlainSerializer(lambda kind: kind.word, when_used="unless-none"),
+    ] = None
+    source: str = ""
+    target: str = ""
+    broker: str = ""  # empty if the generator chooses one
+    topics: Items[Route] = ()
 
     @property
     def subject(self) -> Subject:
@@ -214,9 +230,6 @@ class Connection:
             and listed.target in ("", self.target)
             and listed.type in (None, self.type)
         )
-
-    def distinguishing_values(self) -> tuple[str, ...]:
-        return (self.source, self.target, self.known_type.word)
 
     def topic_keys(self) -> Iterator[TopicKey]:
         for route in self.topics:

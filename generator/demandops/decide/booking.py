@@ -6,33 +6,16 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 
+from demandops.model.demand.demand import Operation
 from demandops.base.errors import Fault, Refused, fault, suggestion
 from demandops.base.naming import Subject, SubjectKind, TopicKey
 from demandops.connections import connection as routes
 from demandops.connections.connection import Connection
 from demandops.decide.rollback import Restoration, restore
-from demandops.model.demand.claim import (
-    Application,
-    Claim,
-    ClaimKey,
-    Term,
-    demand_id,
-    renewed,
-    requesters_of,
-)
-from demandops.model.demand.demand_request import (
-    Decommission,
-    Demanded,
-    DemandRequest,
-    Expire,
-    Join,
-    Put,
-    Release,
-    Renew,
-    Shutdown,
-)
+from demandops.model.demand.demand import Application, Decommission, Demand, Item, Term, renewed
+from demandops.model.ledger.claim import Claim, ClaimKey, demand_id, requesters_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, claim_changes
-from demandops.model.ledger.records import RecentShutdown, Wait
+from demandops.model.ledger.records import Wait
 
 # ---- owners: the requesters for whom a demand that has an id holds claims or waits ----
 #
@@ -40,7 +23,7 @@ from demandops.model.ledger.records import RecentShutdown, Wait
 # demand id by chance, its requests cannot change the demand of the first requester.
 
 
-def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
+def is_waiting(ledger: Ledger, request: Demand) -> bool:
     """Return whether the request's demand waits; raise Refused if it is of others."""
     waiting = ledger.waiting.get(request.demand)
     if waiting is not None:
@@ -48,7 +31,7 @@ def is_waiting(ledger: Ledger, request: DemandRequest) -> bool:
     return waiting is not None
 
 
-def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
+def owned_claims(ledger: Ledger, request: Demand) -> tuple[Claim, ...]:
     """Return the claims of the demand; raise Refused if it holds none or is of others."""
     held = ledger.claims_of_demand(request.demand)
     if not held:
@@ -69,7 +52,7 @@ def owned_claims(ledger: Ledger, request: DemandRequest) -> tuple[Claim, ...]:
     return held
 
 
-def refuse_other_owners(owners: Sequence[str], request: DemandRequest) -> None:
+def refuse_other_owners(owners: Sequence[str], request: Demand) -> None:
     if owners and not set(owners) & set(request.requesters()):
         message = (
             f"'{request.demand}' is a demand of {', '.join(sorted(owners))}; name one of them, or "
@@ -81,7 +64,7 @@ def refuse_other_owners(owners: Sequence[str], request: DemandRequest) -> None:
 # ---- conflicts: a demand contradicts existing claims on the same application or connection ----
 
 
-def conflicts(item: Demanded, ledger: Ledger, *, above: bool = False) -> Iterator[Fault]:
+def conflicts(item: Item, ledger: Ledger, *, above: bool = False) -> Iterator[Fault]:
     """Yield the faults of an item that contradicts claims, or with ``above`` earlier items."""
     held = item.held
     if isinstance(held, Application):
@@ -93,7 +76,7 @@ def conflicts(item: Demanded, ledger: Ledger, *, above: bool = False) -> Iterato
         wait = "" if above else ", or wait until the application is released"
         for name, new, current, holding, remedy in (
             ("node", held.node, booked.node, "on", f"request node '{booked.node}'{wait}"),
-            ("appdef", held.appdef, booked.appdef, "as", "use another application id"),
+            ("type", held.appdef, booked.appdef, "as", "use another application id"),
         ):
             if new != current:
                 message = (
@@ -132,7 +115,7 @@ def _held(claim: Claim, above: bool) -> str:
 
 
 def _route_conflicts(
-    item: Demanded, demanded: Connection, claim: Claim, above: bool
+    item: Item, demanded: Connection, claim: Claim, above: bool
 ) -> Iterator[Fault]:
     held = _held(claim, above)
     by_source = {route.source: route for route in claim.connection.topics}
@@ -168,7 +151,7 @@ def _route_conflicts(
 
 def book(
     ledger: Ledger,
-    item: Demanded,
+    item: Item,
     request: str,
     key: ClaimKey,
     current: Claim | None,
@@ -191,7 +174,7 @@ def book(
     return ledger.replace(key, claim.after_booking(current))
 
 
-def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]:
+def join(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     # A goal of the reference's action adds to what its demand already holds.
     faults: list[Fault] = []
     start = ledger
@@ -221,14 +204,10 @@ def join(ledger: Ledger, request: Join, now: datetime) -> tuple[Ledger, Changes]
     changes = claim_changes(start, ledger, keys)
     if not changes:
         return start, Changes()
-    # A join that only renews claims keeps the records of recent shutdowns. If it removed the record
-    # of a shutdown, a repeat of this shutdown would count as a new one and end another demand.
-    adds = not all(change.only_renews for change in changes)
-    shutdowns, forgotten = start.shutdowns.forget(now, request.requesters() if adds else ())
-    return replace(ledger, shutdowns=shutdowns), Changes(claims=changes, shutdowns=forgotten)
+    return ledger, Changes(claims=changes)
 
 
-def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
+def put(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     # After a put, a demand with an id holds exactly what the put lists.
     start, demand = ledger, request.demand
     held = ledger.claims_of_demand(demand)
@@ -252,43 +231,34 @@ def put(ledger: Ledger, request: Put, now: datetime) -> tuple[Ledger, Changes]:
     return ledger.without_waiting(waited), changes
 
 
-def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger, Changes]:
-    """Take one hold from each requester that a shutdown names, on each topic that it lists.
+def shut_down(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
+    """Take what a shutdown lists from the claims of its own request id and requesters.
 
-    If several claims hold the topic for the requester, the hold is taken from the claim with the
-    shutdown's request id and requesters, else from the oldest other claim with this request id,
-    else from the oldest claim. If the shutdown lists no topic of an application or a connection, it
-    takes all holds that the requester has in the first of these claims. It never takes holds from
-    the claims of a demand that has an id.
+    Of an item that lists no topic, the whole claim is taken. Nothing else is touched: no claim of
+    another request id or of other requesters, and none of a demand that has an id.
     """
-    record = RecentShutdown.of(request, now)
-    repeats = ledger.shutdowns.earlier(record)
-    if repeats is not None:
-        return ledger, Changes(repeats=repeats)
-    start, not_held = ledger, list[str]()
-    taken: dict[tuple[ClaimKey, str], set[TopicKey]] = {}
+    start, not_held, keys = ledger, list[str](), list[ClaimKey]()
     for item in request.demanded:
-        own = demand_id(request.id, item.requesters)
-        for requester in item.requesters:
-            # look in the ledger before the request, so that a topic listed twice is taken once
-            claims = sorted(
-                (
-                    claim
-                    for claim in start.claims_held_by(requester, item.held.subject)
-                    if claim.joined and claim.held.matches_listed(item.held)
-                ),
-                key=lambda c: (c.demand != own, c.request != request.id, c.booked, c.demand),
-            )
-            for words, claim, held in _holds(item, requester, claims):
-                if claim is None:
-                    not_held.append(words)
-                else:
-                    taken.setdefault((claim.key, requester), set()).update(held)
-    for (key, requester), topics in taken.items():
-        left = ledger.get(key)
-        assert left is not None  # noqa: S101 - the requester's holds are in the claim until now
-        ledger = ledger.replace(key, left.without_holds(requester, topics))
-    if not taken:
+        subject = item.held.subject
+        key = ClaimKey(subject, demand_id(request.id, item.requesters))
+        claim = start.get(key)  # as before the request, so that a topic listed twice is taken once
+        listed = list(item.held.listed_topics(item.held))
+        if claim is None or not claim.joined or not claim.held.matches_listed(item.held):
+            not_held += [f"{subject}: {words}" for words, _ in listed] or [str(subject)]
+            continue
+        keys.append(key)
+        if not listed:
+            ledger = ledger.replace(key, None)
+            continue
+        gone = set[TopicKey]()
+        for words, topics in claim.held.listed_topics(item.held):
+            gone |= {*topics}
+            not_held += [] if topics else [f"{subject}: {words}"]
+        if (current := ledger.get(key)) is not None:
+            held = current.held.without_topics(gone)
+            ledger = ledger.replace(key, replace(current, held=held) if held else None)
+    changes = claim_changes(start, ledger, keys)
+    if not changes:
         similar = [
             f"{claim.subject} for {', '.join(claim.requesters)} ("
             + (
@@ -307,38 +277,10 @@ def shut_down(ledger: Ledger, request: Shutdown, now: datetime) -> tuple[Ledger,
         message = f"nothing that the shutdown lists is held; similar claims: {shown}"
         place = request.demanded[0].fault if request.demanded else fault
         raise Refused([place("id", message, code="not-held")])
-    shutdowns, forgotten = ledger.shutdowns.forget(now)
-    ledger = replace(ledger, shutdowns=shutdowns.replace(record.digest, record))
-    return ledger, Changes(
-        claims=claim_changes(start, ledger, [key for key, _ in taken]),
-        not_held=tuple(dict.fromkeys(not_held)),
-        shutdowns=(*forgotten, record.digest),
-    )
+    return ledger, Changes(claims=changes, not_held=tuple(dict.fromkeys(not_held)))
 
 
-def _holds(
-    item: Demanded, requester: str, claims: list[Claim]
-) -> Iterator[tuple[str, Claim | None, list[TopicKey]]]:
-    """Yield (text, first claim with matching holds, their keys) for each topic that is listed."""
-    subject = item.held.subject
-    listed = [words for words, _ in item.held.listed_topics(item.held)]
-    # who lists no topic means all of the first claim
-    if not claims or not listed:
-        first = next(iter(claims), None)
-        yield f"{subject} for {requester}", first, list(first.held.topic_keys()) if first else []
-        return
-    by_claim = [(claim, dict(claim.held.listed_topics(item.held))) for claim in claims]
-    for words in listed:
-        for claim, meant in by_claim:
-            held = [topic for topic in meant[words] if requester in claim.holders(topic)]
-            if held:
-                yield words, claim, held
-                break
-        else:
-            yield f"{subject}: {words} for {requester}", None, []
-
-
-def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
+def release_demand(ledger: Ledger, request: Demand) -> tuple[Ledger, Changes]:
     waited = (request.demand,) * is_waiting(ledger, request)
     held = ledger.claims_of_demand(request.demand) if waited else owned_claims(ledger, request)
     after = ledger.without(held).without_waiting(waited)
@@ -346,7 +288,7 @@ def release_demand(ledger: Ledger, request: Release) -> tuple[Ledger, Changes]:
     return after, Changes(claims=claims, waiting=waited)
 
 
-def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger, Changes]:
+def renew_leases(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     # a demand that waits has no lease yet, but its client may renew it already
     if is_waiting(ledger, request) and not ledger.claims_of_demand(request.demand):
         return ledger, Changes()
@@ -358,7 +300,7 @@ def renew_leases(ledger: Ledger, request: Renew, now: datetime) -> tuple[Ledger,
     return ledger, Changes(claims=claim_changes(start, ledger, [claim.key for claim in held]))
 
 
-def expire(ledger: Ledger, request: Expire, now: datetime) -> tuple[Ledger, Changes]:
+def expire(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     held = ledger.claims_of_demand(request.demand)
     ended = [claim for claim in held if claim.lease and claim.lease.has_ended(now)]
     after = ledger.without(ended)
@@ -414,13 +356,15 @@ def claims_needing(ledger: Ledger, node: str) -> list[Claim]:
 
 
 @dataclass(frozen=True, slots=True)
-class Drain(DemandRequest):
+class Drain(Demand):
     """The generator's request to move what it placed on the drained node ``id``.
 
     :mod:`.relocation` determines which claims change. ``moved`` and ``stays`` have a text about
     each application or service that moves or cannot move.
     """
 
+    operation: Operation = "drain"
+    is_complete: bool = True
     # One drain looks only for so many nodes, because demands wait meanwhile. It begins with the
     # application that follows ``after`` in the order of ids. If some are left for another drain,
     # ``last`` is the last one before them.
@@ -430,28 +374,27 @@ class Drain(DemandRequest):
     moved: tuple[str, ...] = ()
     stays: tuple[str, ...] = ()
 
-    operation = "drain"
 
-
-def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger, Changes]:
+def apply(ledger: Ledger, request: Demand, now: datetime) -> tuple[Ledger, Changes]:
     """Return the ledger after an admitted request is carried out, and the changes.
 
     If the same request is booked already, at most the leases of its claims change.
     ``docs/demand.md``, "How a demand is booked", says what each operation means.
     """
-    match request:
-        case Join():
+    match request.operation:
+        case "join":
             return join(ledger, request, now)
-        case Shutdown():
-            return shut_down(ledger, request, now)
-        case Put():
+        case "shutdown":
+            return shut_down(ledger, request)
+        case "put":
             return put(ledger, request, now)
-        case Release():
+        case "release":
             return release_demand(ledger, request)
-        case Renew():
+        case "renew":
             return renew_leases(ledger, request, now)
-        case Expire():
+        case "expire":
             return expire(ledger, request, now)
+    match request:
         case Decommission():
             return decommission(ledger, request)
         case Wait():
@@ -468,4 +411,4 @@ def apply(ledger: Ledger, request: DemandRequest, now: datetime) -> tuple[Ledger
             return after, Changes(claims=claim_changes(ledger, after, moved))
         case Restoration():
             return restore(ledger, request, now)
-    raise TypeError(f"{type(request).__name__} cannot be applied")
+    raise TypeError(f"a {request.operation} cannot be applied")

@@ -10,6 +10,7 @@ from datetime import datetime, timezone
 from types import MappingProxyType
 from typing import Any, Literal
 
+from demandops.model.demand.demand import Demand
 from demandops.base.errors import Fault, InvalidInput, OverLimit, Refused, fault
 from demandops.base.quoting import one_line
 from demandops.base.strict_yaml import load_all, short_repr
@@ -22,9 +23,9 @@ from demandops.model.config.appdef import ApplicationDefinition
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override
 from demandops.model.config.repo_settings import ROOT_FILE
-from demandops.model.demand.claim import Application, InputTopic
-from demandops.model.demand.demand_request import Demanded, Join
-from demandops.model.ledger import claim_file, records
+from demandops.model.demand.demand import Application, InputTopic, Item
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Changes, Ledger, World
 from demandops.model.release import Release, ServiceRelease
 from demandops.render import manifests, release_file
@@ -146,16 +147,8 @@ def _ledger_files(
     files: dict[str, str | None] = {}
     for change in changes.claims:
         checkpoint()
-        path = claim_file.path_of(change.key)
-        files[path] = claim_file.text_of(change.after) if change.after else None
-    for digest in changes.shutdowns:
-        shutdown = ledger.shutdowns.by_digest.get(digest)
-        path = records.shutdowns_path(digest)
-        files[path] = records.shutdowns_text(shutdown) if shutdown else None
-    for instance in changes.kept:
-        steps = ledger.kept.steps.get(instance)
-        path = records.replicas_path(instance)
-        files[path] = records.replicas_text(instance, steps) if steps else None
+        path = claim_files.path_of(change.key)
+        files[path] = claim_files.text_of(change.after) if change.after else None
     for demand in changes.waiting:
         waits = ledger.waiting.get(demand)
         files[records.waiting_path(demand)] = records.waiting_text(waits) if waits else None
@@ -271,7 +264,7 @@ def _trial_services(
         role: (InputTopic(f"/rehearsal/{role.replace('-', '_')}", node),) for role in appdef.inputs
     }
     app = Application(f"rehearsal/{appdef.name}", appdef.name, node, inputs, version=version)
-    request = Join("rehearsal", (Demanded(app, ("rehearsal",), str),))
+    request = Demand("join", "rehearsal", (Item(app, ("rehearsal",)),))
     ledger, changes = apply(Ledger(), request, _NEVER)
     before, after = World(config, Ledger()), World(config, ledger)
     for key in affected_keys(before, after, changes.claims):
@@ -425,7 +418,7 @@ def render_faults(world: World, evaluate: Evaluate, edited: Collection[str] = ()
         return []
     files: dict[ReleaseKey, list[str]] = {}
     for subject in sorted(world.ledger.claims, key=str):
-        paths = [claim_file.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
+        paths = [claim_files.path_of(claim.key) for claim in world.ledger.claims_on(subject)]
         for key in keys_of(world, subject):
             files.setdefault(key, []).extend(paths)
     faults: list[Fault] = []

@@ -7,23 +7,30 @@ after the remote got newer commits all call the same function.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import chain
-from typing import Literal
+from typing import Literal, TypeVar
 
 from demandops.base.errors import Fault, OverBudget, Refused, fault
 from demandops.base.naming import Subject
 from demandops.decide import changeset, rollback, warnings
-from demandops.decide.admission import admission, admitted_request, permission
-from demandops.decide.admission.admitted_request import Checkpoint, Throttle, admit, admitted, paced
+from demandops.decide.admission import admission, permission
+from demandops.decide.admission.completing import (
+    completed,
+    notes_on_instances,
+    placed,
+    with_definitions,
+    with_separate_instances,
+)
 from demandops.decide.booking import Drain, apply
 from demandops.decide.changeset import Changeset, FileReader, ReleaseChange
 from demandops.decide.checks import collisions, quotas, version_difference
-from demandops.decide.placement import capacity, relocation
-from demandops.decide.planning import planner
+from demandops.decide.placement import capacity, placement, relocation
+from demandops.decide.placement.candidates import NO_ROOM
 from demandops.decide.planning.flows import flows, without_idle_deliveries
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.planner import is_bridged
@@ -31,15 +38,12 @@ from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, ke
 from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
 from demandops.model.config.config import Config
-from demandops.model.config.override import format_time
-from demandops.model.demand import demand_goal
-from demandops.model.demand.claim import Application
-from demandops.model.demand.demand_request import Decommission, DemandRequest
-from demandops.model.ledger import claim_file
+from demandops.model.demand.demand import Application, Decommission, Demand
+from demandops.model.demand.goals import goal_field, read_goal
+from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import ledger as ledgers
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World
-from demandops.model.ledger.records import Instance, Wait
-from demandops.model.release import ServiceKey, ServiceRelease
+from demandops.model.ledger.records import Wait, WaitingDemand
 
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "restored", "unchanged", "waiting"]
@@ -63,7 +67,7 @@ class Decision:
     ``approval`` has the reasons why a person must approve the demand before it is booked.
     """
 
-    request: DemandRequest
+    request: Demand
     outcome: Outcome
     state: State
     changes: Changes
@@ -89,7 +93,7 @@ class Decision:
         waiting = self.state.ledger.waiting.get(self.request.demand)
         if waiting is not None:
             # which domain it will get is open, so any in which it may wait counts
-            put, config = demand_goal.parse(dict(waiting.goal))[0], self.state.config
+            put, config = waiting.put, self.state.config
             domains = (domain for domain in config.domains.values() if domain.when_full == "wait")
             terms = (permission.term(put, domain) for domain in domains)
             return min((term.seconds for term in terms if term), default=None)
@@ -100,26 +104,31 @@ class Decision:
         return min((claim.lease.seconds for claim in claims if claim.lease), default=None)
 
 
+# Yields faults if a demand comes too soon after others of its requesters.
+Throttle = Callable[[Demand, Config], Iterable[Fault]]
+# Is called often during a decision, and raises OverBudget to end it.
+Checkpoint = Callable[[], None]
+
+
 def decide(
     state: State,
     goal: object,
     now: datetime,
     read: FileReader,
     on_stage: Callable[[Stage], None] = lambda stage: None,
-    throttle: Throttle = lambda request, config: (),
+    throttle: Throttle = lambda demand, config: (),
     checkpoint: Checkpoint = lambda: None,
 ) -> Decision:
-    """Return the decision on a goal, or on a request that the generator makes itself.
+    """Return the decision on a demand, or on its goal as plain data.
 
-    Of the generator's own requests, only a :class:`Restoration` is checked against the
-    configuration and its policy.
+    A demand that is complete is not checked against the configuration and its policy again.
 
     Args:
         now: when the demand was received, with time zone.
         on_stage: called when the demand is admitted and when it is booked, each at most once.
             Later checks may still refuse an admitted demand.
-        throttle: called if all other checks of admission find no fault, perhaps twice for one goal.
-            It is not called for a :class:`Decommission` and for the generator's own requests.
+        throttle: called if all other checks of admission find no fault, perhaps twice for one
+            demand. It is not called for a :class:`Decommission` and for the generator's own.
         checkpoint: called often while a demand that may add claims is decided, and raises
             :class:`OverBudget` to end the decision. It can only refuse a demand, never change what
             is decided.
@@ -129,13 +138,19 @@ def decide(
             the demand takes too much work.
         InvalidInput: if a file of the state repo prevents the rendering of a valid demand.
     """
-    if isinstance(goal, DemandRequest):
-        return _decided(state, goal, now, read, on_stage)
+    demand = read_goal(goal, state.config.repo_settings.limits)
+    if demand.is_complete:
+        try:
+            return _carried_out(state, demand, now, read, on_stage)
+        except Refused as refused:
+            raise _refused(state, demand, refused.faults) from None
+    if not demand.adds_claims:  # what was booked must be released, however long that takes
+        checkpoint = _no_limit
     throttled, told = list[Fault](), set[Stage]()
 
     # who was throttled must not get another try on other nodes
-    def noted(request: DemandRequest, config: Config) -> list[Fault]:
-        throttled[:] = throttle(request, config)
+    def noted(demand: Demand, config: Config) -> list[Fault]:
+        throttled[:] = throttle(demand, config)
         return throttled
 
     def once(stage: Stage) -> None:
@@ -144,27 +159,129 @@ def decide(
             on_stage(stage)
 
     try:
-        request = admitted(state, goal, now, noted, checkpoint)
-        return _decided(state, request, now, read, once, checkpoint)
+        request = _admitted_or_waiting(state, demand, now, noted, checkpoint)
+        return _carried_out(state, request, now, read, once, checkpoint)
     except OverBudget as spent:
-        raise Refused([_too_large(spent)]) from None
+        raise _refused(state, demand, [_too_large(spent)]) from None
     except Refused as refused:
-        if throttled or any(each.code not in _BY_NODE for each in refused.faults):
-            raise
+        faults = refused.faults
         try:
             checkpoint()
             # Look for nodes on which the demand is not refused. To try many nodes takes time, but
             # only a demand that is refused on the nodes chosen first takes this time.
-            if admitted_request.leaves_nodes_open(state, goal):
+            if (
+                not throttled
+                and all(each.code in _BY_NODE for each in faults)
+                and placement.needs_placement(
+                    defined := with_definitions(demand, state.config), state
+                )
+                and defined.adds_claims
+            ):
                 checkpoint()
                 with suppress(Refused):
                     trials = _Trials(state, now, checkpoint)
-                    request = admit(state, goal, throttle, trials.succeeds, checkpoint)
-                    return _decided(state, request, now, read, once, checkpoint)
+                    request = admit(state, demand, throttle, trials.succeeds, checkpoint)
+                    return _carried_out(state, request, now, read, once, checkpoint)
         except OverBudget as spent:
             # keep the faults of the first refusal: they tell the requester what to change
-            raise Refused([_too_large(spent), *refused.faults]) from None
-        raise
+            faults = (_too_large(spent), *faults)
+        raise _refused(state, demand, faults) from None
+
+
+def _no_limit() -> None:
+    pass
+
+
+def _refused(state: State, demand: Demand, faults: Iterable[Fault]) -> Refused:
+    """Return the refusal with the fields of the demand's goal."""
+    config = state.config
+    roles = {
+        name: {str(wire): role for wire, role in appdef.deployment_request.inputs.items()}
+        for name, appdef in config.appdefs.items()
+        if appdef.deployment_request
+    }
+    named = with_definitions(demand, config)
+    return Refused(
+        each if each.file else replace(each, field=goal_field(each.field, named, roles))
+        for each in faults
+    )
+
+
+def _admitted_or_waiting(
+    state: State, demand: Demand, now: datetime, throttle: Throttle, checkpoint: Checkpoint
+) -> Demand:
+    """Return the completed demand, or its wait if it lacks only room and may wait."""
+    try:
+        return admit(state, demand, throttle, None, checkpoint)
+    except Refused as refused:
+        # the reference's action names no demand that could wait
+        if demand.operation != "put" or any(each.code != NO_ROOM for each in refused.faults):
+            raise
+        before = state.ledger.waiting.get(demand.demand)
+        mine = before is None or {*before.requesters} == {*demand.requesters()}
+        # a demand that holds claims keeps them when it is refused, so it cannot wait as well
+        holds = state.ledger.claims_of_demand(demand.demand)
+        asked = with_separate_instances(demand, state.config)
+        if holds or not mine or not placement.may_wait(asked, state, checkpoint):
+            raise
+        if faults := list(throttle(asked, state.config)):
+            raise Refused(faults) from None
+        # a demand that is sent again keeps its place among those that wait
+        waiting = WaitingDemand(demand, before.since if before else now)
+        reasons = tuple(each.message for each in refused.faults)
+        who = waiting.requesters
+        return Wait("wait", demand.id, (), demand.demand, who, waiting=waiting, reasons=reasons)
+
+
+_ITEM = re.compile(r"(applications|connections)\[(\d+)\]")
+
+
+def admit(
+    state: State,
+    demand: Demand,
+    throttle: Throttle = lambda demand, config: (),
+    trial: placement.Trial | None = None,
+    checkpoint: Checkpoint = _no_limit,
+) -> Demand:
+    """Return the completed demand, or raise Refused with all faults against the configuration.
+
+    If ``trial`` is given, a node is chosen only if ``trial`` accepts the demand with this node.
+    """
+    config = state.config
+    limits = config.repo_settings.limits
+    if faults := list(admission.size_faults(demand, limits)):
+        raise Refused(faults)
+    checkpoint()
+    request, faults = completed(demand, state, trial, checkpoint)
+    if isinstance(request, Decommission):
+        return request
+    # derived connections count as well
+    if large := list(admission.size_faults(request, limits)):
+        raise Refused(large)
+    checkpoint()
+    faults += _paced(admission.faults(request, config), checkpoint)
+    for item in _paced(request.demanded, checkpoint):  # an access domain may have many rules
+        faults += permission.faults(replace(request, demanded=(item,)), config)
+    # last, because a demand with faults does not count against the limits of its requesters
+    faults = faults or list(throttle(request, config))
+    if faults:
+
+        def item_of(each: Fault) -> tuple[str, int]:
+            match = _ITEM.match(each.field)
+            return (match[1], int(match[2])) if match else ("", 0)
+
+        # the faults of one application or connection are reported together
+        raise Refused(sorted(dict.fromkeys(faults), key=item_of))
+    return request
+
+
+_Each = TypeVar("_Each")
+
+
+def _paced(items: Iterable[_Each], checkpoint: Checkpoint) -> Iterator[_Each]:
+    for item in items:
+        checkpoint()
+        yield item
 
 
 def _too_large(spent: OverBudget) -> Fault:
@@ -188,7 +305,7 @@ class _Trials:
         self._state, self._now, self._checkpoint = state, now, checkpoint
         self._tried = self._items = 0
 
-    def succeeds(self, request: DemandRequest) -> bool:
+    def succeeds(self, request: Demand) -> bool:
         """Return whether a request, which names a node for each application, can be booked."""
         self._tried += 1
         self._items += admission.items_of(request)
@@ -198,11 +315,12 @@ class _Trials:
                 "too many nodes would have to be tried for this demand; name a node for each "
                 "application, or split the demand"
             )
-        request, config = admitted_request.completed(request, self._state), self._state.config
-        if next(admission.faults(request, config), None) or next(
-            admitted_request.permission_faults(request, config, self._checkpoint), None
-        ):
+        request, config = placed(request, self._state), self._state.config
+        if next(admission.faults(request, config), None):
             return False
+        for item in _paced(request.demanded, self._checkpoint):
+            if next(permission.faults(replace(request, demanded=(item,)), config), None):
+                return False
         try:
             _booked(self._state, request, self._now, self._checkpoint)
         except Refused:
@@ -210,17 +328,16 @@ class _Trials:
         return True
 
 
-def _decided(
+def _carried_out(
     state: State,
-    request: DemandRequest,
+    request: Demand,
     now: datetime,
     read: FileReader,
-    on_stage: Callable[[Stage], None],
-    checkpoint: Checkpoint = lambda: None,
+    on_stage: Callable[[Stage], None] = lambda stage: None,
+    checkpoint: Checkpoint = _no_limit,
 ) -> Decision:
+    """Return the decision on a demand that is admitted: book, plan and render it."""
     config = state.config
-    # what was booked must be released, however long that takes
-    checkpoint = checkpoint if request.adds_claims else lambda: None
     if isinstance(request, Drain):
         request = relocation.with_moves(request, state, state.usage(), state.names(), MOST_TRIALS)
     if isinstance(request, Restoration):
@@ -283,7 +400,7 @@ def _decided(
 
 
 def _booked(
-    state: State, request: DemandRequest, now: datetime, checkpoint: Checkpoint
+    state: State, request: Demand, now: datetime, checkpoint: Checkpoint
 ) -> tuple[State, Changes, tuple[ReleaseKey, ...]]:
     checkpoint()
     subjects = request.subjects()
@@ -314,11 +431,9 @@ def _booked(
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
-    ledger, kept = planner.with_kept_replicas(state, after, keys, now)
-    after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
-    clashes = list(collisions.topic_faults(request, state, after, paced(keys, checkpoint)))
+    clashes = list(collisions.topic_faults(request, state, after, _paced(keys, checkpoint)))
     clashes += collisions.name_faults(
-        request, state, after, paced(keys, checkpoint), changes, state.names()
+        request, state, after, _paced(keys, checkpoint), changes, state.names()
     )
     for change in changes.claims if isinstance(request, Restoration) else ():
         clashes += collisions.faults_of_claim(change.after, state, after) if change.after else ()
@@ -327,27 +442,11 @@ def _booked(
     return after, changes, keys
 
 
-def scale_down(
-    state: State, instance: Instance, now: datetime, read: FileReader
-) -> tuple[State, changeset.Changeset]:
-    kept = state.ledger.kept
-    steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
-    after = replace(state, ledger=replace(state.ledger, kept=kept.replace(instance, steps)))
-    changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
-    change = changeset.build_changeset(
-        state, after, changes, keys, state.evaluate, read, state.plans
-    )
-    grown = capacity.growth(change.former, change.plans, state.config)
-    return state.followed_by(after.ledger, change, state.usage().plus(grown)), change
-
-
 # ---- notes for the requester, in addition to the outcome ----
 
 
-def notes_on(
-    request: DemandRequest, after: World, changes: Changes, rendered: Changeset
-) -> Iterator[str]:
-    yield from admitted_request.notes(request)
+def notes_on(request: Demand, after: World, changes: Changes, rendered: Changeset) -> Iterator[str]:
+    yield from notes_on_instances(request)
     # a connection that an override denies carries nothing
     ledger = without_suspended(after).ledger
     for item in request.demanded if request.adds_claims else ():
@@ -371,21 +470,11 @@ def notes_on(
                 )
     yield from warnings.notes(request, after)
     yield from rendered.blocked
-    if changes.repeats is not None:
-        at = f"{changes.repeats.at:%Y-%m-%d %H:%M:%S} UTC"
-        yield f"the same shutdown was carried out at {at}, so this one releases nothing more"
     if isinstance(request, Drain):
         yield from request.stays
     if isinstance(request, Wait):
         yield from request.reasons
     yield from quotas.warnings(request, after)
-    for release in (rendered.plans.get(ServiceKey.of(instance)) for instance in changes.kept):
-        if isinstance(release, ServiceRelease) and release.keeps:
-            until = format_time(release.keeps.until)
-            yield (
-                f"{release.name} keeps {release.replicas} replicas until {until} (downAfter in its "
-                "definition), although its demands need fewer"
-            )
 
 
 # ---- claims that a person edits in the ledger ----
@@ -411,7 +500,7 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
         # an edit that only takes requesters away has the effect of a release, which is allowed
         if (
             (old := change.before)
-            and replace(claim, requesters=old.requesters, partial=old.partial) == old
+            and replace(claim, requesters=old.requesters) == old
             and {*claim.requesters} <= {*old.requesters}
         ):
             continue
@@ -422,7 +511,7 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
             quotas.quota_faults(before, after, Changes((change,))),
         )
         for each in malformed or allowed:
-            yield each.within(claim_file.path_of(claim.key))
+            yield each.within(claim_files.path_of(claim.key))
         yield from collisions.faults_of_claim(claim, before, after)
         keys, changed = keys_of_claims(after, [claim]), Changes((change,))
         faults = list(collisions.name_faults(wanted, before, after, keys, changed, after.names()))
@@ -433,4 +522,4 @@ def faults_of_edit(before: World, after: State, changes: Iterable[ClaimChange]) 
             usage = after.usage().plus({need: -amount for need, amount in grown.items()})
             faults += capacity.faults(usage, grown, config)
         for each in faults:
-            yield each.within(claim_file.path_of(claim.key))
+            yield each.within(claim_files.path_of(claim.key))

@@ -10,20 +10,22 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import datetime
 
+from demandops.model.demand.demand import Operation
 from demandops.base.errors import Fault, Refused, fault
 from demandops.decide.admission import admission, permission
-from demandops.model.demand.claim import Claim, Term
-from demandops.model.demand.demand_request import Demanded, DemandRequest, Put
-from demandops.model.ledger.claim_file import path_of
+from demandops.model.demand.demand import Demand, Item, Term
+from demandops.model.ledger.claim import Claim, path_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
 
 _SHOWN = 20
 
 
 @dataclass(frozen=True, slots=True)
-class Restoration(DemandRequest):
+class Restoration(Demand):
     """A person's request to restore the claims of the commit ``to``, which was made at ``made``."""
 
+    operation: Operation = "rollback"
+    is_complete: bool = True
     to: str = ""
     made: datetime | None = None
     claims: tuple[Claim, ...] = ()
@@ -31,8 +33,6 @@ class Restoration(DemandRequest):
     reason: str = ""
     by: str = ""
     email: str = ""
-
-    operation = "rollback"
 
 
 def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger, Changes]:
@@ -62,11 +62,8 @@ def restore(ledger: Ledger, request: Restoration, now: datetime) -> tuple[Ledger
             lease = Term(restored.lease.seconds, restored.lease.slack).lease_from(now)
             restored = replace(restored, lease=lease)
         ledger = ledger.replace(change.key, restored)
-    booked = {who for change in changes if change.after for who in change.after.requesters}
-    shutdowns, forgotten = start.shutdowns.forget(now, booked)
-    return replace(ledger, shutdowns=shutdowns), Changes(
-        claims=claim_changes(start, ledger, [change.key for change in changes]), shutdowns=forgotten
-    )
+    keys = [change.key for change in changes]
+    return ledger, Changes(claims=claim_changes(start, ledger, keys))
 
 
 def _changes(ledger: Ledger, request: Restoration) -> list[ClaimChange]:
@@ -95,11 +92,12 @@ def faults(request: Restoration, world: World) -> Iterator[Fault]:
             yield each.within(path_of(change.key))
 
 
-def request_for(claim: Claim) -> Put:
+def request_for(claim: Claim) -> Demand:
     """Return a request that books this claim; its faults name fields of the claim."""
-    return Put(
+    return Demand(
+        "put",
         id=claim.request,
-        demanded=(Demanded(claim.held, claim.requesters, str),),
+        demanded=(Item(claim.held, claim.requesters),),
         demand=claim.demand,
         lease_s=claim.lease.seconds if claim.lease else None,
     )

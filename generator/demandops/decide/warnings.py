@@ -21,9 +21,8 @@ from demandops.decide.planning.flows import flows
 from demandops.decide.planning.overrides import without_suspended
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
-from demandops.model.demand.claim import Application
-from demandops.model.demand.demand_request import DemandRequest
-from demandops.model.ledger import claim_file
+from demandops.model.demand.demand import Application, Demand
+from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.ledger import World
 from demandops.templating import charts
 
@@ -51,7 +50,7 @@ def missing_inputs(world: World) -> list[MissingInput]:
     # Suspended claims need no topics, and suspended connections carry none.
     active = without_suspended(world)
     missing = {
-        MissingInput(claim.application.id, claim_file.path_of(claim.key), reason)
+        MissingInput(claim.application.id, claim_files.path_of(claim.key), reason)
         for claim in active.ledger
         if claim.is_on_application
         for reason in _reasons(claim.application, active)
@@ -97,7 +96,7 @@ _WORD = re.compile(r"[A-Za-z]+")
 _SHORT = 4
 
 
-def notes(request: DemandRequest, world: World) -> Iterator[str]:
+def notes(request: Demand, world: World) -> Iterator[str]:
     if request.adds_claims:
         known = _KnownTopics(world)
         for item in request.demanded:
@@ -106,9 +105,9 @@ def notes(request: DemandRequest, world: World) -> Iterator[str]:
 
 def misspelled_topic_warnings(world: World) -> Iterator[Fault]:
     known = _KnownTopics(world)
-    for claim in sorted(world.ledger, key=lambda claim: claim_file.path_of(claim.key)):
+    for claim in sorted(world.ledger, key=lambda claim: claim_files.path_of(claim.key)):
         for note in known.notes_on(claim.held):
-            yield fault("", note).within(claim_file.path_of(claim.key))
+            yield fault("", note).within(claim_files.path_of(claim.key))
 
 
 class _KnownTopics:

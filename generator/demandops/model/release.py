@@ -12,8 +12,9 @@ from demandops.model.config.inventory import Node
 from demandops.model.config.override import UNSHAPED, Shaping, format_time
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ApplicationVersion, ChartSource, Image
-from demandops.model.demand.claim import Claim, InputTopic
+from demandops.model.demand.demand import InputTopic
 from demandops.model.ledger import records
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import Instance, Kept
 

@@ -24,9 +24,9 @@ from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.load import load
 from demandops.model.config.repo_settings import ROOT_FILE
-from demandops.model.demand.claim import ClaimKey
-from demandops.model.ledger import claim_file, records
-from demandops.model.ledger.claim_file import LEDGER_ROOT
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.claim import LEDGER_ROOT, ClaimKey
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.release import ServiceRelease
 from demandops.repo import reader
@@ -157,9 +157,9 @@ def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
     written = {}
     for path, text in files.items():
         new = text
-        if claim_file.kind_of(path) is not None:
-            claim = ledger.get(claim_file.read(text, path).key)
-            new = claim_file.text_of(claim) if claim else text
+        if claim_files.kind_of(path) is not None:
+            claim = ledger.get(claim_files.read(text, path).key)
+            new = claim_files.text_of(claim) if claim else text
         elif records.read_ended_override({path: text}):
             new = strict_yaml.set_key(text, "apiVersion", LEDGER_API_VERSION)
         if new != text:

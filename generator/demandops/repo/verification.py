@@ -15,8 +15,9 @@ from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.config.repo_settings import ROOT_FILE
-from demandops.model.demand.claim import OVERRIDE_PREFIX
-from demandops.model.ledger import claim_file, records
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.claim import OVERRIDE_PREFIX
 from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.ledger.records import Instance
 from demandops.model.release import Release
@@ -52,14 +53,14 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     demands = {*entry.trailers.get("Demand-Id", ())}
     for path in entry.trailers.get("Override", ()):  # claims that a `keep` override adds
         demands.add(OVERRIDE_PREFIX + path.rsplit("/", 1)[-1].removesuffix(".yaml"))
-    named = {f"{claim_file.segment(demand)}.yaml" for demand in demands}
+    named = {f"{claim_files.segment(demand)}.yaml" for demand in demands}
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
         if root in (*GENERATED_ROOTS, NOTES_ROOT) or (path == ROOT_FILE and operation == "upgrade"):
             continue
         if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
             continue
-        if root != claim_file.LEDGER_ROOT:
+        if root != claim_files.LEDGER_ROOT:
             yield path
         elif path.startswith(_RECORDS):
             if not _may_record(commit, path, operation):
@@ -89,7 +90,7 @@ def _is_canonical(commit: Commit, path: str) -> bool:
         waits = records.read_waiting(text, path)
         return waits is not None and records.waiting_text(waits) == text
     claim = ledger_files.valid_claim_at(commit.tree, path)
-    return claim is not None and claim_file.text_of(claim) == trees.read_text(commit.tree, path)
+    return claim is not None and claim_files.text_of(claim) == trees.read_text(commit.tree, path)
 
 
 def _may_record(commit: Commit, path: str, operation: str) -> bool:

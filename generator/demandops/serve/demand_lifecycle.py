@@ -177,7 +177,7 @@ class Demands:
                 if (error := self._why_refused(ticket, len(taken))) is not None:
                     refused.append((ticket, error))
                     continue
-                self._of_requester[queue.requester_of(ticket.goal)] += 1
+                self._of_requester[ticket.requester] += 1
                 self._tickets[ticket.operation] = ticket
                 taken.append(ticket)
             try:
@@ -192,7 +192,7 @@ class Demands:
                 self.wake()  # so that the worker ends the process if the journal is unsound
                 for ticket in taken:
                     del self._tickets[ticket.operation]
-                    self._of_requester[queue.requester_of(ticket.goal)] -= 1
+                    self._of_requester[ticket.requester] -= 1
                     refused.append((ticket, why))
                 taken = []
             for ticket in taken:
@@ -217,7 +217,7 @@ class Demands:
         if ticket.operation in self._tickets:
             message = "is the operation id of another demand; choose a new one"
             return errors.Refused([errors.fault("", f"'{ticket.operation}' {message}")])
-        who = queue.requester_of(ticket.goal)
+        who = ticket.requester
         if (limit := self._requester_limit) is not None and self._of_requester[who] >= limit:
             whose = f"of {quoted(who)}" if who else "without a requester"
             return QueueFull(
@@ -346,14 +346,14 @@ class Demands:
         self.fail(left, error, keep=True)
 
     def _enqueue(self, ticket: Ticket) -> None:
-        self._of_requester[queue.requester_of(ticket.goal)] += 1
+        self._of_requester[ticket.requester] += 1
         self._queue.append(ticket)
 
     def _leave(self, ticket: Ticket) -> None:
         # a proposed demand left the count of its requester already
         if ticket.proposal is None:
             # this difference drops a requester at 0, so that passing vehicles leave nothing behind
-            self._of_requester -= Counter([queue.requester_of(ticket.goal)])
+            self._of_requester -= Counter([ticket.requester])
 
 
 def _may_become(ticket: Ticket, state: State) -> bool:

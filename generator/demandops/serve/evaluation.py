@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 from math import inf
-from typing import Any
 
 from demandops.base.errors import DemandOpsError, InvalidInput, Refused, Withdrawn, fault, internal
-from demandops.base.settings import API_VERSION
 from demandops.decide.decision import Decision, Outcome, decide
 from demandops.decide.rollback import Restoration
-from demandops.model.demand.demand_request import Decommission
+from demandops.model.demand.demand import Demand, Rollback
 from demandops.repo.git.repository import StateRepository, disk_error
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history.commit_log import operations_since
@@ -18,47 +16,10 @@ from demandops.repo.load.ledger_files import restoration
 from demandops.repo.load.snapshot import Snapshot
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.approvals.approvals import Approvals, Result
-from demandops.serve.approvals.proposal import is_release
 from demandops.serve.demand_lifecycle import TAKEN_BACK, Demands
 from demandops.serve.queue import Receipt, Ticket
 from demandops.serve.timing.pauses_and_limits import RateLimit, within
 from demandops.templating.evaluator import DEMAND_S, processor_time
-
-# ---- a rollback as a goal: plain data that passes queue and journal like a demand ----
-#
-# Only the command line makes this goal; actions and request files cannot contain it. The goal is
-# evaluated on the newest tip, so a rollback works while others write. What others book until then
-# counts as newer than the commit to roll back to.
-
-_KIND = "Rollback"
-
-
-def goal(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> dict[str, Any]:
-    return {
-        "apiVersion": API_VERSION,
-        "kind": _KIND,
-        "to": to,
-        "dropNewer": drop_newer,  # without it, newer claims make the rollback fail
-        "reason": " ".join(reason.split()),
-        "by": list(who),
-    }
-
-
-def is_rollback(goal: object) -> bool:
-    return isinstance(goal, dict) and goal.get("kind") == _KIND
-
-
-def to_restoration(
-    goal: dict[str, Any], repository: StateRepository, head: Snapshot
-) -> Restoration:
-    to = str(goal["to"])
-    if not repository.includes(str(head.commit), to):
-        message = f"commit {to} is not in the history of the state repo; roll back to one that is"
-        raise Refused([fault("", message)])
-    by, email = goal["by"]
-    more = {"drop_newer": bool(goal["dropNewer"]), "reason": goal["reason"]}
-    return restoration(repository.objects, to, **more, by=by, email=email)
-
 
 # ---- one demand; if it fails, the others of the batch continue ----
 
@@ -76,21 +37,18 @@ class Evaluator:
         if ticket.state == "withdrawn":
             return Withdrawn(TAKEN_BACK)
         try:
-            goal = ticket.goal
-            if is_rollback(goal):
-                goal = to_restoration(goal, self._repository, commits.start)
+            demand: Demand = ticket.demand
+            if isinstance(demand, Rollback):
+                demand = self._restoration(demand, commits.start)
             state = commits.head.state
             # of all services, once for each configuration; that is not this demand's work
             state.usage()
             state.names()
-            adds_claims = (
-                isinstance(goal, dict) and not is_release(goal) and not Decommission.is_goal(goal)
-            )
             # what was booked must be released or restored, however long all of it takes
-            with processor_time(each=DEMAND_S, together=DEMAND_S if adds_claims else inf):
+            with processor_time(each=DEMAND_S, together=DEMAND_S if demand.adds_claims else inf):
                 decision = decide(
                     state,
-                    goal,
+                    demand,
                     ticket.received,
                     commits.read,
                     lambda stage: ticket.notify(stage, stage),
@@ -120,7 +78,7 @@ class Evaluator:
             if ticket.has_released:  # the demand released a proposal, which had no claims yet
                 commits.record_in_next_commit(ticket.operation, "released")
                 commit = str(commits.head.commit)
-                return Receipt(ticket.operation, ticket.name, "released", commit)
+                return Receipt(ticket.operation, ticket.demand.id, "released", commit)
             commits.record_in_next_commit(ticket.operation, "refused")
             return error
         except SigningFailed as error:
@@ -131,6 +89,13 @@ class Evaluator:
                 raise reason from None
             log.exception("internal error while evaluating demand %s", ticket.operation)
             return internal(error)
+
+    def _restoration(self, rollback: Rollback, head: Snapshot) -> Restoration:
+        to = rollback.to
+        if not self._repository.includes(str(head.commit), to):
+            message = f"commit {to} is not in the history of the state repo; roll back to one that "
+            raise Refused([fault("", f"{message}is")])
+        return restoration(self._repository.objects, rollback)
 
     def published_before(self, tip: str, batch: list[Ticket]) -> list[Result]:
         # Oldest first, the results of those demands that main records already. They have no answer
@@ -156,10 +121,10 @@ class Evaluator:
             outcome: Outcome = "booked"
             if record.outcome != "changed":
                 outcome = record.outcome
-            elif is_rollback(ticket.goal):
+            elif ticket.demand.operation == "rollback":
                 outcome = "restored"
-            elif is_release(ticket.goal) or Decommission.is_goal(ticket.goal):
+            elif ticket.demand.is_release or ticket.demand.operation == "decommission":
                 outcome = "released"
-            receipt = Receipt(ticket.operation, ticket.name, outcome, record.commit)
+            receipt = Receipt(ticket.operation, ticket.demand.id, outcome, record.commit)
             results.append((ticket, receipt))
         return results

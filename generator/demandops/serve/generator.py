@@ -2,18 +2,18 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import re
 from collections.abc import Callable
 from concurrent.futures import Future
 from pathlib import Path
 
-from demandops.base import settings, strict_yaml
-from demandops.base.errors import Refused, fault
+from demandops.base import settings
+from demandops.base.errors import Refused
 from demandops.base.runtime import REAL, Runtime
-from demandops.decide.admission import admission
 from demandops.model.config.config import Config
+from demandops.model.demand.demand import Demand
+from demandops.model.demand.goals import read_goal
 from demandops.repo.git.local_repository import connect
 from demandops.repo.git.repository import access_error, reading
 from demandops.repo.git.signing import Signer
@@ -33,6 +33,7 @@ _STOP_TIMEOUT_S = 5.0
 # How much longer a stop waits for the threads; a running call of git or ssh-keygen ends in it.
 _GRACE_S = 5.0
 _OPERATION = re.compile(r"[A-Za-z0-9_.-]{1,100}")
+_UNREAD = Demand("put")  # of a ticket whose goal cannot be read
 
 
 class Generator:
@@ -135,7 +136,9 @@ class Generator:
         operation: str | None = None,
         listener: Listener = lambda stage, text: None,
     ) -> Ticket:
-        """Queue a demand and return its ticket at once, with every error in the ticket's future.
+        """Queue a demand, or its goal as plain data, and return its ticket at once.
+
+        Every error is in the ticket's future.
 
         One that was not accepted has ``ShuttingDown``, ``QueueFull``, ``Refused`` or
         ``StateRepoError``, and its listener is not called. If the generator ends before the demand
@@ -148,22 +151,13 @@ class Generator:
             message = f"{operation!r} is not an operation id; use at most 100 letters, digits, "
             message += "dashes, dots and underscores"
             raise ValueError(message)
-        ticket = Ticket(operation, goal, self._runtime.now(), listener)
-        try:
-            # exactly what a restart would read from the journal, so that it decides the same
-            ticket.goal = json.loads(json.dumps(goal))
-            is_deep = _is_deeper(ticket.goal, strict_yaml.MAX_DEPTH)
-        except (TypeError, ValueError, RecursionError):
-            is_deep = True
-        if is_deep:
-            message = f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} "
-            message += "deep; give only text, numbers, true, false, null, lists and mappings"
-            ticket.refuse(Refused([fault("", message)]))
-            return ticket
-        # here, so that a huge goal is not journaled, and does not wait in the queue
+        ticket = Ticket(operation, _UNREAD, self._runtime.now(), listener)
         limits = self.snapshot.state.config.repo_settings.limits
-        if large := list(admission.length_faults(ticket.goal, limits)):
-            ticket.refuse(Refused(large))
+        try:
+            # here, so that what cannot be read is not journaled, and does not wait in the queue
+            ticket.demand = read_goal(goal, limits)
+        except Refused as refused:
+            ticket.refuse(refused)
             return ticket
         ticket.base = str(self.snapshot.commit)
         self._demands.arrive(ticket)
@@ -215,9 +209,3 @@ class Generator:
     def close(self, timeout: float = _STOP_TIMEOUT_S) -> bool:
         return self.stop(timeout).result()
 
-
-def _is_deeper(value: object, levels: int) -> bool:
-    if not isinstance(value, dict | list):
-        return False
-    parts = value.values() if isinstance(value, dict) else value
-    return levels == 0 or any(_is_deeper(part, levels - 1) for part in parts)

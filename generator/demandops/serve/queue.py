@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Hashable, Iterable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Any, Literal
+from typing import Literal
 
 from demandops.base.errors import DemandOpsError, InvalidInput
 from demandops.base.quoting import quoted
 from demandops.cluster.health import Target
 from demandops.decide.decision import Decision, Outcome
+from demandops.model.demand.demand import Demand
+from demandops.model.demand.goals import read_journaled
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo.write.journal import JournalEntry, ProposalRecord
 
@@ -59,7 +61,7 @@ class Receipt:
 @dataclass(eq=False)
 class Ticket:
     operation: str
-    goal: Any
+    demand: Demand
     received: datetime
     listener: Listener = lambda stage, text: None
     future: Future[Receipt] = field(default_factory=Future)
@@ -81,11 +83,8 @@ class Ticket:
             future.set_running_or_notify_cancel()  # a demand is withdrawn, not canceled
 
     @property
-    def name(self) -> str:
-        # the goal may be invalid, or name no id
-        fields = self.goal if isinstance(self.goal, dict) else {}
-        keys = ("id", "request", "demand", "name")
-        return str(next((fields[key] for key in keys if fields.get(key)), ""))
+    def requester(self) -> str:  # the first; empty if there is none
+        return next(iter(self.demand.requesters()), "")
 
     def refuse(self, error: DemandOpsError) -> None:
         # only a demand that is not in the journal yet
@@ -111,7 +110,7 @@ class Ticket:
 
     def journal_entry(self, proposal: ProposalRecord | None = None) -> JournalEntry:
         received = self.received.isoformat()
-        return JournalEntry(self.operation, self.goal, received, self.base, proposal)
+        return JournalEntry(self.operation, self.demand.goal, received, self.base, proposal)
 
 
 def receipt_of(
@@ -136,14 +135,15 @@ def reason_of(error: DemandOpsError) -> str:
 
 
 def ticket_from_journal(entry: JournalEntry) -> Ticket:
-    ticket = Ticket(entry.operation, entry.goal, datetime.fromisoformat(entry.received))
-    demand = f"demand {ticket.operation} ({quoted(ticket.name)}) from the journal"
+    demand = read_journaled(entry.goal)
+    ticket = Ticket(entry.operation, demand, datetime.fromisoformat(entry.received))
+    name = f"demand {ticket.operation} ({quoted(demand.id)}) from the journal"
 
     def tell(stage: Stage, text: str) -> None:
         if stage in ("proposed", "pushed"):
-            log.info("%s: %s", demand, text)
+            log.info("%s: %s", name, text)
         elif stage == "refused":
-            log.error("%s: refused: %s", demand, text)
+            log.error("%s: refused: %s", name, text)
 
     ticket.listener = tell
     ticket.journaled.set_result(True)
@@ -160,21 +160,16 @@ def ticket_from_journal(entry: JournalEntry) -> Ticket:
 # demand whose turn it is, the queue returns the other demand first.
 #
 # - Demands that share an application, a connection or a demand id keep their order.
-# - Goals of the reference's action that share a requester keep their order. For example, of two
-#   equal shutdowns, the second has an effect only if a join came between them.
+# - Goals of the reference's action that share a requester keep their order.
 # - A rollback or a decommission may touch any subject, so it overtakes no demand, and no demand
 #   overtakes it.
-
-# A goal with one of these fields touches only the subjects that it lists; one without any of them,
-# such as a rollback, may touch any subject.
-_ORDINARY = {"apps", "applications", "connections", "demand", "shutdown"}
 
 
 @dataclass(eq=False)
 class _Queued:
     number: int  # the order of arrival
     ticket: Ticket
-    subjects: frozenset[tuple[str, str]] | None  # None: any
+    subjects: frozenset[Hashable] | None  # None: any
     # A removal only marks the demand, because a search in each deque would be slow; `_next_in`
     # drops those that have left.
     has_left: bool = False
@@ -188,7 +183,7 @@ class FairQueue:
         self._in_order = in_order
         self._queued: dict[Ticket, _Queued] = {}
         self._lanes: dict[str, deque[_Queued]] = {}
-        self._subjects: dict[tuple[str, str], deque[_Queued]] = {}
+        self._subjects: dict[Hashable, deque[_Queued]] = {}
         self._barriers: deque[_Queued] = deque()
         self._arrived = 0
 
@@ -197,7 +192,7 @@ class FairQueue:
 
     def append(self, ticket: Ticket) -> None:
         self._arrived += 1
-        queued = _Queued(self._arrived, ticket, subjects_of(ticket.goal))
+        queued = _Queued(self._arrived, ticket, ticket.demand.touches())
         self._queued[ticket] = queued
         self._lanes.setdefault(self._lane(ticket), deque()).append(queued)
         for subject in queued.subjects or ():
@@ -211,7 +206,7 @@ class FairQueue:
         # back, had its turn and comes after all others.
         first = min((queued.number for queued in self._queued.values()), default=1) - len(tickets)
         again = {
-            ticket: _Queued(number, ticket, subjects_of(ticket.goal))
+            ticket: _Queued(number, ticket, ticket.demand.touches())
             for number, ticket in enumerate(tickets, start=first)
         }
         lanes = dict.fromkeys(map(self._lane, tickets))
@@ -249,7 +244,7 @@ class FairQueue:
         return first.ticket
 
     def _lane(self, ticket: Ticket) -> str:
-        return "" if self._in_order else requester_of(ticket.goal)
+        return "" if self._in_order else ticket.requester
 
     def _predecessor(self, queued: _Queued) -> _Queued | None:
         if (barrier := _next_in(self._barriers)) is not None and barrier.number < queued.number:
@@ -268,35 +263,3 @@ def _next_in(lane: deque[_Queued]) -> _Queued | None:
         lane.popleft()
     return lane[0] if lane else None
 
-
-def requester_of(goal: Any) -> str:  # noqa: ANN401 - plain data
-    """Return the first requester of a goal, even of an invalid one; empty if it names none."""
-    fields = goal if isinstance(goal, dict) else {}
-    own = fields.get("requesters")
-    names = own if isinstance(own, list) else _requesters(fields)
-    return next((name for name in names if isinstance(name, str)), "")
-
-
-def _requesters(goal: dict[str, Any]) -> Iterator[Any]:
-    bodies = (app.get("object_detection_fusion_app") for app in _items(goal, "apps"))
-    for item in (*bodies, *_items(goal, "connections")):
-        names = item.get("requester_ids") if isinstance(item, dict) else None
-        yield from names if isinstance(names, list) else ()
-
-
-def subjects_of(goal: Any) -> frozenset[tuple[str, str]] | None:  # noqa: ANN401 - plain data
-    """Return the subjects that a goal, even an invalid one, touches; None means any subject."""
-    if not isinstance(goal, dict) or _ORDINARY.isdisjoint(goal):
-        return None
-    headers = (app.get("header") for app in _items(goal, "apps"))
-    subjects = [("demand", goal.get("demand"))]
-    subjects += [("application", head.get("id")) for head in headers if isinstance(head, dict)]
-    for kind in ("application", "connection"):
-        subjects += [(kind, item.get("id")) for item in _items(goal, f"{kind}s")]
-    subjects += [("requester", name) for name in _requesters(goal)]
-    return frozenset((kind, id) for kind, id in subjects if isinstance(id, str))
-
-
-def _items(fields: dict[str, Any], name: str) -> Iterator[dict[str, Any]]:
-    items = fields.get(name)
-    return (item for item in (items if isinstance(items, list) else ()) if isinstance(item, dict))

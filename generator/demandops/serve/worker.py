@@ -283,7 +283,7 @@ class Worker:
         for number, ticket in enumerate(part):
             self._require_not_ending()
             is_late = self._runtime.monotonic() - began > LONGEST_EVALUATION_S
-            if number and (is_late or pauses_and_limits.may_take_long(ticket.goal)):
+            if number and (is_late or pauses_and_limits.may_take_long(ticket.demand)):
                 part, left = part[:number], part[number:] + left
                 break
             self._approvals.withdraw_released(results, ticket, commits.head.state)

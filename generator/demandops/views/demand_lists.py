@@ -12,7 +12,8 @@ from demandops.base.naming import SubjectKind
 from demandops.decide.planning.overrides import suspended_by
 from demandops.model.config.config import Config
 from demandops.model.config.inventory import Position, PropertyValue
-from demandops.model.demand.claim import Claim, Lease, requesters_of
+from demandops.model.demand.demand import Lease
+from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import Release

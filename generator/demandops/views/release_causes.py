@@ -16,7 +16,7 @@ from demandops.decide.planning.release_keys import all_keys, keys_of, keys_of_cl
 from demandops.model.config.config import DOMAINS_FILE, IMAGES_FILE, NODES_FILE, Config
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
 from demandops.model.config.repo_settings import ROOT_FILE
-from demandops.model.demand.claim import Claim, demand_id
+from demandops.model.ledger.claim import Claim, demand_id
 from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.release import Release, ServiceRelease, claims_of, most_replicas
 from demandops.render.gitops import path_of

@@ -12,7 +12,7 @@ from typing import Any, TypeAlias, TypeVar
 from demandops.base.naming import SubjectKind
 from demandops.decide.planning.planner import connection_topics
 from demandops.model.config.base_model import duration_text
-from demandops.model.demand.claim import Claim, requesters_of
+from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import WaitingDemand
 from demandops.model.release import ServiceRelease

@@ -13,7 +13,7 @@ from demandops.cluster.release_status import ReleaseStatus
 from demandops.decide.planning.overrides import suspended_claims
 from demandops.model.config.config import IMAGES_FILE, Config
 from demandops.model.config.override import Override
-from demandops.model.demand.claim import Claim, requesters_of
+from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.records import in_turn
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import GENERATOR_NAME, LogEntry

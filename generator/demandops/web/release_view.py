@@ -15,7 +15,7 @@ from demandops.base.settings import API_VERSION
 from demandops.cluster.release_status import ReleaseStatus
 from demandops.decide.decision import Decision, decide
 from demandops.model.config.override import Override
-from demandops.model.demand.claim import Claim, requesters_of
+from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.release import Release, ServiceRelease
 from demandops.render.gitops import path_of
 from demandops.repo.history.commit_log import LogEntry, PathHistory

@@ -18,7 +18,7 @@ from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.planner import denied_release, plan
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.override import Override
-from demandops.model.demand.claim import Claim
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World, changes_on
 from demandops.model.release import Release, ServiceKey, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry

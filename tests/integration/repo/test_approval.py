@@ -17,7 +17,7 @@ import yaml
 from demandops.base.errors import StateRepoError
 from demandops.cli.main import run
 from demandops.decide.state import rendered_files
-from demandops.model.demand.claim import Lease
+from demandops.model.demand.demand import Lease
 from demandops.serve import worker
 from demandops.serve.approvals import approvals
 from demandops.serve.generator import Generator

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 import yaml
-from demandops.model.demand.demand_request import Decommission
+from demandops.model.demand.demand import Decommission
 from demandops.serve.generator import Generator
 
 from tests.kit import rig

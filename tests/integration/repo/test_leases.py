@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 from demandops.base import settings
-from demandops.model.demand.claim import Claim
+from demandops.model.ledger.claim import Claim
 from demandops.repo.write.journal import JournalEntry, Slot
 from demandops.serve.generator import Generator
 from demandops.serve.timing.pauses_and_limits import LIMIT_LOCAL

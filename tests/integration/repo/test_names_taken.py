@@ -10,8 +10,8 @@ import pytest
 import yaml
 from demandops.base import naming
 from demandops.base.naming import Subject, SubjectKind
-from demandops.model.demand.claim import ClaimKey
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import ClaimKey
 from demandops.repo import reader
 from demandops.repo.load import last_valid_config
 from demandops.repo.merge_check import merge_check
@@ -84,7 +84,7 @@ def test_a_claim_by_hand_whose_release_has_the_name_of_another_is_held_back(
         (path,) = rig.claims(bare)
         data = yaml.safe_load(read(bare, path)) | {"application": PAIR[1], "node": "cloud"}
         key = ClaimKey(Subject(SubjectKind.APPLICATION, PAIR[1]), data["demand"])
-        held_back = {claim_file.path_of(key): yaml.safe_dump(data)}
+        held_back = {claim_files.path_of(key): yaml.safe_dump(data)}
         person.change(held_back)
         rig.book(generator, joining("edge/other"))
         assert claims(bare) == {PAIR[0], "edge/other"}
@@ -98,7 +98,7 @@ def test_a_claim_by_hand_whose_release_has_the_name_of_another_is_held_back(
 @pytest.mark.usefixtures("short_digests")
 def test_a_claim_by_hand_in_the_file_of_another_is_held_back(bare: Path, person: Person) -> None:
     def path_of(id: str) -> str:
-        return claim_file.folder_of(Subject(SubjectKind.APPLICATION, id))
+        return claim_files.folder_of(Subject(SubjectKind.APPLICATION, id))
 
     first, other = "edge/a", rival("edge/a", path_of)
     with rig.running(bare) as generator:

@@ -12,7 +12,7 @@ from datetime import datetime, timedelta, timezone
 from pathlib import Path
 
 from demandops.base.errors import DemandOpsError
-from demandops.model.demand.claim import OVERRIDE_PREFIX
+from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
 from tests.kit import config, rig
 from tests.kit.rig import Person

@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import yaml
 from demandops.base.naming import Subject, SubjectKind
-from demandops.model.demand.claim import ClaimKey
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import ClaimKey
 from demandops.repo import reader
 from demandops.repo.load import last_valid_config
 from demandops.repo.merge_check import merge_check
@@ -107,7 +107,7 @@ def by_hand(
     data = yaml.safe_load(read(bare, path))
     data |= {"application": app, "demand": demand, "requesters": [requester]}
     key = ClaimKey(Subject(SubjectKind.APPLICATION, app), demand)
-    return {claim_file.path_of(key): yaml.safe_dump(data)}
+    return {claim_files.path_of(key): yaml.safe_dump(data)}
 
 
 def held(bare: Path) -> set[tuple[str, ...]]:

@@ -28,7 +28,7 @@ from demandops.connections.connection import (
 )
 from demandops.decide.decision import Decision
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
 from demandops.views import release_causes
 
 from tests.kit.connections import ROS_IMAGE, demand, routes, state
@@ -119,9 +119,9 @@ def test_a_demand_for_it_becomes_a_claim_and_a_client(kind: str) -> None:
     world, decision = booked(kind)
     (claim,) = world.state.ledger.connection_claims("c")
     assert claim.connection.type is RELAY
-    path = claim_file.path_of(claim.key)
+    path = claim_files.path_of(claim.key)
     assert yaml.safe_load(world.files[path])["type"] == "relay"
-    assert claim_file.read(world.files[path], path) == claim
+    assert claim_files.read(world.files[path], path) == claim
     assert world.objects("Deployment").keys() == {"relay-edge"}
     (config,) = world.objects("ConfigMap").values()
     assert yaml.safe_load(config["data"]["relay.yaml"]) == {"fetch": {"/a": "/b"}}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demandops.model.demand.demand_request import Decommission
+from demandops.model.demand.demand import Decommission
 
 from tests.kit.goals import put
 from tests.kit.memory import MemoryRepo

@@ -10,7 +10,7 @@ import pytest
 import yaml
 from demandops.base.errors import InvalidInput, Refused
 from demandops.decide.state import rendered_files
-from demandops.model.demand.claim import OVERRIDE_PREFIX
+from demandops.model.ledger.claim import OVERRIDE_PREFIX
 from demandops.views.bookkeeping import bookkeeping
 from hypothesis import given
 from hypothesis import strategies as st

@@ -16,7 +16,7 @@ from demandops.decide.placement.relocation import with_moves
 from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import all_keys
 from demandops.model.config.config import Config
-from demandops.model.demand.claim import Application, Requirement
+from demandops.model.demand.demand import Application, Requirement
 from demandops.model.release import ServiceRelease
 from hypothesis import given
 from hypothesis import strategies as st

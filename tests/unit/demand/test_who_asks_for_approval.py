@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 from demandops.decide.admission.permission import with_leases_from_approval
 from demandops.model.config.load import load
-from demandops.model.demand.claim import UNSTARTED
-from demandops.model.ledger import claim_file
+from demandops.model.demand.demand import UNSTARTED
+from demandops.model.ledger import claim as claim_files
 
 from tests.kit import plain_yaml
 from tests.kit.config import state_of
@@ -95,9 +95,9 @@ def test_a_proposed_lease_has_no_end_and_is_written_without() -> None:
     assert claim.lease is not None
     assert claim.lease.until == UNSTARTED
     assert not claim.lease.has_started
-    text = claim_file.text_of(claim)
+    text = claim_files.text_of(claim)
     assert "until" not in text
-    assert claim_file.read(text, claim_file.path_of(claim.key)) == claim
+    assert claim_files.read(text, claim_files.path_of(claim.key)) == claim
     assert {one.key for one in ledger.unstarted_claims()} == {one.key for one in claims}
     later = claim.lease.started(NOW)
     assert (later.seconds, (later.until - NOW).total_seconds()) == (60, 60)

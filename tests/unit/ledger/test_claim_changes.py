@@ -16,8 +16,9 @@ from demandops.connections.mqtt import MQTT
 from demandops.connections.ros import ROS
 from demandops.connections.zenoh import ZENOH
 from demandops.decide.booking import apply
-from demandops.model.demand.claim import OVERRIDE_PREFIX, Claim, Term
-from demandops.model.demand.demand_request import Demanded, DemandRequest, Join, Release, Shutdown
+from demandops.model.demand.demand import Demand, Item, Term
+from demandops.model.demand.demand_request import Join, Release, Shutdown
+from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim
 from demandops.model.ledger.ledger import Changes, Ledger
 
 from tests.kit.memory import NOW, rebuilt
@@ -25,11 +26,11 @@ from tests.kit.memory import NOW, rebuilt
 HELD = Connection("c", MQTT, "s", "t", "", (Route("/a", "/b"),))
 
 
-def item(*requesters: str, held: Connection = HELD) -> tuple[Demanded, ...]:
-    return (Demanded(held, requesters, "connections[0].{}".format, Term(60)),)
+def item(*requesters: str, held: Connection = HELD) -> tuple[Item, ...]:
+    return (Item(held, requesters, "connections[0].{}".format, Term(60)),)
 
 
-def applied(ledger: Ledger, request: DemandRequest, minutes: int = 0) -> tuple[Ledger, Changes]:
+def applied(ledger: Ledger, request: Demand, minutes: int = 0) -> tuple[Ledger, Changes]:
     return apply(ledger, request, NOW + timedelta(minutes=minutes))
 
 

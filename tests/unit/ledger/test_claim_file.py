@@ -12,18 +12,10 @@ from demandops.base.naming import Subject, SubjectKind
 from demandops.connections.connection import Connection, Route, merged_routes
 from demandops.connections.connection_types import CONNECTION_TYPES
 from demandops.connections.mqtt import MQTT
-from demandops.model.demand.claim import (
-    LONGEST_S,
-    Application,
-    Claim,
-    ClaimKey,
-    Delivery,
-    InputTopic,
-    Lease,
-    demand_id,
-)
+from demandops.model.demand.demand import LONGEST_S, Application, Delivery, InputTopic, Lease
 from demandops.model.demand.demand_request import id_problem
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import Claim, ClaimKey, demand_id
 from demandops.model.ledger.ledger import Ledger
 from hypothesis import given
 from hypothesis import strategies as st
@@ -122,16 +114,16 @@ def joined_claims(draw: st.DrawFn) -> Claim:
 @examples(50)
 @given(claims | joined_claims())
 def test_every_claim_survives_its_file(claim: Claim) -> None:
-    path, text = claim_file.path_of(claim.key), claim_file.text_of(claim)
+    path, text = claim_files.path_of(claim.key), claim_files.text_of(claim)
 
-    read = claim_file.read(text.encode().decode(), path)
+    read = claim_files.read(text.encode().decode(), path)
 
     assert read == claim
     if claim.is_on_application:  # 1, 1.0 and True are equal in Python, so compare their texts
         parameters = (sorted(held.application.parameters.items()) for held in (read, claim))
         assert len(set(map(repr, parameters))) == 1
-    assert claim_file.text_of(read) == text
-    assert claim_file.kind_of(path) is claim.subject.kind
+    assert claim_files.text_of(read) == text
+    assert claim_files.kind_of(path) is claim.subject.kind
     assert path.isascii()
     assert all(0 < len(part) <= 100 for part in path.split("/"))
 
@@ -140,7 +132,7 @@ def test_every_claim_survives_its_file(claim: Claim) -> None:
 @given(st.dictionaries(st.tuples(st.sampled_from(SubjectKind), ids, ids), st.none(), min_size=2))
 def test_two_claims_never_share_a_file(keys: dict[tuple[SubjectKind, str, str], None]) -> None:
     paths = {
-        claim_file.path_of(ClaimKey(Subject(kind, subject), demand)).lower()
+        claim_files.path_of(ClaimKey(Subject(kind, subject), demand)).lower()
         for kind, subject, demand in keys
     }
     assert len(paths) == len(keys)
@@ -176,18 +168,18 @@ LINK = Connection("a", MQTT, "d", "e", "", (Route("/a", "/b"), Route("/c", "/d")
 
 def edited(claim: Claim, *changes: tuple[str, str]) -> Claim:
     """Write a claim's file, replace texts in it as a person may, and return the claim it has."""
-    text = claim_file.text_of(claim)
+    text = claim_files.text_of(claim)
     for old, new in changes:
         assert old in text
         text = text.replace(old, new)
-    return claim_file.read(text, claim_file.path_of(claim.key))
+    return claim_files.read(text, claim_files.path_of(claim.key))
 
 
 def fault_of(claim: Claim, *changes: tuple[str, str]) -> Fault:
     with pytest.raises(InvalidInput) as invalid:
         edited(claim, *changes)
     (found,) = invalid.value.faults
-    assert found.file == claim_file.path_of(claim.key)
+    assert found.file == claim_files.path_of(claim.key)
     return found
 
 
@@ -213,7 +205,7 @@ def test_a_time_that_cannot_be_reckoned_with_is_refused(
 ) -> None:
     times = {"booked": AT, "until": AT.replace(day=30)}
     claim = Claim(LINK, "d", "r", ("c",), AT, Lease(1, LONGEST_S, times["until"]))
-    found = fault_of(claim, (claim_file.format_timestamp(times[written]), edit))
+    found = fault_of(claim, (claim_files.format_timestamp(times[written]), edit))
     assert found.message.startswith(f"'{edit}' {problem}")
 
 
@@ -247,13 +239,13 @@ def test_a_topic_names_requesters_of_the_claim_only(
 
 
 def test_half_a_character_in_a_forged_trailer_has_a_path_segment() -> None:
-    assert claim_file.segment("\ud800") != claim_file.segment("\ud801")
+    assert claim_files.segment("\ud800") != claim_files.segment("\ud801")
 
 
 def test_topics_stay_readable() -> None:
     """A route without options is one line. Other routes list their options."""
     topics = (Route("/a", "/b"), Route("/b", "/c", qos=1, rate=0.5))
-    text = claim_file.text_of(Claim(replace(LINK, topics=topics), "d", "r", ("v",), AT))
+    text = claim_files.text_of(Claim(replace(LINK, topics=topics), "d", "r", ("v",), AT))
     assert text.endswith("topics:\n  /a: /b\n  /b:\n    target: /c\n    qos: 1\n    rate: 0.5\n")
 
 

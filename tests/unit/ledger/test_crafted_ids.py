@@ -24,8 +24,10 @@ from demandops.decide.placement.relocation import following_overrides
 from demandops.decide.planning import flows
 from demandops.decide.state import rendered_files
 from demandops.model.config.load import load
-from demandops.model.demand.claim import ClaimKey, Requirement, demand_id
-from demandops.model.ledger import claim_file, records
+from demandops.model.demand.demand import Requirement
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import Changes
 from demandops.model.ledger.records import RecentShutdown, RecentShutdowns, Wait, WaitingDemand
 from demandops.model.release import ServiceKey
@@ -210,7 +212,7 @@ def test_two_service_instances_keep_replicas_in_two_files() -> None:
         """Return the names of an application's replicas, release and claim."""
         key = ClaimKey(Subject(SubjectKind.APPLICATION, id), id)
         replicas = records.replicas_path(ServiceKey("recorder", "edge", id).instance)
-        return replicas, naming.object_name("rec", id), claim_file.path_of(key)
+        return replicas, naming.object_name("rec", id), claim_files.path_of(key)
 
     same, *apart = names("rec/x")
     others = (f"rec/{'-' * number}x" for number in range(1, 1000))

@@ -12,8 +12,7 @@ import yaml
 from demandops.decide.decision import faults_of_edit
 from demandops.decide.planning.flows import with_booked_topics_marked
 from demandops.decide.rollback import Restoration
-from demandops.model.demand.claim import Claim
-from demandops.model.ledger.claim_file import path_of
+from demandops.model.ledger.claim import Claim, path_of
 from demandops.model.ledger.ledger import ClaimChange
 
 from tests.kit.config import skeleton

@@ -13,8 +13,8 @@ from random import Random
 import pytest
 from demandops.decide.decision import Decision
 from demandops.decide.state import rendered_files
-from demandops.model.demand.claim import ClaimKey, demand_id
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.records import SHUTDOWNS_ROOT
 from hypothesis import assume, given
 from hypothesis import strategies as st
@@ -89,8 +89,8 @@ def assert_changes(taken: Decision, expected: Result) -> None:
     """Check that exactly the touched claims are written, and that each missing hold is named."""
     changed = {key_from(change.key) for change in taken.changes.claims}
     assert changed == {key_of(*key) for key in expected.touched}
-    paths = {claim_file.path_of(change.key) for change in taken.changes.claims}
-    assert {path for path in taken.files if claim_file.kind_of(path)} == paths
+    paths = {claim_files.path_of(change.key) for change in taken.changes.claims}
+    assert {path for path in taken.files if claim_files.kind_of(path)} == paths
     assert bool(taken.files) == expected.effective
     named = taken.changes.not_held
     for vain in expected.not_held:

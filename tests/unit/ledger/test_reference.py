@@ -16,8 +16,9 @@ from typing import Any
 
 from demandops.decide.booking import apply
 from demandops.model.demand import deployment_request_goal
-from demandops.model.demand.claim import ClaimKey, demand_id
-from demandops.model.demand.demand_request import DemandRequest, Join
+from demandops.model.demand.demand import Demand
+from demandops.model.demand.demand_request import Join
+from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import Ledger
 from demandops.model.ledger.records import REMEMBERED
 
@@ -155,7 +156,7 @@ def made(random: Random) -> Goal:
     return goal(*parts, id=random.choice("rs"), shutdown=random.random() < 0.5)
 
 
-def counts_twice(ledger: Ledger, request: DemandRequest) -> bool:
+def counts_twice(ledger: Ledger, request: Demand) -> bool:
     """Return whether the operators count a join twice.
 
     They do if the demand of the join already has a claim with one of the join's topics.

@@ -12,7 +12,8 @@ from demandops.base.errors import Fault, Refused
 from demandops.decide.decision import Decision, decide
 from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
-from demandops.model.demand.claim import Claim, Lease
+from demandops.model.demand.demand import Lease
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
 
 from tests.kit.memory import NOW, MemoryRepo

@@ -10,7 +10,7 @@ import pytest
 from demandops.base.errors import fault
 from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
-from demandops.model.demand.demand_request import Decommission
+from demandops.model.demand.demand import Decommission
 from demandops.repo.history import commit_message
 
 from tests.kit import goals

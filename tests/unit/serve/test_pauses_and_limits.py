@@ -12,8 +12,9 @@ from demandops.base.runtime import REAL
 from demandops.connections.connection import Connection, Route
 from demandops.connections.mqtt import MQTT
 from demandops.model.config.load import load
-from demandops.model.demand.claim import Application, Claim, Lease
-from demandops.model.demand.demand_request import Demanded, Join
+from demandops.model.demand.demand import Application, Item, Lease
+from demandops.model.demand.demand_request import Join
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
 from demandops.serve.timing.expiry import LeaseExpiry
 from demandops.serve.timing.pauses_and_limits import (
@@ -174,7 +175,7 @@ class Sending:
     def send(self, requester: str, at_s: float, operation: str = "") -> bool:
         """Send a demand; return whether the limit allowed it."""
         app = Application("edge/fusion", "object-detection-fusion", "edge", inputs={})
-        request = Join("one", (Demanded(app, (requester,), "applications[0].{}".format),))
+        request = Join("one", (Item(app, (requester,), "applications[0].{}".format),))
         moment, name = NOW + timedelta(seconds=at_s), operation or next(self._names)
         return not list(self.throttle.faults(request, self._config, name, moment))
 

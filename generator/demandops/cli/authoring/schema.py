@@ -22,8 +22,7 @@ from demandops.model.config.override import OverrideFile
 from demandops.model.config.policy import AccessDomainsFile
 from demandops.model.config.registry import ChartsFile, ClientsFile, ImagesFile, VersionsFile
 from demandops.model.config.repo_settings import RepoSettings
-from demandops.model.demand.demand_goal import DemandGoal
-from demandops.model.demand.deployment_request_goal import WireGoal
+from demandops.model.demand.goals import DemandGoal, WireGoal
 
 # ---- a description and an example of each property, for editors and the docs ----
 

@@ -22,7 +22,7 @@ from demandops.cli.target import dry_run_option, names_of, signing_option, writa
 from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision, decide
 from demandops.model.config.config import CONFIG_ROOTS
-from demandops.model.demand.demand_request import Decommission
+from demandops.model.demand.demand import Decommission
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo import reader
 from demandops.repo.history import commit_message
@@ -146,7 +146,7 @@ def decommission(  # noqa: PLR0913, PLR0917 - each is an option
     """
     chosen = frozenset([kinds] if kinds else ["node", "requester"])
     by = commit_message.operator()
-    goal = Decommission(name, kinds=chosen, by=str(by), reason=reason).goal()
+    goal = decommission_of(name, chosen, str(by), reason)
     if dry_run or person_change.is_asked(yes, output):
         row = _dry_run_decommission(goal, state_repo, output)
         show(output, row, _decommission_lines(row, True))
@@ -259,7 +259,7 @@ def rollback(  # noqa: PLR0913, PLR0917 - each is an option
     with reader.opened(state_repo, only_read=dry_run) as repo:
         to, base = repo.commit(revision), repo.commit()
         who = repo.operator() if dry_run else person_change.warned_if_unnamed(repo.operator())
-        goal = evaluation.goal(to, drop_newer=drop_newer, reason=reason, who=who)
+        goal = rollback_to(to, drop_newer=drop_newer, reason=reason, who=who)
         result: Json = {"to": to, "outcome": "refused", "commit": None}
         since = repo.changed_files(to, base, CONFIG_ROOTS)
         result |= {**_consequences(None), "configuration_since": since, "faults": []}

@@ -28,7 +28,7 @@ from demandops.cli.output import console, errors, progress
 from demandops.cli.target import dry_run_option, hint_to_pull, signing_option, writable_repo_option
 from demandops.decide.admission.admitted_request import admit, form_faults
 from demandops.decide.decision import decide
-from demandops.model.demand.demand_goal import is_demand_goal
+from demandops.model.demand.goals import is_demand_goal
 from demandops.repo import reader
 from demandops.serve.approvals.proposal import parse_waiting_text
 from demandops.serve.generator import Generator

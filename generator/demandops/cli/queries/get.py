@@ -33,7 +33,7 @@ from demandops.model.config.base_model import duration_text, relative
 from demandops.model.config.override import parse_time
 from demandops.model.config.policy import matches
 from demandops.model.config.repo_settings import Proposals
-from demandops.model.demand.claim import Lease
+from demandops.model.demand.demand import Lease
 from demandops.model.ledger.ledger import World
 from demandops.repo import reader
 from demandops.repo.forge import ForgeError, forge_for

@@ -21,8 +21,8 @@ from demandops.decide.planning.overrides import suspended_by, without_suspended
 from demandops.decide.warnings import missing_inputs
 from demandops.model.config.base_model import duration_text
 from demandops.model.config.config import NODES_FILE
-from demandops.model.demand.claim import Claim
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World
 from demandops.model.release import Release
 from demandops.render.gitops import path_of
@@ -55,7 +55,7 @@ class Match:
 
 def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> Match:
     # of a name or a path; only the history up to the commit of ``snapshot`` counts
-    if name.startswith(("clusters/", "bootstrap/", f"{claim_file.LEDGER_ROOT}/")):
+    if name.startswith(("clusters/", "bootstrap/", f"{claim_files.LEDGER_ROOT}/")):
         return _by_path(repo, snapshot, name)
     world = snapshot.state
     matches = []
@@ -67,7 +67,7 @@ def match_of(repo: Reader, snapshot: Snapshot, name: str, kind: str | None) -> M
     if path is not None:
         matches.append(Match("release", name, path, release))
     for subject in (Subject(subject_kind, name) for subject_kind in SubjectKind):
-        folder = claim_file.folder_of(subject)
+        folder = claim_files.folder_of(subject)
         if world.ledger.claims_on(subject) or _has_history(repo, snapshot, folder):
             matches.append(Match(subject.kind.value[:-1], name, folder, subject=subject))
     matches = [match for match in matches if kind in (None, match.kind)]
@@ -174,7 +174,7 @@ def _by_path(repo: Reader, snapshot: Snapshot, path: str) -> Match:
         )
     if text is not None or not path.startswith(("clusters/", "ledger/")):
         return Match("file", path, path)
-    return Match("claim" if claim_file.kind_of(path) else "release", name, path)
+    return Match("claim" if claim_files.kind_of(path) else "release", name, path)
 
 
 def _has_history(repo: Reader, snapshot: Snapshot, path: str) -> bool:

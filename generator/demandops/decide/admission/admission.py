@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain
 
+from demandops.model.demand.goals import ITEMS, too_large
 from demandops.base.errors import Fault, fault, suggestion
 from demandops.base.naming import id_problem, topic_problem
 from demandops.base.quoting import quoted
@@ -19,19 +20,12 @@ from demandops.connections import connection_types
 from demandops.connections.connection import Connection
 from demandops.model.config.appdef import ApplicationDefinition, Services
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
-from demandops.model.config.repo_settings import ROOT_FILE, Limits
-from demandops.model.demand.claim import LONGEST_S, OVERRIDE_PREFIX, Application, Delivery
-from demandops.model.demand.demand_request import (
-    AnyRequest,
-    Demanded,
-    DemandRequest,
-    Put,
-    Release,
-    Renew,
-)
+from demandops.model.config.repo_settings import Limits
+from demandops.model.demand.demand import LONGEST_S, AnyDemand, Application, Delivery, Demand, Item
+from demandops.model.ledger.claim import OVERRIDE_PREFIX
 
 
-def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
+def faults(request: Demand, config: Config) -> Iterator[Fault]:
     """Yield a fault for everything in ``request`` that cannot run, whatever the ledger contains."""
     # if the goal gives no request id, the request has the demand's id, which is checked below
     if request.id and request.id != request.demand:
@@ -46,13 +40,13 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
             yield fault("demand", message)
         if not request.demanded:  # otherwise the requesters of each item are checked
             yield from _requester_faults(request.own_requesters)
-        lease_s = request.lease_s if isinstance(request, Put) else None
+        lease_s = request.lease_s
         if lease_s is not None and not 0 < lease_s <= LONGEST_S:
             yield fault("lease", f"must be between 1 second and {LONGEST_S} seconds (a year)")
-    for index, node in enumerate(request.positions if isinstance(request, Put) else ()):
+    for index, node in enumerate(request.positions):
         yield from _id_faults(f"positions[{index}].node", node)
         yield from _node_faults(f"positions[{index}].node", node, config)
-    if not request.demanded and not isinstance(request, Release | Renew):
+    if not request.demanded and request.operation not in ("release", "renew"):
         message = "the request lists no application and no connection; list at least one"
         yield fault("id" if request.is_reference else "applications", message, code="empty")
     for item in request.demanded:
@@ -66,60 +60,12 @@ def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
         )
         for each in chain(_id_faults("id", held.id), _requester_faults(item.requesters), of_held):
             if not (unplaced and each.field == "node"):
-                yield replace(each, field=item.place(each.field))
+                yield item.fault(each.field, each.message, code=each.code)
 
 
-# The lists in these fields have no items of their own (items_of). The size of parameters is limited
-# in bytes instead, and each target topic belongs to a source topic, which counts.
-_NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
-# About ten fields describe any item. Unknown fields are bounded too, because each would cost a
-# fault when the goal is parsed.
-_FIELDS_OF_ITEM = 10
-_ITEMS = (
-    "items (applications, connections, topics, requesters and so on, also of the connections that "
-    "it needs)"
-)
-
-
-def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
-    """Yield a fault if a goal, as plain data, is far too large to be parsed at all."""
-    length = items = fields = 0
-    most_fields = max(1_000, _FIELDS_OF_ITEM * limits.demand_items)
-    # The walk ends as soon as a limit is passed, so that a huge goal costs no more than the limit.
-    # It keeps a list instead of calling itself, because a goal may be nested to any depth.
-    unread: list[tuple[object, bool]] = [(goal, True)]
-    while (
-        unread
-        and length <= limits.demand_characters
-        and items <= limits.demand_items
-        and fields <= most_fields
-    ):
-        value, counts = unread.pop()
-        if isinstance(value, str):
-            length += len(value)
-        elif isinstance(value, list):
-            length += 2 * len(value)  # each part is at least a character and a comma
-            items += len(value) if counts else 0
-            unread += [(part, counts) for part in value]
-        elif isinstance(value, dict):
-            fields += len(value)
-            length += sum(1 + len(key) if isinstance(key, str) else 1 for key in value)
-            unread += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
-        elif isinstance(value, int):
-            length += value.bit_length() // 4
-    for count, most, verb, what, limit in (
-        (length, limits.demand_characters, "has", "characters", "demandCharacters"),
-        (fields, most_fields, "has", "fields", "demandItems"),
-        (items, limits.demand_items, "lists", _ITEMS, "demandItems"),
-    ):
-        if count > most:
-            message = _too_large(f"{verb} more than {most} {what}", limit, most)
-            yield fault("", message, code="too-large")
-
-
-def items_of(request: DemandRequest) -> int:
+def items_of(request: Demand) -> int:
     items = len(request.own_requesters)
-    items += len(request.positions) if isinstance(request, Put) else 0
+    items += len(request.positions)
     for item in request.demanded:
         held = item.held
         if isinstance(held, Application):
@@ -133,26 +79,19 @@ def items_of(request: DemandRequest) -> int:
     return items
 
 
-def size_faults(request: DemandRequest, limits: Limits) -> Iterator[Fault]:
+def size_faults(request: Demand, limits: Limits) -> Iterator[Fault]:
     for item in request.demanded:
         held = item.held
         if isinstance(held, Application) and held.parameters:
             size = len(json.dumps(dict(held.parameters), default=str))
             if size > limits.parameter_bytes:
-                message = _too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
+                message = too_large(f"have {size} bytes", "parameterBytes", limits.parameter_bytes)
                 yield item.fault("parameters", message, code="too-large")
     items = items_of(request)
     if items > limits.demand_items:
-        listed = f"lists {items} {_ITEMS}"
-        message = _too_large(listed, "demandItems", limits.demand_items)
+        listed = f"lists {items} {ITEMS}"
+        message = too_large(listed, "demandItems", limits.demand_items)
         yield fault("id" if request.is_reference else "demand", message, code="too-large")
-
-
-def _too_large(size: str, limit: str, most: int) -> str:
-    return (
-        f"{size}, but at most {most} are allowed; a platform engineer may raise limits.{limit} in "
-        f"{ROOT_FILE}"
-    )
 
 
 def _application_faults(app: Application, config: Config, claiming: bool) -> Iterator[Fault]:
@@ -285,7 +224,7 @@ def _unknown_application(name: str, config: Config) -> Fault:
         )
         shown, remedy = quoted(name), suggestion(name, config.appdefs) or none
     message = f"{shown} is not a known application type{remedy}"
-    return fault("appdef", message, code="unknown-application")
+    return fault("type", message, code="unknown-application")
 
 
 def _connection_faults(connection: Connection, config: Config, claiming: bool) -> Iterator[Fault]:
@@ -349,12 +288,12 @@ def _requester_faults(requesters: tuple[str, ...]) -> Iterator[Fault]:
 
 
 def with_chosen_types(
-    request: AnyRequest, config: Config, current: Callable[[str], Connection | None]
-) -> AnyRequest:
+    request: AnyDemand, config: Config, current: Callable[[str], Connection | None]
+) -> AnyDemand:
     if not request.adds_claims:
         return request
 
-    def with_type(item: Demanded) -> Demanded:
+    def with_type(item: Item) -> Item:
         connection = item.held
         if not isinstance(connection, Connection):
             return item

@@ -16,8 +16,8 @@ from demandops.connections.connection import Connection
 from demandops.model.config.base_model import duration_text, seconds_of
 from demandops.model.config.config import Config
 from demandops.model.config.policy import AccessDomain, Rule, matches
-from demandops.model.demand.claim import Application, Claim, Term
-from demandops.model.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put
+from demandops.model.demand.demand import AnyDemand, Application, Demand, Item, Term
+from demandops.model.ledger.claim import Claim
 
 # pairs of a rule's field, such as ``nodes``, and a value that this field must allow
 Access = list[tuple[str, str]]
@@ -28,7 +28,7 @@ PEERS = "peers"
 _NO_RULES = (Rule(name="everything"),)
 
 
-def faults(request: DemandRequest, config: Config) -> Iterator[Fault]:
+def faults(request: Demand, config: Config) -> Iterator[Fault]:
     if not request.adds_claims:  # everybody may release what is theirs
         return
     lease_s = _wanted_lease(request)
@@ -73,7 +73,7 @@ def needed_access(
         yield domain, access
 
 
-def may_place(item: Demanded, appdef: str, node: str, config: Config) -> bool:
+def may_place(item: Item, appdef: str, node: str, config: Config) -> bool:
     """Return whether the requesters may use a node for an ``appdef``, or without one as an end."""
     domain = config.domain_of.get(node)
     access: Access = [("applications", appdef)] if appdef else []
@@ -81,7 +81,7 @@ def may_place(item: Demanded, appdef: str, node: str, config: Config) -> bool:
     return domain is not None and not any(_not_allowed(item, domain, access))
 
 
-def _not_allowed(item: Demanded, domain: AccessDomain, access: Access) -> Iterator[Fault]:
+def _not_allowed(item: Item, domain: AccessDomain, access: Access) -> Iterator[Fault]:
     rules = domain.rules or _NO_RULES
     for index, requester in enumerate(item.requesters):
         own = [rule for rule in rules if matches(requester, rule.requesters)]
@@ -120,15 +120,15 @@ def first_uncovered(rule: Rule, access: Access) -> tuple[str, str] | None:
     return next(missing, None)
 
 
-def with_lease_terms(request: AnyRequest, config: Config) -> AnyRequest:
-    def with_term(item: Demanded) -> Demanded:
+def with_lease_terms(request: AnyDemand, config: Config) -> AnyDemand:
+    def with_term(item: Item) -> Item:
         domain = config.domain_of.get(item.held.home)
         return replace(item, term=term(request, domain) if domain else None)
 
     return replace(request, demanded=tuple(map(with_term, request.demanded)))
 
 
-def term(request: DemandRequest, domain: AccessDomain) -> Term | None:
+def term(request: Demand, domain: AccessDomain) -> Term | None:
     policy = domain.leases
     # the reference's clients need not repeat their demands, unless the policy says so
     if request.is_reference and not policy.deployment_requests:
@@ -138,12 +138,12 @@ def term(request: DemandRequest, domain: AccessDomain) -> Term | None:
     return Term(seconds, seconds_of(policy.slack)) if seconds else None
 
 
-def _wanted_lease(request: DemandRequest) -> int | None:
-    return request.lease_s if isinstance(request, Put) else None
+def _wanted_lease(request: Demand) -> int | None:
+    return request.lease_s
 
 
 def approval_reasons(
-    request: DemandRequest, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
+    request: Demand, changes: Iterable[tuple[Claim | None, Claim | None]], config: Config
 ) -> tuple[str, ...]:
     """Return why a request needs approval, by its changed claims as (before, after)."""
     if not request.adds_claims:
@@ -178,7 +178,7 @@ def approval_reasons(
     return tuple(reasons)
 
 
-def with_leases_from_approval(request: AnyRequest) -> AnyRequest:
+def with_leases_from_approval(request: AnyDemand) -> AnyDemand:
     demanded = (
         replace(item, term=replace(item.term, on_approval=True)) if item.term else item
         for item in request.demanded

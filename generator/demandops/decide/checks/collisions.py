@@ -21,10 +21,10 @@ from demandops.decide.planning.release_keys import ReleaseKey, is_needed, keys_o
 from demandops.decide.rollback import request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import NODES_FILE, Config
-from demandops.model.demand.claim import Application, Claim, ClaimKey
-from demandops.model.demand.demand_request import Demanded, DemandRequest
-from demandops.model.ledger import claim_file, records
-from demandops.model.ledger.claim_file import path_of
+from demandops.model.demand.demand import Application, Demand, Item
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.claim import Claim, ClaimKey, path_of
 from demandops.model.ledger.ledger import Changes, World
 from demandops.model.release import ServiceKey
 
@@ -36,7 +36,7 @@ from demandops.model.release import ServiceKey
 
 
 def topic_faults(
-    request: DemandRequest, before: World, after: World, keys: Iterable[ReleaseKey]
+    request: Demand, before: World, after: World, keys: Iterable[ReleaseKey]
 ) -> Iterator[Fault]:
     """Yield a fault for each new service, route or delivery that clashes with another source."""
     if not request.adds_claims:
@@ -73,7 +73,7 @@ def faults_of_claim(claim: Claim, before: World, after: World) -> Iterator[Fault
         yield clash.within(path_of(claim.key))
 
 
-def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -> Iterator[Fault]:
+def _clashes_of_service(request: Demand, after: World, key: ServiceKey) -> Iterator[Fault]:
     claim = next(iter(release_keys.claims_needing(after, key)), None)
     if claim is None:
         return
@@ -100,7 +100,7 @@ def _clashes_of_service(request: DemandRequest, after: World, key: ServiceKey) -
             yield fault(_field(request, key, service), message, code="conflict")
 
 
-def _clashes_of_flows(item: Demanded, app: Application, after: World) -> Iterator[Fault]:
+def _clashes_of_flows(item: Item, app: Application, after: World) -> Iterator[Fault]:
     has_outputs_elsewhere = app.deliver or app.services or app.moved
     for flow in flows(after.config, app) if has_outputs_elsewhere else ():
         # Of an input that the demand lists, the demand names the source, so it is no fault.
@@ -223,15 +223,15 @@ def _remedy(
     return f"give '{key.source}' another id in {file}"
 
 
-def _field(request: DemandRequest, key: ServiceKey, service: Service) -> str:
+def _field(request: Demand, key: ServiceKey, service: Service) -> str:
     for item in request.demanded:
         if not isinstance(item.held, Application):
             continue
         if item.held.id == key.application:
-            return item.place("id")
+            return item.fault("id", "").field
         for index, topic in enumerate(item.held.inputs.get(str(service.root), ())):
             if (topic.source, topic.topic) == (key.source, key.topic):
-                return item.place(f"inputs.{service.root}[{index}].topic")
+                return item.fault(f"inputs.{service.root}[{index}].topic", "").field
     return ""
 
 
@@ -266,8 +266,6 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
         # Nothing is named if the configuration no longer has the service.
         if service is not None and service.scope == key.scope:
             yield "release", service_name(world.config, service, key)
-            if key.service in world.config.services_with_down_after:
-                yield "record of replicas", records.replicas_path(key.instance)
             return
 
 
@@ -294,7 +292,7 @@ def followed(names: Names, before: World, after: World, keys: Collection[Release
 
 
 def name_faults(
-    request: DemandRequest,
+    request: Demand,
     before: World,
     after: World,
     keys: Iterable[ReleaseKey],
@@ -320,15 +318,15 @@ def name_faults(
 
 
 def faults_in_files(
-    request: DemandRequest, changes: Changes, text_at: Callable[[str], str | None]
+    request: Demand, changes: Changes, text_at: Callable[[str], str | None]
 ) -> Iterator[Fault]:
     owners: dict[str, ClaimKey] = {}
     for change in changes.claims:
-        path = claim_file.path_of(change.key)
+        path = claim_files.path_of(change.key)
         owner = owners.setdefault(path, change.key)
         if change.before is None and owner == change.key and (text := text_at(path)):
             with suppress(InvalidInput):  # a file that is not valid is no claim, and is replaced
-                owner = claim_file.read(text, path).key
+                owner = claim_files.read(text, path).key
         if owner != change.key:
             other = f"{owner.subject} of demand '{owner.demand}'"
             message = f"{change.key.subject} needs the file {path}, which belongs to {other}"
@@ -358,9 +356,9 @@ def _message(key: ReleaseKey, name: Name, other: ReleaseKey) -> str:
     return f"{words(key)} needs {needed}; {_REMEDY}"
 
 
-def _located(message: str, request: DemandRequest, claim: ClaimKey | None) -> Fault:
+def _located(message: str, request: Demand, claim: ClaimKey | None) -> Fault:
     for item in request.demanded:
         if claim and item.held.subject == claim.subject:
             return item.fault("id", message, code="conflict")
     clash = fault("", message, code="conflict")
-    return clash.within(claim_file.path_of(claim)) if claim else clash
+    return clash.within(claim_files.path_of(claim)) if claim else clash

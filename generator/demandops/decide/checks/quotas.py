@@ -14,8 +14,7 @@ from demandops.decide.planning.release_keys import is_needed, keys_of, keys_of_c
 from demandops.model.config.config import Config
 from demandops.model.config.override import Selector, format_time
 from demandops.model.config.policy import AccessDomain, matches
-from demandops.model.demand.claim import Application
-from demandops.model.demand.demand_request import Demanded, DemandRequest
+from demandops.model.demand.demand import Application, Demand, Item
 from demandops.model.ledger.ledger import Changes, World
 from demandops.model.release import ServiceKey
 
@@ -25,7 +24,7 @@ from demandops.model.release import ServiceKey
 # refused; its requester gets a warning.
 
 
-def denial_faults(request: DemandRequest, after: World, changes: Changes) -> Iterator[Fault]:
+def denial_faults(request: Demand, after: World, changes: Changes) -> Iterator[Fault]:
     denying = [override for override in reversed(after.overrides) if override.deny]
     if not denying or not request.adds_claims:
         return
@@ -59,7 +58,7 @@ def denial_faults(request: DemandRequest, after: World, changes: Changes) -> Ite
             yield item.fault(_matched_field(selector, item, after.config), message, code="denied")
 
 
-def _matched_field(selector: Selector, item: Demanded, config: Config) -> str:
+def _matched_field(selector: Selector, item: Item, config: Config) -> str:
     if selector.applications or selector.connections:
         return "id"
     if selector.requesters:
@@ -75,7 +74,7 @@ def _matched_field(selector: Selector, item: Demanded, config: Config) -> str:
     return "source" if at_source and overrides.has_labels(selector, source, config) else "target"
 
 
-def warnings(request: DemandRequest, world: World) -> Iterator[str]:
+def warnings(request: Demand, world: World) -> Iterator[str]:
     """Yield a warning for each suspended claim of the requesters that a demand holds or lists."""
     if not any(override.deny for override in world.overrides):
         return

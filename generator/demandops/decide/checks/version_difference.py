@@ -16,8 +16,8 @@ from demandops.decide.planning.overrides import without_suspended
 from demandops.decide.planning.release_keys import ReleaseKey, contents, newest_asked, same_version
 from demandops.model.config.appdef import VersionPolicy
 from demandops.model.config.registry import ApplicationVersion, precedence
-from demandops.model.demand.claim import Claim
-from demandops.model.demand.demand_request import Demanded, DemandRequest
+from demandops.model.demand.demand import Demand, Item
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.release import Release, ServiceRelease
 
@@ -73,7 +73,7 @@ class Difference:
 
 
 def differences(
-    request: DemandRequest,
+    request: Demand,
     before: World,
     after: World,
     changes: Iterable[ClaimChange],
@@ -87,7 +87,7 @@ def differences(
     if not request.adds_claims:
         return
     listed = {item.held.subject: item for item in request.demanded}
-    demanded: dict[str, tuple[Demanded, str]] = {}
+    demanded: dict[str, tuple[Item, str]] = {}
     for change in changes:
         item, claim, old = listed.get(change.key.subject), change.after, change.before
         if item is None or claim is None or not claim.is_on_application:
@@ -100,7 +100,7 @@ def differences(
             yield from _of_service(release, demanded, before, without_suspended(after))
 
 
-def _of_application(item: Demanded, claim: Claim, after: World) -> Iterator[Difference]:
+def _of_application(item: Item, claim: Claim, after: World) -> Iterator[Difference]:
     app, ledger = claim.application, after.ledger
     versions = after.config.application_versions[app.appdef]
     # Two words may name one version, for example a channel and a number.
@@ -141,7 +141,7 @@ def _version_text(word: str, version: ApplicationVersion) -> str:
 
 def _of_service(
     release: ServiceRelease,
-    demanded: Mapping[str, tuple[Demanded, str]],
+    demanded: Mapping[str, tuple[Item, str]],
     before: World,
     after: World,
 ) -> Iterator[Difference]:

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from math import fsum, inf
-from types import MappingProxyType
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, suggestion
@@ -21,8 +20,8 @@ from demandops.model.config import inventory
 from demandops.model.config.appdef import Place, Service
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.inventory import Node, Position
-from demandops.model.demand.claim import Application, Claim, Requirement
-from demandops.model.demand.demand_request import Demanded
+from demandops.model.demand.demand import Application, Item, Requirement
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World
 
 _MOST_SHOWN = 5
@@ -44,7 +43,7 @@ def requirement_of(service: Service) -> Requirement:
     place = service.place or Place()
     return Requirement(
         place.role,
-        tuple(sorted(place.labels.items())),
+        tuple(sorted(f"{key}={value}" for key, value in place.labels.items())),
         tuple(sorted({*place.capabilities})),
         tuple(sorted(inventory.condition_texts(place.properties))),
     )
@@ -55,7 +54,7 @@ def on_node(app: Application, node: str, service: Service | None, world: World) 
     if service is None:
         app = replace(app, node=node)
     else:
-        app = replace(app, services=MappingProxyType({**app.services, service.name: node}))
+        app = replace(app, services={**app.services, service.name: node})
     return with_overridden_nodes(app, world)
 
 
@@ -73,7 +72,7 @@ class Choice:
     ``suits`` returns whether the demand can be booked with the given application.
     """
 
-    item: Demanded
+    item: Item
     requirement: Requirement
     world: World
     room: Room
@@ -148,7 +147,7 @@ class Choice:
 
     def _fitting(self) -> list[Node]:
         required, config = self.requirement, self.config
-        traits = (*((name,) for name in required.capabilities), *required.labels)
+        traits = (*((name,) for name in required.capabilities), *required.label_pairs)
         # Of the nodes with each required trait, only the shortest list is searched.
         pools = [config.nodes_with.get(trait, ()) for trait in traits]
         return [
@@ -253,7 +252,7 @@ class Choice:
     def _fault(self, message: str, code: str) -> Fault:
         if self.service is None:
             return self.item.fault("place", message, code=code)
-        return self.item.fault("appdef", f"{self.service.name}: {message}", code=code)
+        return self.item.fault("type", f"{self.service.name}: {message}", code=code)
 
 
 def unmet(requirement: Requirement, config: Config) -> Iterator[str]:
@@ -279,7 +278,7 @@ def lacks(node: Node, requirement: Requirement) -> Iterator[str]:
     if requirement.role not in ("", node.type):
         yield f"the role {quoted(requirement.role)}"
     labels = node.labels() if requirement.labels else {}
-    for key, value in requirement.labels:
+    for key, value in requirement.label_pairs:
         if labels.get(key) != value:
             yield f"the label {quoted(f'{key}={value}')}"
     for capability in requirement.capabilities:

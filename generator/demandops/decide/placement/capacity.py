@@ -19,7 +19,7 @@ from demandops.decide.planning.planner import plan
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.config import NODES_FILE, Config
 from demandops.model.config.inventory import Node, amount_of, amount_text
-from demandops.model.demand.claim import Claim
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange, World
 from demandops.model.release import Release, ServiceKey, ServiceRelease, most_replicas
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from datetime import datetime, timezone
-from types import MappingProxyType
 
 from demandops.base.errors import Fault
 from demandops.base.quoting import quoted
@@ -20,8 +19,8 @@ from demandops.decide.placement.candidates import Choice, Chosen, joined, lacks,
 from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning.overrides import with_overridden_nodes
 from demandops.model.config.appdef import Service
-from demandops.model.demand.claim import Application, Claim, demand_id
-from demandops.model.demand.demand_request import AnyRequest, Demanded, DemandRequest, Put
+from demandops.model.demand.demand import AnyDemand, Application, Demand, Item
+from demandops.model.ledger.claim import Claim, demand_id
 from demandops.model.ledger.ledger import World
 
 # The booking time of a claim that is not booked yet. It is later than any other booking time, as
@@ -29,19 +28,19 @@ from demandops.model.ledger.ledger import World
 _LAST = datetime.max.replace(tzinfo=timezone.utc)
 
 # Returns whether a request can be booked. All its applications have a node already.
-Trial = Callable[[DemandRequest], bool]
+Trial = Callable[[Demand], bool]
 
 # Stands for the faults of a demand whose fixed part is refused; the caller knows these faults.
 _NOWHERE = Fault("no-node", "", "is refused whatever nodes are chosen")
 
 
 def with_chosen_nodes(
-    request: AnyRequest,
+    request: AnyDemand,
     world: World,
     usage: Usage,
     trial: Trial | None,
     checkpoint: Callable[[], None],
-) -> tuple[AnyRequest, list[Fault]]:
+) -> tuple[AnyDemand, list[Fault]]:
     """Return the request with a node for each application and service to place, and the faults.
 
     A booked application or service stays on its node if the node still fits. If other demands hold
@@ -73,7 +72,7 @@ def with_chosen_nodes(
     return replace(request, demanded=tuple(demanded)), faults
 
 
-def needs_placement(request: DemandRequest, world: World) -> bool:
+def needs_placement(request: Demand, world: World) -> bool:
     # A service with a node of its own, in the request or in the ledger, needs its node checked.
     apps = (item.held for item in request.demanded if isinstance(item.held, Application))
     return any(
@@ -91,12 +90,12 @@ def _services_to_place(app: Application, world: World) -> list[Service]:
 
 
 def _placed(
-    request: AnyRequest,
+    request: AnyDemand,
     world: World,
     usage: Usage,
     trial: Trial | None,
     checkpoint: Callable[[], None],
-) -> tuple[AnyRequest, list[Fault]]:
+) -> tuple[AnyDemand, list[Fault]]:
     ledger, faults = world.ledger, list[Fault]()
     kept = [claim for subject in request.subjects() for claim in ledger.kept_claims(subject)]
     room = Room(world, usage, [*ledger.claims_of_demand(request.demand), *kept], checkpoint)
@@ -105,7 +104,7 @@ def _placed(
         if isinstance(item.held, Application):
             services = {service.name: "" for service in _services_to_place(item.held, world)}
             services |= {name: item.held.services[name] for name in item.held.named}
-            held = replace(item.held, services=MappingProxyType(services))
+            held = replace(item.held, services=services)
             demanded[index] = replace(item, held=held)
     # What leaves no choice is tried first and alone. If that is refused, no node helps.
     fixed = tuple(
@@ -137,7 +136,7 @@ def _placed(
 
         return can_be_booked
 
-    positions = request.positions if isinstance(request, Put) else {}
+    positions = request.positions
     # The choices follow one another. What is chosen first is not changed for the sake of what comes
     # later, and after the first failure no more is tried.
     for index, item in enumerate(demanded):
@@ -166,7 +165,7 @@ def _placed(
     return replace(request, demanded=tuple(demanded)), faults
 
 
-def may_wait(request: DemandRequest, world: World, checkpoint: Callable[[], None]) -> bool:
+def may_wait(request: Demand, world: World, checkpoint: Callable[[], None]) -> bool:
     """Return whether a demand that lacks only room may wait.
 
     Each application and service needs a node that would fit, in a domain that lets demands wait.
@@ -197,13 +196,13 @@ def may_wait(request: DemandRequest, world: World, checkpoint: Callable[[], None
     return True
 
 
-def _claim(request: DemandRequest, item: Demanded) -> Claim:
+def _claim(request: Demand, item: Item) -> Claim:
     """Return the claim that a demanded application would get if it were booked last of all."""
     demand = request.demand or demand_id(request.id, item.requesters)
     return Claim(item.held.booked(), demand, request.id, item.requesters, _LAST)
 
 
-def _with_node(request: DemandRequest, item: Demanded, choice: Choice) -> Demanded | Fault:
+def _with_node(request: Demand, item: Item, choice: Choice) -> Item | Fault:
     app = choice.app
     if app.node:
         # ``node`` and ``place`` together are a check of the named node, and no preference.
@@ -269,12 +268,12 @@ def _of_another(claims: tuple[Claim, ...], demand: str) -> Claim | None:
 
 
 def _with_services(
-    request: DemandRequest,
-    item: Demanded,
+    request: Demand,
+    item: Item,
     world: World,
     room: Room,
     suits: Callable[[Application], bool] | None,
-) -> tuple[Demanded, list[Fault]]:
+) -> tuple[Item, list[Fault]]:
     app = item.held
     assert isinstance(app, Application)  # noqa: S101 - callers pass only applications
     claims, faults = world.ledger.claims_on(app.subject), list[Fault]()
@@ -316,8 +315,8 @@ def _with_services(
     stay = {*services} - {*app.services} - no_longer_named
     booked = first.services if first else {}
     kept = {name: node for name, node in booked.items() if name in stay}
-    item = replace(item, held=replace(app, services=MappingProxyType(kept | {**app.services})))
-    positions = request.positions if isinstance(request, Put) else {}
+    item = replace(item, held=replace(app, services=kept | {**app.services}))
+    positions = request.positions
     for service in _services_to_place(app, world):
         claims = (_claim(request, item),)
         required = requirement_of(service)

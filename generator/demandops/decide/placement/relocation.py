@@ -9,6 +9,7 @@ from functools import partial, reduce
 from itertools import islice
 from math import inf
 
+from demandops.model.demand.demand import Demand
 from demandops.base.errors import Fault, sentences
 from demandops.base.naming import Subject, SubjectKind
 from demandops.base.quoting import quoted
@@ -26,16 +27,10 @@ from demandops.decide.planning.release_keys import affected_keys
 from demandops.decide.rollback import Restoration, request_for
 from demandops.model.config.appdef import Service
 from demandops.model.config.override import Override, format_time
-from demandops.model.demand.claim import (
-    Application,
-    Claim,
-    ClaimKey,
-    InputTopic,
-    Requirement,
-    requesters_of,
-)
-from demandops.model.demand.demand_request import Demanded, Put
-from demandops.model.ledger import claim_file, records
+from demandops.model.demand.demand import Application, InputTopic, Item, Requirement
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.claim import Claim, ClaimKey, requesters_of
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World, claim_changes
 
 # ---- when an application moves, the connections of its demands follow, with type and options ----
@@ -98,9 +93,9 @@ def _followed(world: World, claim: Claim, move: Move) -> tuple[Ledger, list[Clai
         if former and not ledger.is_carried_to(flow.receiver, flow.target):
             same = replace(former, source=brought.topic, target=flow.target, reverse=False)
             connection = replace(connection, topics=(same,))
-        put = Put("", (Demanded(connection, claim.requesters, str),))
+        put = Demand("put", "", (Item(connection, claim.requesters),))
         (item,) = admission.with_chosen_types(put, config, ledger.connection).demanded
-        booked = replace(claim, held=item.held.booked(), partial={})
+        booked = replace(claim, held=item.held.booked())
         if current := ledger.get(booked.key):
             booked = replace(current, held=current.connection.extended(booked.connection).booked())
         ledger = ledger.replace(booked.key, booked)
@@ -229,7 +224,7 @@ def _moved(
             inputs.setdefault(role, {}).update(dict.fromkeys(topics))
     united = {role: tuple(topics) for role, topics in inputs.items()}
     app = claims[0].application.with_inputs(united)
-    demanded = Demanded(app, requesters_of(claims), str)
+    demanded = Item(app, requesters_of(claims))
     choice = Choice(demanded, required, world, room, claims, service)
     reasons: list[str] = []
     # On the sender's own node, no connection would rename the topic.
@@ -482,7 +477,7 @@ def changed_claim_files(
     for key in keys:
         claim = after.get(key)
         if claim != before.get(key):
-            files[claim_file.path_of(key)] = claim_file.text_of(claim) if claim else None
+            files[claim_files.path_of(key)] = claim_files.text_of(claim) if claim else None
     return files
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple, TypeAlias
 
 from demandops.base import naming
@@ -13,8 +13,8 @@ from demandops.connections.connection import Connection, Route
 from demandops.connections.connection_types import type_named
 from demandops.model.config.appdef import Service
 from demandops.model.config.config import Config
-from demandops.model.demand.claim import Application, ClaimKey, InputTopic
-from demandops.model.demand.demand_request import AnyRequest, Demanded, Put
+from demandops.model.demand.demand import AnyDemand, Application, InputTopic, Item
+from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import Changes, Ledger, World, claim_changes
 from demandops.model.release import ServiceKey
 
@@ -68,12 +68,12 @@ def usual_topic(config: Config, source: str, role: str) -> str | None:
     return node.topics.get(role) if node else None
 
 
-def with_further_topics(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
+def with_further_topics(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDemand:
     """Return the request with ``further`` set for inputs that may have an instance."""
     if not request.adds_claims:
         return request
     # The claims of the put's own demand do not count, because the put may release their topics.
-    own = request.demand if isinstance(request, Put) else None
+    own = request.demand if request.operation == "put" else None
     first: dict[tuple[str, str], str] = {}
 
     def is_further(role: str, topic: InputTopic) -> bool:
@@ -131,7 +131,7 @@ def _marked(
     marked: dict[str, list[InputTopic]] = {}
     for role, topic in _per_topic(app, config):
         further = is_further(role, topic)
-        marked.setdefault(role, []).append(topic._replace(further=further))
+        marked.setdefault(role, []).append(replace(topic, further=further))
     return app.with_inputs(
         {**app.inputs, **{role: tuple(topics) for role, topics in marked.items()}}
     )
@@ -301,18 +301,12 @@ def _parts(app: Application, service: Service) -> Iterator[tuple[str, Applicatio
 _Ends: TypeAlias = "tuple[str, ...]"
 
 
-def _needing_field(field: str, path: str) -> str:
-    # The goal does not list an implied connection, so its faults are reported at the input,
-    # delivery or node that needs it. Only its requesters are written in the goal.
-    return path if path.startswith("requesters") else field
-
-
-def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config) -> AnyRequest:
+def with_implied_connections(request: AnyDemand, ledger: Ledger, config: Config) -> AnyDemand:
     """Return the request with a connection for each flow that no listed connection brings.
 
     It is the claimed connection that carries the flow, or else a derived one.
     """
-    first: dict[_Ends, Demanded] = {}
+    first: dict[_Ends, Item] = {}
     routes: dict[_Ends, dict[tuple[str, str], Route]] = {}
     listed = [each.held for each in request.demanded if isinstance(each.held, Connection)]
     brought = {
@@ -322,7 +316,7 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
     }
     for item in request.demanded:
         app = item.held
-        if not isinstance(app, Application) or item.connect == "none":
+        if not isinstance(app, Application) or app.connect == "none":
             continue
         places: dict[TopicKey, str] = {
             (role, topic.topic, topic.source): f"inputs.{role}[{index}]"
@@ -339,20 +333,21 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
             )
             if (flow.receiver, flow.target) in brought or not is_valid:
                 continue
-            needed = connection_for(flow, item.connect, ledger)
+            needed = connection_for(flow, app.connect, ledger)
             field = places.get(flow.root, "node")
             if flow.delivery is not None:
                 field = f"deliver[{flow.delivery}]"
-            place = partial(_needing_field, item.place(field))
             note = ""
-            if needed.type is not None and item.connect not in ("auto", needed.type.word):
+            if needed.type is not None and app.connect not in ("auto", needed.type.word):
                 topic = needed.topics[0].source
                 note = (
                     f"already carries {topic} by {needed.type.name}, so {topic} gets no "
-                    f"{item.connect.upper()} connection"
+                    f"{app.connect.upper()} connection"
                 )
             ends = (needed.id, *needed.nodes)
-            first.setdefault(ends, Demanded(needed, item.requesters, place, item.term, note=note))
+            first.setdefault(
+                ends, Item(needed, item.requesters, item.field, field, item.term, note)
+            )
             topics = routes.setdefault(ends, {})
             for route in needed.topics:
                 names = (route.source, route.target)
@@ -367,7 +362,7 @@ def with_implied_connections(request: AnyRequest, ledger: Ledger, config: Config
     return replace(request, demanded=(*demanded, *implied))
 
 
-def _with_topics(item: Demanded, topics: Iterable[Route]) -> Demanded:
+def _with_topics(item: Item, topics: Iterable[Route]) -> Item:
     assert isinstance(item.held, Connection)  # noqa: S101 - callers pass only connections
     return replace(item, held=replace(item.held, topics=tuple(dict.fromkeys(topics))))
 

@@ -5,20 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime
-from types import MappingProxyType
 
 from demandops.base.naming import Subject, SubjectKind
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, Selector, Shaping
 from demandops.model.config.policy import matches
-from demandops.model.demand.claim import (
-    OVERRIDE_PREFIX,
-    Application,
-    Claim,
-    ClaimKey,
-    requesters_of,
-)
-from demandops.model.demand.demand_request import Demanded
+from demandops.model.demand.demand import Application, Item
+from demandops.model.ledger.claim import OVERRIDE_PREFIX, Claim, ClaimKey, requesters_of
 from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.release import Release, ServiceRelease, claims_of, overridden
 
@@ -60,10 +53,10 @@ def with_overridden_nodes(app: Application, world: World) -> Application:
             for override in moving:
                 if override.node and selects(override, traits, world.config):
                     nodes[service.name] = override.node
-    return replace(app, moved=MappingProxyType(nodes))
+    return replace(app, moved=nodes)
 
 
-def traits_of(item: Claim | Demanded) -> Traits:
+def traits_of(item: Claim | Item) -> Traits:
     held = item.held
     if isinstance(held, Application):
         return Traits(held.nodes, item.requesters, (held.id,), (held.appdef,))
@@ -216,7 +209,7 @@ def _kept_claim(
         return None
     name, who = OVERRIDE_PREFIX + keeping[0].name, (keeping[0].owner,)
     last = replace(last, demand=name, request=name, requesters=who, booked=now)
-    return replace(last, lease=None, joined=False, partial={})
+    return replace(last, lease=None, joined=False)
 
 
 def keeping_overrides(claim: Claim, world: World) -> list[Override]:

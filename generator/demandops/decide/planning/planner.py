@@ -26,7 +26,8 @@ from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.appdef import Parameter, Scaling, Service
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override
-from demandops.model.demand.claim import Application, Claim, InputTopic, requesters_of
+from demandops.model.demand.demand import Application, InputTopic
+from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import ClaimChange, Ledger, World, index_entries
 from demandops.model.ledger.records import Instance, Kept, Steps, extended
 from demandops.model.release import Autoscaler, Release, ServiceKey, ServiceRelease
@@ -81,7 +82,9 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         }
         # Only some demands name the message type of a topic. An entry without the type sorts first,
         # so the entry with the type replaces it here.
-        inputs[role] = tuple({topic[:2]: topic for topic in sorted(read)}.values())
+        inputs[role] = tuple(
+            {(t.topic, t.source): t for t in sorted(read, key=lambda t: t.order)}.values()
+        )
     # If claims have several values of a parameter, the definition says how they are merged.
     parameters: dict[str, object] = {}
     for name, parameter in sorted(service.parameters.items()):

@@ -13,7 +13,8 @@ from demandops.decide.planning.overrides import without_suspended
 from demandops.model.config.appdef import Service, Services
 from demandops.model.config.config import VERSIONS_FILE, Config
 from demandops.model.config.registry import ApplicationVersion, precedence
-from demandops.model.demand.claim import Application, Claim
+from demandops.model.demand.demand import Application
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange, Ledger, World
 from demandops.model.release import ServiceKey
 

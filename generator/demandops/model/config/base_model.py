@@ -4,18 +4,22 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from datetime import datetime
+from datetime import datetime, timezone
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
+    PlainSerializer,
+    PlainValidator,
     StringConstraints,
     ValidationError,
 )
 from pydantic.alias_generators import to_camel
+from pydantic_core import PydanticKnownError
 
 from demandops.base import strict_yaml
 from demandops.base.errors import Fault, InvalidInput, fault, field_path, suggestion
@@ -46,6 +50,37 @@ def duration_text(seconds: float) -> str:
         whole, left = divmod(left, size)
         text += f"{whole}{name}" if whole else ""
     return text or "0s"
+
+
+def parse_timestamp(text: str) -> datetime:
+    try:
+        moment = datetime.fromisoformat(text.replace("Z", "+00:00"))
+        in_utc = moment.astimezone(timezone.utc)
+    except (ValueError, OverflowError):
+        message = f"{quoted(text)} is not a time like 2026-01-31T12:00:00.000000Z"
+        raise ValueError(message) from None
+    if moment.tzinfo is None:
+        raise ValueError(f"{quoted(text)} has no time zone; end it in Z")
+    return in_utc
+
+
+def time_text(moment: datetime) -> str:
+    in_utc = moment.astimezone(timezone.utc).isoformat(timespec="microseconds")
+    return f"{in_utc.removesuffix('+00:00')}Z"
+
+
+def _moment(value: object) -> datetime:
+    if isinstance(value, str):
+        return parse_timestamp(value)
+    raise PydanticKnownError("string_type")
+
+
+# A time in a file of the ledger: ISO 8601 in UTC.
+Moment = Annotated[
+    datetime,
+    PlainValidator(_moment, json_schema_input_type=str),
+    PlainSerializer(time_text, return_type=str),
+]
 
 
 def span(seconds: float) -> str:
@@ -122,6 +157,20 @@ Text = Annotated[str, Visible]
 Approval = Literal["none", "required"]
 
 
+# The configuration of a part that is a dataclass: pydantic reads it from a mapping, with no other
+# fields, and :func:`plain` writes it. Code makes copies of it without any check.
+PART = ConfigDict(extra="forbid")
+
+
+def _number(value: object) -> object:
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return value
+    raise PydanticKnownError("float_type")
+
+
+plain_number = BeforeValidator(_number, json_schema_input_type=float)
+
+
 class FrozenModel(BaseModel):
     """An immutable value that rejects unknown fields."""
 
@@ -162,6 +211,8 @@ def faults_of(
 
 _EXPECTED = {
     "model_type": "must be a mapping",
+    "dataclass_type": "must be a mapping",
+    "mapping_type": "must be a mapping",
     "dict_type": "must be a mapping",
     "list_type": "must be a list",
     "tuple_type": "must be a list",
@@ -175,7 +226,7 @@ def _message(item: dict[str, Any], model: type[BaseModel]) -> str:
     kind, value = item["type"], item.get("input")
     if kind == "missing":
         return "is missing; add it"
-    if kind == "extra_forbidden":
+    if kind in ("extra_forbidden", "unexpected_keyword_argument"):
         message = "is not a field here; remove it or correct its spelling"
         if len(item["loc"]) == 1:  # deeper, the field belongs to a model that is not known here
             fields = [field.alias or name for name, field in model.model_fields.items()]

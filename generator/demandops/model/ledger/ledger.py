@@ -5,7 +5,7 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from datetime import datetime
+from datetime import datetime, timezone
 from operator import attrgetter
 from typing import TypeAlias
 
@@ -16,15 +16,9 @@ from demandops.connections import connection_types
 from demandops.connections.connection import Connection, ConnectionType
 from demandops.model.config.config import Config
 from demandops.model.config.override import Override, by_rank, still_active
-from demandops.model.demand.claim import UNSTARTED, Application, Claim, ClaimKey, InputTopic
-from demandops.model.ledger.claim_file import minute_of
-from demandops.model.ledger.records import (
-    Instance,
-    KeptReplicas,
-    RecentShutdown,
-    RecentShutdowns,
-    WaitingDemands,
-)
+from demandops.model.demand.demand import UNSTARTED, Application, InputTopic
+from demandops.model.ledger.claim import Claim, ClaimKey
+from demandops.model.ledger.records import WaitingDemands
 
 # ---- the ledger: which demand holds which subject, as a set of persistent maps ----
 #
@@ -53,12 +47,10 @@ class Ledger:
     minutes: HashTrieSet[str] = field(default_factory=HashTrieSet)
     # the end that each ended override had when it ended, by name
     ended: Mapping[str, str] = field(default_factory=dict)
-    shutdowns: RecentShutdowns = field(default_factory=RecentShutdowns)
     # For how many applications each node was chosen, also if only for one of their services. The
     # choice of nodes takes the emptiest, and must not count all claims for each demand.
     applications_on: HashTrieMap[str, int] = field(default_factory=HashTrieMap)
     waiting: WaitingDemands = field(default_factory=HashTrieMap)
-    kept: KeptReplicas = field(default_factory=KeptReplicas)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         return self.claims.get(subject) or ()
@@ -151,9 +143,6 @@ class Ledger:
 
     def claims_of_requester(self, requester: str) -> tuple[Claim, ...]:
         return self._claims("requester", requester)
-
-    def claims_held_by(self, requester: str, subject: Subject) -> tuple[Claim, ...]:
-        return self._claims("holder", requester, subject.kind.value, subject.id)
 
     def count_of_requester(self, requester: str) -> int:
         return len(self.index.get(("requester", requester)) or ())
@@ -280,6 +269,11 @@ class Ledger:
         return sum(len(claims) for claims in self.claims.values())
 
 
+def minute_of(moment: datetime) -> str:
+    # in UTC, and sorts like the time
+    return moment.astimezone(timezone.utc).strftime("%Y-%m-%dT%H:%M")
+
+
 def index_entries(claim: Claim | None) -> set[Entry]:
     entries = set(claim.index_entries()) if claim else set()
     if claim and claim.lease:
@@ -313,12 +307,6 @@ class Changes:
     claims: tuple[ClaimChange, ...] = ()
     # in words, what a shutdown lists, but its requesters do not hold
     not_held: tuple[str, ...] = ()
-    # the digests of shutdowns that the ledger now records or forgets
-    shutdowns: tuple[str, ...] = ()
-    # the earlier shutdown that the request repeats
-    repeats: RecentShutdown | None = None
-    # the service instances whose kept replicas changed
-    kept: tuple[Instance, ...] = ()
     # the ids of the demands that begin or cease to wait, or that now wait with another goal
     waiting: tuple[str, ...] = ()
 

@@ -1,321 +1,23 @@
-"""The files of the ledger that are not claims: what the generator must remember between commits."""
+"""The files of the ledger that are not claims: waiting demands, and overrides that have ended."""
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
-from datetime import datetime, timedelta
-from itertools import islice, pairwise
-from typing import Any, Literal, NamedTuple, TypeAlias
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from typing import Any, Literal, TypeAlias
 
 from pydantic import Field
-from rpds import HashTrieMap, HashTrieSet
+from rpds import HashTrieMap
 
 from demandops.base import naming, strict_yaml
 from demandops.base.errors import InvalidInput
 from demandops.base.settings import LEDGER_API_VERSION
-from demandops.model.config.base_model import FrozenModel, parse_file
+from demandops.model.config.base_model import FrozenModel, Moment, parse_file, time_text
 from demandops.model.config.override import Override, format_time, parse_time
-from demandops.model.demand import demand_goal
-from demandops.model.demand.demand_request import DemandRequest, Put, Shutdown
-from demandops.model.ledger.claim_file import (
-    LEDGER_ROOT,
-    Timestamp,
-    format_timestamp,
-    minute_of,
-    parse_timestamp,
-    segment,
-)
-
-# ---- kept replicas ----
-#
-# A definition may set how long a service keeps replicas (``scaling.downAfter``). Then the service
-# has the highest number of replicas that its demands needed within this time. Its record, the file
-# ``ledger/replicas/<hh>/<name>.yaml``, lists each number above the present need, with the time
-# until which it is kept. When that time passes, the generator removes the number by a commit. The
-# replicas depend on the record, never on the clock, so ``demandops verify`` computes the same bytes
-# again.
-
-REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
-
-# the key of a service instance: the text ``replicas``, then the values of _FIELDS
-Instance: TypeAlias = "tuple[str, ...]"
-
-_FIELDS = ("service", "node", "application", "source", "topic", "version", "scope")
-
-
-# One step of scaling down
-class Kept(NamedTuple):
-    replicas: int
-    until: datetime
-
-
-# each step has fewer replicas and a later end than the previous one
-Steps: TypeAlias = "tuple[Kept, ...]"
-
-
-# `until` is the end of a new step
-def extended(steps: Steps, needed: int, was_needed: int, now: datetime, until: datetime) -> Steps:
-    if was_needed > needed:
-        # the new step ends last, so it covers each step with as many replicas or fewer
-        steps = (*(step for step in steps if step.replicas > was_needed), Kept(was_needed, until))
-    left: list[Kept] = []
-    for step in steps:
-        # the clock may have been set back, so a later step may end first
-        if step.replicas > needed and step.until > (left[-1].until if left else now):
-            left.append(step)
-    return tuple(left)
-
-
-@dataclass(frozen=True, slots=True)
-class KeptReplicas:
-    steps: HashTrieMap[Instance, Steps] = field(default_factory=HashTrieMap)
-    # by the minute in which the first step ends, so that the next end is found without a scan
-    by_minute: HashTrieMap[str, HashTrieSet[Instance]] = field(default_factory=HashTrieMap)
-
-    def replace(self, instance: Instance, steps: Steps) -> KeptReplicas:
-        old = self.steps.get(instance) or ()
-        if old == steps:
-            return self
-        all_steps, by_minute = self.steps, self.by_minute
-        if old:
-            minute = minute_of(old[0].until)
-            left = by_minute[minute].remove(instance)
-            by_minute = by_minute.insert(minute, left) if left else by_minute.remove(minute)
-            all_steps = all_steps.remove(instance)
-        if steps:
-            minute = minute_of(steps[0].until)
-            others = by_minute.get(minute) or HashTrieSet()
-            by_minute = by_minute.insert(minute, others.insert(instance))
-            all_steps = all_steps.insert(instance, steps)
-        return KeptReplicas(all_steps, by_minute)
-
-    def due(self, now: datetime) -> list[Instance]:
-        return sorted(
-            instance
-            for minute in self.by_minute
-            if minute <= minute_of(now)
-            for instance in self.by_minute[minute]
-            if self.steps[instance][0].until <= now
-        )
-
-    def next_end(self) -> datetime | None:
-        if not self.by_minute:
-            return None
-        first = self.by_minute[min(self.by_minute)]
-        return min(self.steps[instance][0].until for instance in first)
-
-
-def replicas_path(instance: Instance) -> str:
-    exact = json.dumps(instance[1:], ensure_ascii=True)
-    return f"{REPLICAS_ROOT}/{naming.hash_of(exact, 2)}/{segment(exact)}.yaml"
-
-
-def replicas_text(instance: Instance, steps: Steps) -> str:
-    named = zip(_FIELDS, instance[1:], strict=True)
-    return strict_yaml.dump(
-        {
-            "apiVersion": LEDGER_API_VERSION,
-            "kind": "KeptReplicas",
-            **{name: value for name, value in named if value},
-            "keeps": [
-                {"replicas": step.replicas, "until": format_timestamp(step.until)} for step in steps
-            ],
-        }
-    )
-
-
-class _Kept(FrozenModel):
-    replicas: int = Field(ge=1, le=1000)
-    until: Timestamp
-
-
-class _KeptReplicasFile(FrozenModel):
-    apiVersion: Literal["demandops.ledger/v2"]
-    kind: Literal["KeptReplicas"]
-    service: str
-    node: str
-    application: str = ""
-    source: str = ""
-    topic: str = ""
-    version: str = ""
-    scope: Literal["", "cluster"] = ""
-    keeps: tuple[_Kept, ...] = Field(min_length=1, strict=False)
-
-
-def read_replicas(text: str, path: str) -> tuple[Instance, Steps] | None:
-    # a person may have written the file; a mistake in it must not stop demands
-    try:
-        file = parse_file(_KeptReplicasFile, text, path)
-    except InvalidInput:
-        return None
-    instance = ("replicas", *(getattr(file, name) for name in _FIELDS))
-    steps = tuple(Kept(step.replicas, parse_timestamp(step.until)) for step in file.keeps)
-    falls = all(a.replicas > b.replicas and a.until < b.until for a, b in pairwise(steps))
-    return (instance, steps) if falls and path == replicas_path(instance) else None
-
-
-def read_all_replicas(files: Mapping[str, str]) -> KeptReplicas:
-    kept = KeptReplicas()
-    for path, text in files.items():
-        if record := read_replicas(text, path):
-            kept = kept.replace(*record)
-    return kept
-
-
-# ---- recent shutdowns ----
-#
-# A client that lost the answer sends its shutdown again, perhaps to another generator. Without a
-# record of the first shutdown, the repeat could release another demand of the same requesters. If a
-# join or a restoration books something for one of the requesters, the record is removed, because
-# the next shutdown may mean what was booked.
-#
-# Each record is one file: ``ledger/shutdowns/<hh>/<digest>.yaml``.
-
-SHUTDOWNS_ROOT = f"{LEDGER_ROOT}/shutdowns"
-
-# how long after a shutdown the same shutdown counts as a repeat, not as a new one
-REMEMBERED = timedelta(minutes=15)
-
-# How old a record must be before forget removes it because of its age. This is longer than
-# REMEMBERED, because a repeat that was received in time may wait in a journal before it is decided.
-_KEPT = timedelta(hours=1)
-
-# How many old records one request removes at most, so that its commit stays small. It adds one
-# record, so old records do not pile up.
-_FORGOTTEN = 10
-
-_Index: TypeAlias = "HashTrieMap[str, HashTrieSet[str]]"
-
-
-@dataclass(frozen=True, slots=True)
-class RecentShutdown:
-    """The record of a shutdown that released something."""
-
-    digest: str
-    request: str
-    requesters: tuple[str, ...]
-    at: datetime  # when it was received
-
-    @classmethod
-    def of(cls, request: Shutdown, at: datetime) -> RecentShutdown:
-        # what is listed twice or in another order is the same shutdown
-        listed = {
-            (
-                item.held.subject.kind.value,
-                item.held.subject.id,
-                tuple(sorted(set(item.requesters))),
-                item.held.distinguishing_values(),
-                tuple(sorted({words for words, _ in item.held.listed_topics(item.held)})),
-            )
-            for item in request.demanded
-        }
-        exact = json.dumps([request.id, sorted(listed)], ensure_ascii=True)
-        digest = hashlib.sha256(exact.encode()).hexdigest()[:20]
-        return cls(digest, request.id, tuple(sorted(request.requesters())), at)
-
-
-@dataclass(frozen=True, slots=True)
-class RecentShutdowns:
-    by_digest: HashTrieMap[str, RecentShutdown] = field(default_factory=HashTrieMap)
-    by_requester: _Index = field(default_factory=HashTrieMap)
-    by_minute: _Index = field(default_factory=HashTrieMap)
-
-    def earlier(self, shutdown: RecentShutdown) -> RecentShutdown | None:
-        record = self.by_digest.get(shutdown.digest)
-        # a person may have written a record that has this digest and other requesters
-        same = record is not None and replace(record, at=shutdown.at) == shutdown
-        return record if record and same and abs(shutdown.at - record.at) <= REMEMBERED else None
-
-    def replace(self, digest: str, shutdown: RecentShutdown | None) -> RecentShutdowns:
-        old = self.by_digest.get(digest)
-        if old == shutdown:
-            return self
-        by_digest, by_requester, by_minute = self.by_digest, self.by_requester, self.by_minute
-        if old is not None:
-            by_digest = by_digest.remove(digest)
-            by_minute = _removed(by_minute, minute_of(old.at), digest)
-            for who in old.requesters:
-                by_requester = _removed(by_requester, who, digest)
-        if shutdown is not None:
-            by_digest = by_digest.insert(digest, shutdown)
-            by_minute = _added(by_minute, minute_of(shutdown.at), digest)
-            for who in shutdown.requesters:
-                by_requester = _added(by_requester, who, digest)
-        return RecentShutdowns(by_digest, by_requester, by_minute)
-
-    def forget(
-        self, now: datetime, requesters: Iterable[str] = ()
-    ) -> tuple[RecentShutdowns, tuple[str, ...]]:
-        """Return the records that are left, and the digests of those that are removed."""
-        ended = sorted(minute for minute in self.by_minute if minute < minute_of(now - _KEPT))
-        old = (digest for minute in ended for digest in sorted(self.by_minute[minute]))
-        forgotten = {*islice(old, _FORGOTTEN)}
-        forgotten |= {digest for who in requesters for digest in self.by_requester.get(who, ())}
-        left = self
-        for digest in forgotten:
-            left = left.replace(digest, None)
-        return left, tuple(sorted(forgotten))
-
-
-def _added(index: _Index, key: str, digest: str) -> _Index:
-    return index.insert(key, index.get(key, HashTrieSet()).insert(digest))
-
-
-def _removed(index: _Index, key: str, digest: str) -> _Index:
-    left = index[key].remove(digest)
-    return index.insert(key, left) if left else index.remove(key)
-
-
-def shutdowns_path(digest: str) -> str:
-    return f"{SHUTDOWNS_ROOT}/{digest[:2]}/{digest}.yaml"
-
-
-def digest_in(path: str) -> str:
-    return path.rsplit("/", 1)[-1].removesuffix(".yaml")
-
-
-def shutdowns_text(shutdown: RecentShutdown) -> str:
-    return strict_yaml.dump(
-        {
-            "apiVersion": LEDGER_API_VERSION,
-            "kind": "Shutdown",
-            "digest": shutdown.digest,
-            "request": shutdown.request,
-            "requesters": list(shutdown.requesters),
-            "at": format_timestamp(shutdown.at),
-        }
-    )
-
-
-class _ShutdownFile(FrozenModel):
-    apiVersion: Literal["demandops.ledger/v2"]
-    kind: Literal["Shutdown"]
-    digest: str = Field(pattern=r"^[0-9a-f]{20}$")
-    request: str
-    requesters: tuple[str, ...] = Field(min_length=1, strict=False)
-    at: Timestamp
-
-
-def read_shutdowns(text: str, path: str) -> RecentShutdown | None:
-    try:
-        file = parse_file(_ShutdownFile, text, path)
-    except InvalidInput:
-        return None
-    requesters = tuple(sorted(set(file.requesters)))  # a person may have listed one twice
-    record = RecentShutdown(file.digest, file.request, requesters, parse_timestamp(file.at))
-    return record if path == shutdowns_path(file.digest) else None
-
-
-def read_all_shutdowns(files: Mapping[str, str]) -> RecentShutdowns:
-    shutdowns = RecentShutdowns()
-    for path, text in files.items():
-        if record := read_shutdowns(text, path):
-            shutdowns = shutdowns.replace(record.digest, record)
-    return shutdowns
-
+from demandops.model.demand.demand import Demand, Operation
+from demandops.model.demand.goals import read_goal
+from demandops.model.ledger.claim import LEDGER_ROOT, segment
 
 # ---- waiting demands, which the ledger keeps until a node has room ----
 #
@@ -330,18 +32,29 @@ WAITING_ROOT = f"{LEDGER_ROOT}/waiting"
 
 @dataclass(frozen=True, slots=True)
 class WaitingDemand:
-    """A demand that waits for room."""
-
-    demand: str
-    request: str
-    requesters: tuple[str, ...]
+    put: Demand
     since: datetime  # when it was first received
-    priority: int
-    goal: Mapping[str, Any]
+
+    @property
+    def demand(self) -> str:
+        return self.put.demand
+
+    @property
+    def requesters(self) -> tuple[str, ...]:
+        return tuple(sorted(self.put.requesters()))
 
     @property
     def turn(self) -> tuple[int, datetime, str]:  # the lowest is tried first
-        return -self.priority, self.since, self.demand
+        return -self.put.priority, self.since, self.demand
+
+    def __eq__(self, other: object) -> bool:
+        # by the goal as it was sent
+        if not isinstance(other, WaitingDemand):
+            return NotImplemented
+        return (self.put.goal, self.since) == (other.put.goal, other.since)
+
+    def __hash__(self) -> int:
+        return hash((self.demand, self.since))
 
 
 # by demand id
@@ -349,13 +62,12 @@ WaitingDemands: TypeAlias = "HashTrieMap[str, WaitingDemand]"
 
 
 @dataclass(frozen=True, slots=True)
-class Wait(DemandRequest):
-    """The request of a demand that must wait; ``reasons`` say why."""
+class Wait(Demand):
+    """What a demand that must wait becomes; ``reasons`` say why."""
 
+    operation: Operation = "wait"
     waiting: WaitingDemand | None = None
     reasons: tuple[str, ...] = ()
-
-    operation = "wait"
 
 
 def in_turn(waiting: WaitingDemands) -> list[WaitingDemand]:
@@ -371,43 +83,34 @@ def waiting_text(waiting: WaitingDemand) -> str:
         {
             "apiVersion": LEDGER_API_VERSION,
             "kind": "WaitingDemand",
-            "demand": waiting.demand,
-            "request": waiting.request,
-            "requesters": list(waiting.requesters),
-            "since": format_timestamp(waiting.since),
-            "priority": waiting.priority,
-            "goal": dict(waiting.goal),
+            "since": time_text(waiting.since),
+            "goal": waiting.put.goal,
         }
     )
 
 
 class _WaitingFile(FrozenModel):
-    apiVersion: Literal["demandops.ledger/v2"]
+    apiVersion: Literal["demandops.ledger/v2", "demandops.ledger/v3"]
     kind: Literal["WaitingDemand"]
-    demand: str = Field(min_length=1)
-    request: str
-    requesters: tuple[str, ...] = Field(min_length=1, strict=False)
-    since: Timestamp
-    priority: int = 0
+    since: Moment
     goal: dict[str, Any]
+    # version 2 repeated these fields of the goal
+    demand: str = ""
+    request: str = ""
+    requesters: tuple[str, ...] = Field(default=(), strict=False)
+    priority: int = 0
 
 
 def read_waiting(text: str, path: str) -> WaitingDemand | None:
+    # a person may have written the file; a mistake in it must not stop demands
     try:
         file = parse_file(_WaitingFile, text, path)
-        if not demand_goal.is_demand_goal(file.goal):
-            return None
-        put, _ = demand_goal.parse(file.goal)  # the booking reports the goal's faults
+        put = read_goal(file.goal)
     except InvalidInput:
         return None
-    if not isinstance(put, Put) or put.demand != file.demand:
+    if put.operation != "put" or path != waiting_path(put.demand):
         return None
-    if path != waiting_path(file.demand):
-        return None
-    since = parse_timestamp(file.since)
-    return WaitingDemand(
-        file.demand, file.request, file.requesters, since, file.priority, file.goal
-    )
+    return WaitingDemand(put, file.since)
 
 
 def read_all_waiting(files: Mapping[str, str]) -> WaitingDemands:
@@ -426,7 +129,7 @@ MARKERS_ROOT = f"{LEDGER_ROOT}/overrides"
 
 
 class _Marker(FrozenModel):
-    apiVersion: Literal["demandops.ledger/v1", "demandops.ledger/v2"]
+    apiVersion: Literal["demandops.ledger/v1", "demandops.ledger/v2", "demandops.ledger/v3"]
     kind: Literal["EndedOverride"]
     override: str
     expires: str

@@ -25,10 +25,9 @@ from demandops.decide.decision import Decision
 from demandops.decide.rollback import Restoration
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.config.override import OVERRIDES_ROOT, Override, format_time
-from demandops.model.demand.claim import OVERRIDE_PREFIX, ClaimKey
-from demandops.model.demand.demand_request import Decommission, Expire
-from demandops.model.ledger import claim_file
-from demandops.model.ledger.claim_file import LEDGER_ROOT
+from demandops.model.demand.demand import Decommission
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import LEDGER_ROOT, OVERRIDE_PREFIX, ClaimKey
 from demandops.model.ledger.records import Instance, Wait
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log, revisions
@@ -74,7 +73,7 @@ def author(decision: Decision, received: datetime) -> pygit2.Signature:
     names = one_line(", ".join(requesters), _MAX_AUTHOR - len(f" ({who})"))
     claims = decision.changes.claims
     demand = claims[0].key.demand if claims else request.demand
-    local = demand if _LOCAL_PART.fullmatch(demand) else claim_file.segment(demand)
+    local = demand if _LOCAL_PART.fullmatch(demand) else claim_files.segment(demand)
     return signature(f"{names} ({who})", f"{local}@requester.demandops.invalid", received)
 
 

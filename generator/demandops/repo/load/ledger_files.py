@@ -8,12 +8,14 @@ from dataclasses import dataclass
 
 from pygit2 import Oid, Repository, Tree
 
+from demandops.model.demand.demand import Rollback
 from demandops.base import naming
 from demandops.base.errors import Fault, InvalidInput, fault
 from demandops.base.naming import Subject
 from demandops.decide.rollback import Restoration
-from demandops.model.demand.claim import Claim, ClaimKey, Lease
-from demandops.model.ledger import claim_file
+from demandops.model.demand.demand import Lease
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import Claim, ClaimKey
 from demandops.model.ledger.ledger import ClaimChange, Ledger
 from demandops.render.gitops import CLUSTERS_ROOT
 from demandops.repo.git import tree as trees
@@ -35,10 +37,10 @@ class ClaimFiles:
 def read_claims(files: Iterable[tuple[str, str]]) -> ClaimFiles:
     claims, faults = list[Claim](), list[Fault]()
     for path, text in files:
-        if claim_file.kind_of(path) is None:
+        if claim_files.kind_of(path) is None:
             continue
         try:
-            claims.append(claim_file.read(text, path))
+            claims.append(claim_files.read(text, path))
         except InvalidInput as error:
             faults += error.faults
     return ClaimFiles(tuple(claims), tuple(faults))
@@ -46,7 +48,7 @@ def read_claims(files: Iterable[tuple[str, str]]) -> ClaimFiles:
 
 def claim_at(tree: Tree | None, path: str) -> Claim | None:
     text = trees.read_text(tree, path)
-    return claim_file.read(text, path) if text is not None else None
+    return claim_files.read(text, path) if text is not None else None
 
 
 def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
@@ -58,10 +60,10 @@ def valid_claim_at(tree: Tree | None, path: str) -> Claim | None:
 
 def key_of(path: str, ledger: Ledger) -> ClaimKey | None:
     """Return the key of the claim whose file has this path; a search of the whole ledger."""
-    if claim_file.kind_of(path) is None:
+    if claim_files.kind_of(path) is None:
         return None
     # a path has slugs and digests of the ids, so it does not give the key
-    return next((claim.key for claim in ledger if claim_file.path_of(claim.key) == path), None)
+    return next((claim.key for claim in ledger if claim_files.path_of(claim.key) == path), None)
 
 
 def owner_faults(claim: Claim | None, path: str, ledger: Ledger) -> Iterator[Fault]:
@@ -139,17 +141,19 @@ def added_by_people(repo: Repository, since: str, to: Oid) -> set[ClaimKey]:
     return {claim.key for claim in claims if claim}
 
 
-def restoration(repo: Repository, to: str, **more: object) -> Restoration:
-    commit = trees.commit_of(repo, to)
-    files = read_claims(trees.texts(commit.tree, (claim_file.LEDGER_ROOT,)).items())
+def restoration(repo: Repository, rollback: Rollback) -> Restoration:
+    commit = trees.commit_of(repo, rollback.to)
+    files = read_claims(trees.texts(commit.tree, (claim_files.LEDGER_ROOT,)).items())
     if files.faults:
         raise InvalidInput(files.faults)
     return Restoration(
-        id="",
         to=str(commit.id),
         made=commit_log.time_of(commit),
         claims=files.claims,
-        **more,  # type: ignore[arg-type]
+        drop_newer=rollback.drop_newer,
+        reason=rollback.reason,
+        by=rollback.by,
+        email=rollback.email,
     )
 
 
@@ -159,8 +163,8 @@ def changed_subjects(before: Ledger, after: Ledger) -> list[Subject]:
 
 
 def changed_files(before: Tree | None, after: Tree) -> Iterator[str]:
-    changed = trees.differences(before, after, (claim_file.LEDGER_ROOT,))
-    return (path for path, _ in changed if claim_file.kind_of(path) is not None)
+    changed = trees.differences(before, after, (claim_files.LEDGER_ROOT,))
+    return (path for path, _ in changed if claim_files.kind_of(path) is not None)
 
 
 def changes_node(repo: Repository, revision: str | Oid, node: str) -> bool:

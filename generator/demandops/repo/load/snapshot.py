@@ -19,8 +19,9 @@ from demandops.decide.state import State, try_configuration
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.load import load as load_config
 from demandops.model.config.repo_settings import ROOT_FILE
-from demandops.model.demand.claim import Claim
-from demandops.model.ledger import claim_file, records
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange, Ledger
 from demandops.model.ledger.records import Instance, Steps
 from demandops.repo.git import tree as trees
@@ -32,7 +33,7 @@ from demandops.templating.evaluator import DEMAND_S, EVALUATE, processor_time
 Progress = Callable[[int, int], None]
 
 # The folders and files that a snapshot is read from.
-ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT)
+ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,8 +87,8 @@ def load(
 def _claim_texts(tree: Tree, progress: Progress) -> Iterator[tuple[str, str]]:
     blobs: list[tuple[str, Blob]] = [
         (path, blob)
-        for path, blob in trees.blobs(tree, (claim_file.LEDGER_ROOT,))
-        if claim_file.kind_of(path)
+        for path, blob in trees.blobs(tree, (claim_files.LEDGER_ROOT,))
+        if claim_files.kind_of(path)
     ]
     for done, (path, blob) in enumerate(blobs):
         if done % 200 == 0:

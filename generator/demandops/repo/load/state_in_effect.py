@@ -28,7 +28,7 @@ from demandops.base.naming import Subject
 from demandops.base.settings import GENERATED_ROOTS
 from demandops.decide.decision import changeset_of_edit, faults_of_edit
 from demandops.decide.state import State, rendered_files
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.ledger import ClaimChange
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
@@ -205,14 +205,14 @@ class Judgement:
         quarantined = dict.fromkeys(snapshot.quarantined_files)
         for subject in (subject for subject in accepted.subjects if subject in faults):
             claims = (*before.state.ledger.claims_on(subject), *ledger.claims_on(subject))
-            keys = {claim_file.path_of(claim.key): claim.key for claim in claims}
+            keys = {claim_files.path_of(claim.key): claim.key for claim in claims}
             # a fault outside claim files is told at a claim on the subject, best at a changed one
             now = snapshot.state.ledger.claims_on(subject)
             changed = [claim for claim in now if before.state.ledger.get(claim.key) != claim]
-            paths = [claim_file.path_of(claim.key) for claim in (changed or now)]
+            paths = [claim_files.path_of(claim.key) for claim in (changed or now)]
             problems += [
                 fault.within(paths[0])
-                if paths and claim_file.kind_of(fault.file) is None
+                if paths and claim_files.kind_of(fault.file) is None
                 else fault
                 for fault in faults[subject]
             ]
@@ -277,7 +277,7 @@ def judge(
         refused = {
             subject: (_TO_CHECK,)
             for subject in advance.subjects
-            if any(claim_file.path_of(c.key) in held_back for c in state.ledger.claims_on(subject))
+            if any(claim_files.path_of(c.key) in held_back for c in state.ledger.claims_on(subject))
         }
     if state.config == old.config:
         return Judgement(repo, before, advance, with_new, with_new, refused, old)

@@ -24,7 +24,7 @@ from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.override import OVERRIDES_ROOT
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
 from demandops.model.release import Release, ServiceRelease
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import reading, unopened
@@ -135,7 +135,7 @@ def _merge_patch(
 
 # ---- the checkout: its files, and the commit that an edit started from ----
 
-_ROOTS = (*CONFIG_ROOTS, claim_file.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
+_ROOTS = (*CONFIG_ROOTS, claim_files.LEDGER_ROOT, *GENERATED_ROOTS, NOTES_ROOT)
 _DEFAULTS = (f"refs/remotes/origin/{MAIN_BRANCH}", f"refs/heads/{MAIN_BRANCH}")
 # A fleet of 20,000 nodes has fewer; more would fill the memory of the machine that checks.
 _MOST_BYTES = 16 << 20

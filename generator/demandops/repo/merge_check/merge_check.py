@@ -29,7 +29,8 @@ from demandops.model.config.config import CHARTS_FILE, CONFIG_ROOTS, Config
 from demandops.model.config.load import load
 from demandops.model.config.override import OVERRIDES_ROOT, format_time
 from demandops.model.config.repo_settings import ROOT_FILE
-from demandops.model.ledger import claim_file, records
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger import records
 from demandops.model.ledger.ledger import Ledger, World, changes_on
 from demandops.render.gitops import BOOTSTRAP_ROOT, path_of
 from demandops.repo.git import tree as trees
@@ -172,9 +173,9 @@ def _is_written_by_generator(path: str) -> bool:
     root = path.split("/", maxsplit=1)[0]
     if trees.is_readme(path):
         return False
-    if root == claim_file.LEDGER_ROOT:  # people may edit claims and waiting demands
+    if root == claim_files.LEDGER_ROOT:  # people may edit claims and waiting demands
         is_waiting = path.startswith(f"{records.WAITING_ROOT}/")
-        return claim_file.kind_of(path) is None and not is_waiting
+        return claim_files.kind_of(path) is None and not is_waiting
     return root in (*GENERATED_ROOTS, NOTES_ROOT)
 
 
@@ -209,7 +210,7 @@ def _remedy(path: str, before: str | None, after: str | None, suggestion: Sugges
         return f"{lost}, and merge {suggestion.file} as shown{unchanged}"
     if root == NOTES_ROOT:
         return "is written by the generator, which would undo the edit; revert the edit"
-    if root == claim_file.LEDGER_ROOT:
+    if root == claim_files.LEDGER_ROOT:
         if before is not None:
             return "is written only by the generator; revert the edit"
         return (
@@ -307,7 +308,9 @@ class _Edit:
         if old is not None:
             subjects = ledger_files.changed_subjects(old.ledger, state.ledger)
             changes = changes_on(old.ledger, state.ledger, subjects)
-            by_path = {claim_file.path_of(change.key): change for change in changes if change.after}
+            by_path = {
+                claim_files.path_of(change.key): change for change in changes if change.after
+            }
             # an override may change claims too, but not their files in the checkout
             written = {path: change for path, change in by_path.items() if path in self.files}
             for path, change in written.items():

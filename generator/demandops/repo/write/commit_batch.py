@@ -27,8 +27,8 @@ from demandops.decide.placement import relocation
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import NODES_FILE
 from demandops.model.config.override import Override
-from demandops.model.demand.claim import ClaimKey
-from demandops.model.ledger import claim_file
+from demandops.model.ledger import claim as claim_files
+from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import claim_changes
 from demandops.model.ledger.records import Instance
 from demandops.repo.git import signing
@@ -194,11 +194,11 @@ class CommitBatch:
         snapshot, ledger, files = accepted.snapshot, state.ledger, dict(change.files)
         for claim in ledger.unstarted_claims():
             assert claim.lease is not None  # noqa: S101 - unstarted claims have a lease
-            path = claim_file.path_of(claim.key)
+            path = claim_files.path_of(claim.key)
             earlier = ledger_files.lease_before_approval(self._objects, snapshot.commit, path)
             started = replace(claim, lease=claim.lease.started(now, earlier))
             ledger = ledger.replace(claim.key, started)
-            files[path] = claim_file.text_of(started)
+            files[path] = claim_files.text_of(started)
         # a lease does not affect a release, so the usage of nodes need not be counted again
         snapshot = replace(snapshot, state=state.with_ledger(ledger, ()))
         return snapshot, replace(change, files=files), tuple(applied.keys)

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from demandops.base.errors import StateRepoError, Unsound
-from demandops.model.demand.claim import UNSTARTED
+from demandops.model.demand.demand import UNSTARTED
 from demandops.repo.git.objects import sync_folder
 from demandops.repo.git.repository import disk_error
 

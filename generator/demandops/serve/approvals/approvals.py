@@ -23,8 +23,8 @@ from demandops.base.settings import PROPOSAL_LIMIT
 from demandops.cluster.rollouts import targets_of_decision
 from demandops.decide.decision import Decision
 from demandops.decide.state import State
-from demandops.model.demand.claim import ClaimKey
-from demandops.model.demand.demand_request import DemandRequest, Put
+from demandops.model.demand.demand import Demand
+from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.git.repository import PushDenied, StateRepository
 from demandops.repo.git.signing import SigningFailed
 from demandops.repo.history import commit_log
@@ -46,7 +46,6 @@ from demandops.serve.approvals.proposal import (
     admit_or_none,
     code,
     decide_in_turn,
-    is_release,
     key_of,
     pull_request_texts,
     push_options,
@@ -91,7 +90,7 @@ class Approvals:
         self._proposals: dict[str, Proposal] = {}  # by branch
         self._changed: deque[str] = deque()
         for ticket in demands.proposed:  # of an earlier run
-            request = admit_or_none(state, ticket.goal)
+            request = admit_or_none(state, ticket.demand)
             record = replace(ticket.proposal or ProposalRecord(""), withdrawn="")
             new = Proposal(record, searched_to=ticket.base)
             proposal = self._proposals.setdefault(record.branch, new)
@@ -140,9 +139,9 @@ class Approvals:
             return
         # What a person has seen on a branch never becomes another demand there. So a put with other
         # content gets a branch of its own, and replaces the earlier proposal.
-        goal = json.dumps(ticket.goal)
+        goal = json.dumps(ticket.demand.goal)
         proposal = next((old for old in waiting if goal in old.goals()), None)
-        replaced = waiting if isinstance(request, Put) and proposal is None else []
+        replaced = waiting if request.operation == "put" and proposal is None else []
         if proposal is None:
             open_proposals = [other for other in self._proposals.values() if other.waits]
             counts = Counter(name for other in open_proposals for name in other.requesters())
@@ -172,14 +171,14 @@ class Approvals:
         for old in replaced:
             self._replace(old, branch)
 
-    def _waiting(self, request: DemandRequest) -> list[Proposal]:
+    def _waiting(self, request: Demand) -> list[Proposal]:
         key = key_of(request)
         waiting = (proposal for proposal in self._proposals.values() if proposal.waits)
         return [proposal for proposal in waiting if key in map(key_of, proposal.requests)]
 
-    def withdraw_replaced(self, request: DemandRequest) -> None:
+    def withdraw_replaced(self, request: Demand) -> None:
         # by a put that needs no approval
-        for proposal in self._waiting(request) if isinstance(request, Put) else ():
+        for proposal in self._waiting(request) if request.operation == "put" else ():
             self._demands.withdraw_proposed(proposal.tickets, REPLACED)
 
     def _replace(self, old: Proposal, branch: str) -> None:
@@ -293,7 +292,7 @@ class Approvals:
         commit = recorded.commit if recorded else str(snapshot.commit)
         # a person merged the demand, but a later commit changed its files
         if isinstance(decision, InvalidInput) or decision.files:
-            return Receipt(ticket.operation, ticket.name, "booked", commit)
+            return Receipt(ticket.operation, ticket.demand.id, "booked", commit)
         receipt = self.receipt(ticket, decision, commit, snapshot.state)
         return replace(receipt, outcome="booked")
 
@@ -401,11 +400,11 @@ class Approvals:
         self._forge.close()
 
 
-def _release_request(ticket: Ticket, state: State) -> DemandRequest | None:
+def _release_request(ticket: Ticket, state: State) -> Demand | None:
     # None also if the request would be refused
-    if ticket.state == "withdrawn" or not is_release(ticket.goal):
+    if ticket.state == "withdrawn" or not ticket.demand.is_release:
         return None
-    return admit_or_none(state, ticket.goal)
+    return admit_or_none(state, ticket.demand)
 
 
 def _belongs_to_another(branch: str) -> Refused:

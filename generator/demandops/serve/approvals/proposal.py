@@ -16,12 +16,11 @@ from demandops.base.errors import DemandOpsError, InvalidInput, TurnedDown, With
 from demandops.base.quoting import harmless, one_line
 from demandops.base.settings import MAIN_BRANCH
 from demandops.decide.admission import permission
-from demandops.decide.admission.admitted_request import admit
 from demandops.decide.changeset import FileReader
-from demandops.decide.decision import Decision, decide
+from demandops.decide.decision import Decision, admit, decide
 from demandops.decide.state import State
-from demandops.model.demand.claim import ClaimKey
-from demandops.model.demand.demand_request import DemandRequest, Release
+from demandops.model.demand.demand import Demand
+from demandops.model.ledger.claim import ClaimKey
 from demandops.repo.forge import PullRequest
 from demandops.repo.history import commit_log
 from demandops.repo.write.journal import ProposalRecord
@@ -47,7 +46,7 @@ class Verdict:
 class Proposal:
     record: ProposalRecord
     tickets: list[Ticket] = field(default_factory=list)
-    requests: list[DemandRequest] = field(default_factory=list)
+    requests: list[Demand] = field(default_factory=list)
     reasons: tuple[str, ...] = ()  # why approval is needed
     searched_to: str = ""  # up to this commit, main was searched for merged demands
     checked_at: str = ""  # main at the last check; empty to check again
@@ -82,7 +81,7 @@ class Proposal:
         for ticket in self.tickets:
             decision: Decision | InvalidInput
             try:
-                decision = decide(state, ticket.goal, ticket.received, read)
+                decision = decide(state, ticket.demand, ticket.received, read)
             except InvalidInput as error:
                 decision, is_merged = error, False
             else:
@@ -127,22 +126,22 @@ class Proposal:
     def goals(self) -> list[str]:
         # as JSON, because in Python 1 equals true
         tickets = (ticket for ticket in self.tickets if ticket.state == "proposed")
-        return [json.dumps(ticket.goal) for ticket in tickets]
+        return [json.dumps(ticket.demand.goal) for ticket in tickets]
 
     def requesters(self) -> set[str]:
         return {name for request in self.requests for name in request.requesters()}
 
 
-def releases(request: DemandRequest, pending: Sequence[DemandRequest]) -> bool:
+def releases(request: Demand, pending: Sequence[Demand]) -> bool:
     # with the key and a requester of one of the demands; names all their subjects or is a Release
     requesters = {name for other in pending for name in other.requesters()}
     if key_of(request) not in map(key_of, pending) or requesters.isdisjoint(request.requesters()):
         return False
     subjects = {subject for other in pending for subject in other.subjects()}
-    return isinstance(request, Release) or subjects <= set(request.subjects())
+    return request.operation == "release" or subjects <= set(request.subjects())
 
 
-def key_of(request: DemandRequest) -> tuple[str, ...]:
+def key_of(request: Demand) -> tuple[str, ...]:
     if request.is_reference:  # the reference's goals have no demand id
         return ("request", request.id, *sorted(request.requesters()))
     return ("demand", request.demand)
@@ -169,14 +168,9 @@ def decide_in_turn(left: Decided, state: State, read: FileReader) -> tuple[Decid
     return steps, failed
 
 
-def is_release(goal: object) -> bool:
-    fields = goal if isinstance(goal, dict) else {}
-    return bool(fields.get("shutdown") or fields.get("operation") == Release.operation)
-
-
-def admit_or_none(state: State, goal: object) -> DemandRequest | None:
+def admit_or_none(state: State, demand: Demand) -> Demand | None:
     try:
-        return admit(state, goal)
+        return admit(state, demand)
     except InvalidInput:
         return None
 

@@ -107,7 +107,7 @@ class WaitingTurns:
             checkpoint = within(state.config.repo_settings.limits, self._runtime)
             try:
                 decision = decide(
-                    state, dict(waiting.goal), now, commits.read, checkpoint=checkpoint
+                    state, waiting.put, now, commits.read, checkpoint=checkpoint
                 )
             except InvalidInput as error:
                 log.debug("demand %s still waits: %s", quoted(demand), error)

@@ -16,8 +16,8 @@ from demandops.base.errors import InvalidInput, OverLimit
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
 from demandops.decide.placement.relocation import expired_overrides
-from demandops.model.demand.claim import Claim
-from demandops.model.demand.demand_request import Expire
+from demandops.model.demand.demand import Demand
+from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World
 from demandops.model.ledger.records import Instance
 from demandops.repo.write.commit_batch import CommitBatch
@@ -55,7 +55,7 @@ class LeaseExpiry:
         return [self._ticket(demand, now) for demand in ended if demand not in self._tried]
 
     def _ticket(self, demand: str, now: datetime) -> Ticket:
-        ticket = Ticket(self._runtime.fresh_id(), Expire(id=demand, demand=demand), now)
+        ticket = Ticket(self._runtime.fresh_id(), Demand("expire", demand, demand=demand, is_complete=True), now)
 
         def tell(future: Future[Receipt]) -> None:
             self._tried[demand] = now

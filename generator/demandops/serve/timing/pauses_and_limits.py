@@ -11,12 +11,12 @@ from pathlib import Path
 
 from demandops.base.errors import Fault, OverBudget, fault
 from demandops.base.runtime import Runtime
-from demandops.decide.admission.admission import length_faults
-from demandops.decide.admission.admitted_request import Checkpoint
+from demandops.decide.decision import Checkpoint
 from demandops.model.config.base_model import seconds_of
 from demandops.model.config.config import Config
 from demandops.model.config.repo_settings import ROOT_FILE, Limits
-from demandops.model.demand.demand_request import DemandRequest
+from demandops.model.demand.demand import Demand
+from demandops.model.demand.goals import length_faults
 
 # ---- the next attempt to publish: when, and with how many demands ----
 #
@@ -171,9 +171,9 @@ class Heartbeat:
 _USUAL = Limits.model_validate({"demandItems": 200, "demandCharacters": 20_000})
 
 
-def may_take_long(goal: object) -> bool:
+def may_take_long(demand: Demand) -> bool:
     # what was decided before such a demand is published first
-    return any(True for _ in length_faults(goal, _USUAL))
+    return any(True for _ in length_faults(demand.goal, _USUAL))
 
 
 def within(limits: Limits, runtime: Runtime) -> Checkpoint:
@@ -206,7 +206,7 @@ class RateLimit:
         self._seen: dict[tuple[str, str], deque[tuple[datetime, str]]] = {}
 
     def faults(
-        self, request: DemandRequest, config: Config, operation: str, received: datetime
+        self, request: Demand, config: Config, operation: str, received: datetime
     ) -> Iterator[Fault]:
         # A demand counts even if it is refused afterwards. A request that adds no claims is not
         # limited.

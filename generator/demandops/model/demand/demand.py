@@ -1,32 +1,54 @@
-"""What a demand asks for and holds: applications, leases, claims."""
+"""What is demanded: applications and connections, and the demand that lists them.
+
+A demand comes as a goal of our own action ``Demand`` or of the reference's ``DeploymentRequest``,
+over ROS 2 or as YAML. :func:`.goals.read_goal` turns it into a :class:`Demand`, and every fault of
+form ends there. From then on the queue, the journal, the decision, proposals and waiting demands
+all hold a :class:`Demand`. "The reference" is the application manager of the paper.
+"""
 
 from __future__ import annotations
 
 import json
 from bisect import bisect_left
-from collections.abc import Container, Iterable, Iterator, Mapping
+from collections.abc import Container, Hashable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from datetime import datetime, timedelta, timezone
 from itertools import islice, takewhile
-from types import MappingProxyType
-from typing import NamedTuple
+from typing import Annotated, Any, ClassVar, Literal, TypeVar
+
+from pydantic import AfterValidator, Field, Strict, StrictBool
 
 from demandops.base import naming
-from demandops.base.naming import Subject, SubjectKind, TopicKey
+from demandops.base.errors import Fault, fault
+from demandops.base.naming import Subject, SubjectKind, TopicKey, absolute_topic
+from demandops.base.quoting import quoted
 from demandops.connections.connection import Connection
+from demandops.connections.connection_types import type_word
+from demandops.model.config.base_model import PART, Items, Moment, time_text, without
+from demandops.model.config.inventory import Position, read_condition
 
 # ---- applications ----
 
 
-class InputTopic(NamedTuple):
+@dataclass(frozen=True, slots=True)
+class InputTopic:
     """An input topic of an application, and the node that publishes it."""
 
-    topic: str
-    source: str
+    __pydantic_config__: ClassVar = PART
+
+    topic: str = ""
+    source: str = ""
     type: str = ""
     # It was not the usual topic of its source when it was booked. The claim says so, because a name
-    # that is made from it must not change while it is demanded (plan/output_topics.py).
-    further: bool = False
+    # that is made from it must not change while it is demanded (:mod:`.flows`).
+    further: StrictBool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "topic", absolute_topic(self.topic))
+
+    @property
+    def order(self) -> tuple[str, str, str, bool]:
+        return self.topic, self.source, self.type, self.further
 
     def part_in(self, version: str) -> str:
         return naming.topic_part(self.source, self.distinguishing_text(self.further, version))
@@ -37,25 +59,57 @@ class InputTopic(NamedTuple):
         return f"{self.topic} {version}" if version else self.topic
 
 
-# An output that is brought to a node, as `topic` if that is set
-class Delivery(NamedTuple):
-    output: str  # `<service>.<output>`
-    node: str
+@dataclass(frozen=True, slots=True, order=True)
+class Delivery:
+    """An output of an application that is brought to a node, as ``topic`` if that is set."""
+
+    __pydantic_config__: ClassVar = PART
+
+    output: str = ""  # `<service>.<output>`
+    node: str = ""
     topic: str = ""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "topic", absolute_topic(self.topic))
+
+
+def _label_problem(text: str) -> str:
+    if text.partition("=")[0] and "=" in text:
+        return ""
+    return f"{quoted(text)} is not a label; write it as key=value"
+
+
+def _property_problem(text: str) -> str:
+    if read_condition(text) is not None:
+        return ""
+    return f"{quoted(text)} is not a property; write name=value, name>=8 or name<=8"
+
+
+def _capability_problem(text: str) -> str:
+    return "" if text else "is empty; name a capability, or leave it out"
 
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """Requirements on a node; ``properties`` are texts like ``memoryGiB>=8``."""
+    """Requirements on a node; ``labels`` are texts like ``zone=north``.
+
+    ``properties`` are texts like ``memoryGiB>=8``.
+    """
+
+    __pydantic_config__: ClassVar = PART
 
     role: str = ""
-    labels: tuple[tuple[str, str], ...] = ()
-    capabilities: tuple[str, ...] = ()
-    properties: tuple[str, ...] = ()
+    labels: Items[Annotated[str, without(_label_problem)]] = ()
+    capabilities: Items[Annotated[str, without(_capability_problem)]] = ()
+    properties: Items[Annotated[str, without(_property_problem)]] = ()
 
     @property
     def size(self) -> int:
         return len(self.labels) + len(self.capabilities) + len(self.properties)
+
+    @property
+    def label_pairs(self) -> list[tuple[str, str]]:
+        return [(key, value) for key, _, value in (text.partition("=") for text in self.labels)]
 
     def united(self, other: Requirement) -> Requirement:  # two roles must be the same
         return Requirement(
@@ -68,35 +122,40 @@ class Requirement:
 
 @dataclass(frozen=True, slots=True)
 class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
-    """One application: its appdef, its node, and its inputs by role."""
+    """One application: its id, type (the name of an appdef), node and inputs by role.
 
-    id: str
-    # ``#<number>`` if a goal gives the application's type as a number that no appdef has
-    appdef: str
-    node: str
-    inputs: Mapping[str, tuple[InputTopic, ...]]
-    parameters: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    ``version`` is a version or a channel of the registry. ``connect`` is the type of the derived
+    connections for the application's flows and deliveries: ``auto`` derives them with any type,
+    ``none`` derives none. What a connection of the demand carries needs no derived connection.
+    ``services`` maps service names to nodes.
+    """
+
+    __pydantic_config__: ClassVar = PART
+
+    id: str = ""
+    # ``#<number>`` if a goal of the reference's action gives the type as a number
+    appdef: Annotated[str, Field(alias="type")] = ""
+    node: str = ""
+    inputs: Mapping[str, Items[InputTopic]] = field(default_factory=dict)
+    parameters: Mapping[str, Any] = field(default_factory=dict)
     version: str = ""
-    deliver: tuple[Delivery, ...] = ()
+    connect: Annotated[str, type_word("auto", after=("none",))] = "auto"
+    deliver: Items[Delivery] = ()
     # the requirements on the node, kept to choose again; None if the demand names the node
     place: Requirement | None = None
-    # this version runs beside others, and the id ends in it (demand/separate_instance.py)
-    separate: bool = False
     # the nodes of services that have one of their own, by service
-    services: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    services: Mapping[str, str] = field(default_factory=dict)
+    # this version runs beside others, and the id ends in it (:mod:`.completing`)
+    separate: StrictBool = False
     # the nodes to which an override moves services, by service
-    moved: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    moved: Mapping[str, str] = field(default_factory=dict)
     # the services whose node the demand itself names; the generator chose the nodes of the others
-    named: tuple[str, ...] = ()
-    _further: dict[tuple[str, str], list[InputTopic]] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
+    named: Items[str] = ()
 
     def __eq__(self, other: object) -> bool:
         if not isinstance(other, Application):
             return NotImplemented
-        compared = (field.name for field in fields(self) if field.compare)
-        same = all(getattr(self, name) == getattr(other, name) for name in compared)
+        same = all(getattr(self, item.name) == getattr(other, item.name) for item in fields(self))
         # Python treats 1, 1.0 and True as equal, but a chart does not
         return same and _exact(self.parameters) == _exact(other.parameters)
 
@@ -122,20 +181,17 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
 
     def inputs_from(self, role: str, source: str, topic: str) -> tuple[InputTopic, ...]:
         # the inputs must be sorted, as in a claim
-        inputs = self.inputs.get(role, ())
-        start = bisect_left(inputs, InputTopic(topic, source))
-        same = takewhile(
-            lambda t: (t.topic, t.source) == (topic, source), islice(inputs, start, None)
-        )
+        inputs, place = self.inputs.get(role, ()), (topic, source)
+        start = bisect_left(inputs, place, key=lambda t: (t.topic, t.source))
+        same = takewhile(lambda t: (t.topic, t.source) == place, islice(inputs, start, None))
         return tuple(same)
 
     def further_inputs(self, role: str, part: str) -> list[InputTopic]:
-        if not self._further:  # computed only once, because the plans of many services need it
-            for own_role, topic in self.all_inputs():
-                if topic.further or self.separate:
-                    key = own_role, topic.part_in(self.own_version)
-                    self._further.setdefault(key, []).append(topic)
-        return self._further.get((role, part), [])
+        return [
+            topic
+            for topic in self.inputs.get(role, ())
+            if (topic.further or self.separate) and topic.part_in(self.own_version) == part
+        ]
 
     def needs(self, node: str) -> bool:
         delivered = any(delivery.node == node for delivery in self.deliver)
@@ -173,22 +229,22 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
                 if topic.type and not first.type:
                     merged[topic.topic, topic.source] = topic
             inputs[role] = tuple(topic for _, topic in sorted(merged.items()))
-        place = self.place and self.place.united(self.place)
-        deliver = tuple(sorted({*self.deliver}))
-        return replace(self, deliver=deliver, place=place).with_inputs(inputs)
+        return replace(
+            self,
+            deliver=tuple(sorted({*self.deliver})),
+            place=self.place and self.place.united(self.place),
+            named=tuple(sorted({*self.named})),
+        ).with_inputs(inputs)
 
     def with_inputs(self, inputs: Mapping[str, tuple[InputTopic, ...]]) -> Application:
-        kept = {role: topics for role, topics in inputs.items() if topics}
-        return replace(self, inputs=MappingProxyType(kept))
+        return replace(self, inputs={role: topics for role, topics in inputs.items() if topics})
 
     def extended(self, more: Application) -> Application:
         roles = {*self.inputs, *more.inputs}
         inputs = {role: (*self.inputs.get(role, ()), *more.inputs.get(role, ())) for role in roles}
-        parameters = MappingProxyType({**self.parameters, **more.parameters})
+        parameters = {**self.parameters, **more.parameters}
         deliver = (*self.deliver, *more.deliver)
-        return replace(
-            more, inputs=MappingProxyType(inputs), parameters=parameters, deliver=deliver
-        )
+        return replace(more, inputs=inputs, parameters=parameters, deliver=deliver)
 
     def matches_listed(self, listed: object) -> bool:
         return (
@@ -196,9 +252,6 @@ class Application:  # noqa: PLW1641 - it contains mappings, so it has no hash
             and listed.node in ("", self.node)
             and listed.appdef == self.appdef
         )
-
-    def distinguishing_values(self) -> tuple[str, ...]:
-        return (self.node, self.appdef)
 
     def topic_keys(self) -> Iterator[TopicKey]:
         # (role, topic, source) of each input; without inputs one empty key
@@ -263,6 +316,8 @@ def _exact(values: Mapping[str, object]) -> str:
     return json.dumps(dict(values), sort_keys=True, default=repr) if values else ""
 
 
+Held = Application | Connection
+
 # ---- leases: how long a claim stays booked without a renewal ----
 #
 # The recorded end may lag behind the last renewal by ``slack``, so that only some renewals make a
@@ -275,6 +330,12 @@ LONGEST_S = 366 * 24 * 3600
 # The end of a lease that has not started. Its claim awaits approval, or a person approved it and
 # the generator has not started the lease yet.
 UNSTARTED = datetime(9000, 1, 1, tzinfo=timezone.utc)
+
+
+def _before_unstarted(moment: datetime) -> datetime:
+    if moment >= UNSTARTED:
+        raise ValueError(f"{time_text(moment)} is after the year 8999; write an earlier time")
+    return moment
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,9 +353,11 @@ class Term:
 
 @dataclass(frozen=True, slots=True)
 class Lease:
-    seconds: int
-    slack: int
-    until: datetime
+    __pydantic_config__: ClassVar = PART
+
+    seconds: Annotated[int, Strict(), Field(ge=1, le=LONGEST_S)]
+    slack: Annotated[int, Strict(), Field(ge=0, le=LONGEST_S)] = 0
+    until: Annotated[Moment, AfterValidator(_before_unstarted)] = UNSTARTED
 
     @property
     def has_started(self) -> bool:
@@ -328,123 +391,121 @@ def renewed(current: Lease | None, term: Term | None, now: datetime) -> Lease | 
     return current.renewed(term, now) if current else term.lease_from(now)
 
 
-# ---- claims: one demand's hold on one subject ----
-
-# The prefix of the demand ids of claims that overrides make; no other demand may use it
-OVERRIDE_PREFIX = "override:"
+# ---- demands ----
 
 
 @dataclass(frozen=True, slots=True)
-class ClaimKey:
-    subject: Subject
-    demand: str
+class Item:
+    """One application or connection of a demand, and the requesters for whom it is demanded."""
 
-
-@dataclass(frozen=True, slots=True)
-class Claim:
-    held: Application | Connection
-    demand: str
-    request: str
+    held: Held
     requesters: tuple[str, ...]
-    booked: datetime
-    lease: Lease | None = None
-    # A goal of the reference's action booked it; a shutdown takes holds only from such claims
-    joined: bool = False
-    # The topics that only some requesters hold
-    partial: Mapping[TopicKey, tuple[str, ...]] = field(default_factory=dict)
+    # where the demand lists it, as in ``applications[0]``
+    field: str = ""
+    # Of a connection that the demand needs and does not list: what needs it, as in
+    # ``inputs.ego_data[1]`` of the application. Its faults are reported there.
+    needed_by: str = ""
+    term: Term | None = None
+    # how a connection differs from the requested one, for a warning in the receipt
+    note: str = ""
+    # a sentence for each placed application or service: which node was chosen, and why
+    placed: tuple[str, ...] = ()
+
+    def fault(self, path: str, message: str, *, code: str = "invalid") -> Fault:
+        if self.needed_by and not path.startswith("requesters"):
+            path = self.needed_by
+        return fault(".".join(filter(None, (self.field, path))), message, code=code)
+
+
+Operation = Literal[
+    "put",  # our own action: the demand holds exactly what the goal lists
+    "release",
+    "renew",
+    "join",  # the reference's action: the goal adds to what its requesters hold already
+    "shutdown",  # its requesters give up what the goal lists
+    "expire",  # the generator's own: release those claims whose lease has ended
+    "decommission",
+    "rollback",
+    "drain",
+    "wait",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """A demand, which is booked or refused as a whole."""
+
+    operation: Operation
+    id: str = ""  # of the request
+    demanded: tuple[Item, ...] = ()
+    # Empty for the reference's action; `claim.demand_id` makes one for each item
+    demand: str = ""
+    # of the demand as a whole: a release lists no items, but has requesters
+    own_requesters: tuple[str, ...] = ()
+    lease_s: int | None = None
+    positions: Mapping[str, Position] = field(default_factory=dict)  # of nodes that have none
+    priority: int = 0  # among the demands that wait for room
+    # Whether it has all that a demand may leave open, and is admitted. The generator's own are.
+    is_complete: bool = False
+    # the goal as plain data, which the journal keeps
+    goal: Any = field(default=None, compare=False, repr=False)
 
     @property
-    def application(self) -> Application:
-        assert isinstance(self.held, Application), self.subject  # noqa: S101
-        return self.held
+    def adds_claims(self) -> bool:
+        return self.operation in ("put", "join")
 
     @property
-    def connection(self) -> Connection:
-        assert isinstance(self.held, Connection), self.subject  # noqa: S101
-        return self.held
+    def is_reference(self) -> bool:
+        # a goal of the reference's action, which names no demand
+        return self.operation in ("join", "shutdown")
 
     @property
-    def subject(self) -> Subject:
-        return self.held.subject
+    def is_release(self) -> bool:  # by the party that demanded
+        return self.operation in ("release", "shutdown")
 
-    @property
-    def is_on_application(self) -> bool:
-        return self.subject.kind is SubjectKind.APPLICATION
+    def requesters(self) -> tuple[str, ...]:
+        listed = (who for item in self.demanded for who in item.requesters)
+        return tuple(dict.fromkeys((*self.own_requesters, *listed)))
 
-    @property
-    def key(self) -> ClaimKey:
-        return ClaimKey(self.subject, self.demand)
+    def subjects(self) -> tuple[Subject, ...]:
+        return tuple(dict.fromkeys(item.held.subject for item in self.demanded))
 
-    @property
-    def keeping_override(self) -> str | None:
-        # the override that made the claim by its effect `keep`
-        name = self.demand.removeprefix(OVERRIDE_PREFIX)
-        return None if name == self.demand else name
-
-    def index_entries(self) -> Iterator[tuple[str, ...]]:
-        yield ("demand", self.demand)
-        for requester in self.requesters:
-            yield ("requester", requester)
-            yield ("holder", requester, self.subject.kind.value, self.subject.id)
-        if self.keeping_override is not None:
-            yield ("kept",)
-            yield ("kept", self.subject.kind.value, self.subject.id)
-        yield from self.held.index_entries()
-
-    def holders(self, topic: TopicKey) -> tuple[str, ...]:
-        return self.partial.get(topic, self.requesters)
-
-    def with_holders(
-        self, held: Application | Connection, holders: Mapping[TopicKey, tuple[str, ...]]
-    ) -> Claim:
-        requesters = tuple(sorted({who for names in holders.values() for who in names}))
-        partial = {topic: names for topic, names in holders.items() if names != requesters}
-        return replace(self, held=held, requesters=requesters, partial=partial)
-
-    def extending(self, current: Claim) -> Claim:
-        # with everything added that the claim so far holds
-        held = current.held.extended(self.held).booked()  # type: ignore[arg-type]  # of one kind
-        # a shutdown may have taken holds: only what is listed again is held by all requesters
-        holders = dict.fromkeys(held.topic_keys(), self.requesters)
-        listed = {*self.held.topic_keys()}
-        kept = {topic: current.holders(topic) for topic in holders if topic not in listed}
-        return self.with_holders(held, holders | kept)
-
-    def without_holds(
-        self, requester: str, topics: Container[TopicKey] | None = None
-    ) -> Claim | None:
-        holders, gone = dict[TopicKey, tuple[str, ...]](), set[TopicKey]()
-        for topic in self.held.topic_keys():
-            names = self.holders(topic)
-            if topics is None or topic in topics:
-                names = tuple(who for who in names if who != requester)
-            if names:
-                holders[topic] = names
-            else:  # nobody holds the topic any longer, so the claim loses it
-                gone.add(topic)
-        held = self.held.without_topics(gone) if gone else self.held
-        return None if held is None else self.with_holders(held, holders)
-
-    def without_node(self, node: str) -> Claim | None:  # the claim must need the node
-        held = self.held.without_node(node)
-        if held is None:
+    def touches(self) -> frozenset[Hashable] | None:
+        """Return what keeps demands that share it in their order; None touches everything."""
+        if self.operation in ("decommission", "rollback"):
             return None
-        return self.with_holders(held, {t: self.holders(t) for t in held.topic_keys()})
-
-    def after_booking(self, current: Claim | None) -> Claim:
-        if current is None:
-            return self
-        # The time of booking stays if at most the lease changes. Else each renewal, and each demand
-        # that is sent again, would change the claim's file.
-        kept = replace(self, booked=current.booked)
-        return kept if replace(kept, lease=current.lease) == current else self
+        # Goals of the reference's action that share a requester keep their order. For example, of
+        # two equal shutdowns, the second has an effect only if a join came between them.
+        names = self.requesters() if self.is_reference else ()
+        return frozenset((*self.subjects(), ("demand", self.demand), *names))
 
 
-def requesters_of(claims: Iterable[Claim]) -> tuple[str, ...]:
-    return tuple(sorted({who for claim in claims for who in claim.requesters}))
+AnyDemand = TypeVar("AnyDemand", bound=Demand)
 
 
-def demand_id(request: str, requesters: Iterable[str]) -> str:
-    # a digest, so that every generator gives a repeated request the same demand id
-    exact = json.dumps([request, sorted(set(requesters))], ensure_ascii=True)
-    return naming.hash_of(exact, 20)
+@dataclass(frozen=True, slots=True)
+class Decommission(Demand):
+    """An operator's request to release all that needs the node, or names the requester, ``id``."""
+
+    operation: Operation = "decommission"
+    kinds: frozenset[str] = frozenset()  # `node`, `requester` or both
+    by: str = ""  # the operator as `name <email>`
+    reason: str = ""
+    # one name for each access domain of the node; the decision fills them in
+    nodes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Rollback(Demand):
+    """A person's request to book again the claims of the commit ``to``.
+
+    It is carried out on the newest tip, so it works while others write. What they book until then
+    counts as newer than the commit.
+    """
+
+    operation: Operation = "rollback"
+    to: str = ""
+    drop_newer: bool = False  # without it, newer claims make the rollback fail
+    reason: str = ""
+    by: str = ""
+    email: str = ""

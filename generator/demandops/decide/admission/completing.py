@@ -1,0 +1,215 @@
+"""A demand is completed: with all that it leaves open, in one order for both actions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
+
+from demandops.base.errors import Fault
+from demandops.connections.connection import Connection
+from demandops.decide.admission import admission, permission
+from demandops.decide.admission.permission import may_place
+from demandops.decide.placement import placement
+from demandops.decide.planning import flows
+from demandops.decide.state import State
+from demandops.model.config.config import Config
+from demandops.model.config.inventory import id_in_domain
+from demandops.model.demand.demand import (
+    AnyDemand,
+    Application,
+    Decommission,
+    Demand,
+    Held,
+    InputTopic,
+    Item,
+)
+from demandops.model.ledger.ledger import Ledger
+
+
+def completed(
+    demand: AnyDemand, state: State, trial: placement.Trial | None, checkpoint: Callable[[], None]
+) -> tuple[AnyDemand, list[Fault]]:
+    """Return the demand with everything that the generator adds, and the faults of its choices.
+
+    If ``trial`` is given, a node is chosen only if ``trial`` accepts the demand with this node.
+    """
+    config, ledger = state.config, state.ledger
+    if isinstance(demand, Decommission):
+        return replace(demand, nodes=config.nodes_of(demand.id), is_complete=True), []
+    demand = with_definitions(demand, config)
+    # the id of a separate instance comes first, because the placement looks for claims on it
+    demand = with_separate_instances(demand, config)
+    demand, unclear = with_chosen_domains(demand, config, ledger)
+    demand = flows.with_further_topics(demand, ledger, config)
+    demand, not_placed = placement.with_chosen_nodes(
+        demand, state, state.usage(), trial, checkpoint
+    )
+    return placed(demand, state), [*unclear, *not_placed]
+
+
+def placed(demand: AnyDemand, state: State) -> AnyDemand:
+    """Return a demand, whose nodes are chosen, with all else that the generator adds."""
+    config, ledger = state.config, state.ledger
+    demand = permission.with_lease_terms(demand, config)
+    # clients of the reference list their connections, and later shut down just what they listed
+    if not demand.is_reference:
+        demand = flows.with_implied_connections(demand, ledger, config)
+    demand = admission.with_chosen_types(demand, config, ledger.connection)
+    return replace(demand, is_complete=True)
+
+
+# ---- the definition that a goal of the reference's action means by a number ----
+
+
+def with_definitions(demand: AnyDemand, config: Config) -> AnyDemand:
+    if not demand.is_reference:
+        return demand
+
+    def defined(held: Held) -> Held:
+        if not isinstance(held, Application) or not held.appdef.startswith("#"):
+            return held
+        number = held.appdef.removeprefix("#")
+        appdef = config.appdef_by_wire_type(int(number)) if number.isdecimal() else None
+        if appdef is None:
+            return held
+        wire = appdef.deployment_request
+        roles = {str(name): role for name, role in wire.inputs.items()} if wire else {}
+        inputs: dict[str, tuple[InputTopic, ...]] = {}
+        for name, topics in held.inputs.items():  # the definition may give both lists to one role
+            role = roles.get(name) or name
+            inputs[role] = (*inputs.get(role, ()), *topics)
+        return replace(held, appdef=appdef.name, inputs=inputs)
+
+    demanded = tuple(replace(item, held=defined(item.held)) for item in demand.demanded)
+    return replace(demand, demanded=demanded)
+
+
+# ---- the choice of an access domain if a demand names a node that is in several domains ----
+#
+# In each further domain the node has the name ``<node>@<domain>``, which a demand may give wherever
+# it names a node. ``<node>@<first domain>`` means the same as ``<node>``.
+#
+# A demand may name a node without a domain. If its application or connection is booked already, the
+# domain stays. If not, it is the only domain in which the rules let the requesters use the node. If
+# there is no such domain, the node's first domain is meant. If there are several, the demand is
+# refused.
+
+
+def with_chosen_domains(
+    request: AnyDemand, config: Config, ledger: Ledger
+) -> tuple[AnyDemand, list[Fault]]:
+    """Choose a domain for each node; a node that may be used in several domains is a fault."""
+    if not config.hosts:
+        return request, []
+    faults: list[Fault] = []
+    demanded = []
+    for item in request.demanded:
+        held = _with_short_names(item.held, config)
+        booked = ledger.held(held.subject)
+        booked_nodes = _named(booked) if booked else {}
+        chosen = _chosen(item, booked_nodes, config, request.adds_claims, faults)
+        nodes = {**_named(held), **dict(chosen)}
+        if isinstance(held, Application):
+            services = {name: nodes[f"services.{name}"] for name in held.services}
+            held = replace(held, node=nodes["node"], services=services)
+        else:
+            held = replace(held, source=nodes["source"], target=nodes["target"])
+        demanded.append(replace(item, held=held))
+    return replace(request, demanded=tuple(demanded)), faults
+
+
+def _with_short_names(held: Held, config: Config) -> Held:
+    # so that a node has one name in claims: <node>@<first domain> is the same node as <node>
+    def short(name: str) -> str:
+        node, _, domain = name.rpartition("@")
+        own = config.domain_of.get(node)
+        return node if own and name not in config.nodes and own.name == domain else name
+
+    if isinstance(held, Connection):
+        source, target, broker = map(short, (held.source, held.target, held.broker))
+        return replace(held, source=source, target=target, broker=broker)
+    inputs = {
+        role: tuple(replace(topic, source=short(topic.source)) for topic in topics)
+        for role, topics in held.inputs.items()
+    }
+    deliver = tuple(replace(each, node=short(each.node)) for each in held.deliver)
+    services = {name: short(node) for name, node in held.services.items()}
+    held = replace(held, node=short(held.node), services=services, deliver=deliver)
+    return held.with_inputs(inputs)
+
+
+def _named(held: Held) -> dict[str, str]:
+    if isinstance(held, Connection):
+        return {"source": held.source, "target": held.target}
+    services = {f"services.{name}": node for name, node in held.services.items()}
+    return {"node": held.node, **services}
+
+
+def _chosen(
+    item: Item, booked_nodes: Mapping[str, str], config: Config, adds: bool, faults: list[Fault]
+) -> Iterator[tuple[str, str]]:
+    """Yield (field, the node's name in the chosen domain) for each node in several domains."""
+    held = item.held
+    for field, node in _named(held).items():
+        choices = config.nodes_of(node)
+        if len(choices) < 2:
+            continue
+        # A demand that is sent again must mean what is booked, even if the rules changed since
+        if booked_nodes.get(field) in choices:
+            yield field, booked_nodes[field]
+            continue
+        appdef = held.appdef if isinstance(held, Application) else ""
+        allowed = [choice for choice in choices if may_place(item, appdef, choice, config)]
+        if len(allowed) == 1:
+            yield field, allowed[0]
+        elif allowed and adds and item.requesters:
+            domains = [config.domain_of[choice].name for choice in allowed]
+            named = " or ".join(id_in_domain(node, domain) for domain in domains)
+            message = (
+                f"'{node}' is in the access domains {' and '.join(domains)}, and their rules let "
+                f"the requesters use the node in each; name it as {named}"
+            )
+            faults.append(item.fault(field, message, code="several-access-domains"))
+
+
+# ---- separate instances: applications that run another version beside the default version ----
+#
+# With ``versions: separate`` in the appdef, a demand for a version other than the default gets an
+# application of its own. This application has the version in its id (``edge/fusion@1.1.0``), so its
+# services, topics and connections have names of their own. It is removed with its last claim. A
+# service that several appdefs share still runs only once, for all versions.
+#
+# With ``versions: separate``, a claim records the version, not the channel that the demand named.
+# It does so for the default version too. If claims recorded the channel, a channel that moves to
+# another version would change an application that others share.
+
+
+def with_separate_instances(request: AnyDemand, config: Config) -> AnyDemand:
+    demanded = (
+        replace(item, held=_separated(item.held, config))
+        if isinstance(item.held, Application) and item.held.version
+        else item
+        for item in request.demanded
+    )
+    return replace(request, demanded=tuple(demanded))
+
+
+def _separated(app: Application, config: Config) -> Application:
+    appdef = config.appdefs.get(app.appdef)
+    versions = config.application_versions.get(app.appdef, {})
+    version = versions.get(app.version)
+    if appdef is None or appdef.versions != "separate" or version is None:
+        return app
+    # the default may have several names, such as channels; they have the same rank
+    if version.rank == versions[""].rank:
+        return replace(app, version=version.name)
+    suffix = f"@{version.name}"
+    id = app.id if app.id.endswith(suffix) else f"{app.id}{suffix}"
+    return replace(app, id=id, version=version.name, separate=True)
+
+
+def notes_on_instances(request: Demand) -> Iterator[str]:
+    for item in request.demanded:
+        if isinstance(item.held, Application) and item.held.separate:
+            id, _, version = item.held.id.rpartition("@")
+            yield f"application '{id}' in version {version} runs separately, as '{item.held.id}'"

@@ -1,0 +1,531 @@
+"""Reads the goals of both actions, as plain data from ROS, a file or the journal, into demands.
+
+A goal in a file has the fields of the message, so files and messages have the same rules. Absent
+fields have their defaults, and unknown fields are errors.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
+from typing import Annotated, Any, Literal, TypeVar
+
+from pydantic import Field, PlainValidator, ValidationError
+
+from demandops.base import strict_yaml
+from demandops.base.errors import MOST_FAULTS, Fault, Refused, fault, field_path
+from demandops.base.naming import id_problem
+from demandops.base.quoting import quoted
+from demandops.base.settings import API_VERSION
+from demandops.connections.connection import Connection, Route
+from demandops.connections.connection_types import by_number, type_numbered
+from demandops.model.config.base_model import FrozenModel, Items, faults_of, seconds_of
+from demandops.model.config.inventory import Coordinate, Position
+from demandops.model.config.repo_settings import ROOT_FILE, Limits
+from demandops.model.demand.demand import (
+    Application,
+    Decommission,
+    Demand,
+    InputTopic,
+    Item,
+    Rollback,
+)
+
+# ---- goals of ``demandops_interfaces/action/Demand``, and YAML of the kind ``Demand`` ----
+
+
+class GoalPosition(FrozenModel):
+    """A position for a node that has none in the inventory: metres in the node's map frame."""
+
+    node: str = ""
+    x: Coordinate = 0.0
+    y: Coordinate = 0.0
+
+
+def _lease_form(value: object) -> object:
+    # without this validator, pydantic reports one fault for each type in the union
+    if value is None or (isinstance(value, int) and not isinstance(value, bool)):
+        return value
+    if isinstance(value, str):
+        return seconds_of(value)
+    raise ValueError(
+        f"must be a duration like 10m, or whole seconds, not {strict_yaml.short_repr(value)}"
+    )
+
+
+class DemandGoal(FrozenModel):
+    """A demand. ``lease`` is a duration like ``10m``, or whole seconds."""
+
+    apiVersion: Literal["demandops/v1"] = API_VERSION
+    kind: Literal["Demand"] = "Demand"
+    operation: Literal["put", "release", "renew"] = "put"
+    demand: str = ""
+    request: str = ""
+    requesters: list[str] = Field(default_factory=list)
+    lease: Annotated[
+        int | None, PlainValidator(_lease_form, json_schema_input_type=str | int | None)
+    ] = None
+    applications: Items[Application] = ()
+    connections: Items[Connection] = ()
+    priority: Annotated[int, Field(ge=-(2**31), lt=2**31)] = 0
+    positions: list[GoalPosition] = Field(default_factory=list)
+    answer: Literal["pushed", "reconciled", "healthy"] = "pushed"
+
+    def faults(self) -> Iterator[Fault]:
+        if verb := self.operation if self.operation != "put" else "":
+            listed = "applications" if self.applications else "connections"
+            remedy = "leave the field out; to change the demand, send a put"
+            if verb == "release":
+                remedy = "to release a part of the demand, put the demand without that part"
+            for name, given, message in (
+                (
+                    "lease",
+                    self.lease is not None,
+                    "is set by a put; leave it out, or put the demand again",
+                ),
+                (
+                    listed,
+                    self.applications or self.connections,
+                    f"a {verb} names only its demand; {remedy}",
+                ),
+                ("priority", self.priority, f"a {verb} does not wait for room; leave priority out"),
+                ("positions", self.positions, f"a {verb} chooses no node; leave the positions out"),
+            ):
+                if given:
+                    yield fault(name, message)
+        placed = set[str]()
+        for index, position in enumerate(self.positions):
+            if position.node in placed:
+                message = f"{quoted(position.node)} has another position above; give only one"
+                yield fault(f"positions[{index}].node", message)
+            placed.add(position.node)
+
+    def read(self) -> Demand:
+        requesters = tuple(self.requesters)
+        lists = (("applications", self.applications), ("connections", self.connections))
+        return Demand(
+            self.operation,
+            self.request or self.demand,
+            tuple(
+                Item(_named(held), requesters, f"{name}[{index}]")
+                for name, listed in lists
+                for index, held in enumerate(listed)
+            ),
+            self.demand,
+            requesters,
+            self.lease,
+            {each.node: Position(x=each.x, y=each.y) for each in self.positions},
+            self.priority,
+        )
+
+
+def _named(held: Application | Connection) -> Application | Connection:
+    # the services whose node the demand names
+    is_application = isinstance(held, Application)
+    return replace(held, named=tuple(sorted(held.services))) if is_application else held
+
+
+# What the generator records of an application and its inputs, which a demand cannot give.
+_RECORDED = {"separate", "moved", "named"}
+
+
+def _applications_read(goal: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
+    """Return a goal with ``parameters_json`` united with ``parameters``, and the faults of both."""
+    faults: list[Fault] = []
+    listed = goal.get("applications")
+    if not isinstance(listed, list):
+        return goal, faults
+    applications = []
+    for index, app in enumerate(listed):
+        where = f"applications[{index}]"
+        if not isinstance(app, dict):
+            applications.append(app)
+            continue
+        for name in sorted(_RECORDED & app.keys()):
+            faults.append(fault(f"{where}.{name}", "is recorded by the generator; remove it"))
+        inputs = app.get("inputs")
+        for role, topics in inputs.items() if isinstance(inputs, dict) else ():
+            for place, topic in enumerate(topics if isinstance(topics, list) else ()):
+                if isinstance(topic, dict) and "further" in topic:
+                    at = f"{where}.inputs.{role}[{place}].further"
+                    faults.append(fault(at, "is recorded by the generator; remove it"))
+        given, texts = app.get("parameters", {}), app.get("parameters_json", {})
+        read = {name: value for name, value in app.items() if name != "parameters_json"}
+        if isinstance(given, dict) and isinstance(texts, dict):
+            values = dict(given)
+            for name, text in texts.items():
+                place_of = f"{where}.parameters_json.{name}"
+                if name in given:
+                    faults.append(fault(place_of, "is already given in parameters; give it once"))
+                    continue
+                try:
+                    values[name] = json.loads(text)
+                except (json.JSONDecodeError, TypeError):
+                    message = 'is not JSON; text needs its own quotes, as in "\\"fast\\""'
+                    faults.append(fault(place_of, message))
+                except RecursionError:
+                    faults.append(fault(place_of, _TOO_DEEP))
+                except ValueError:  # Python refuses to convert integers of more than 4300 digits
+                    message = "has an integer of too many digits; write a shorter one"
+                    faults.append(fault(place_of, message))
+            for name, value in values.items():
+                if problem := _value_problem(value, 0):
+                    field = "parameters" if name in given else "parameters_json"
+                    faults.append(fault(f"{where}.{field}.{name}", problem))
+            read["parameters"] = values
+        elif isinstance(given, dict):
+            faults.append(fault(f"{where}.parameters_json", "must be a mapping of names to JSON"))
+        applications.append(read)
+    return goal | {"applications": applications}, faults
+
+
+# How many levels a parameter's value may have. It is a part of a claim's file, which may have 100.
+_DEEPEST = 50
+_TOO_DEEP = f"is nested deeper than {_DEEPEST} levels; make it flatter"
+# How many characters a key in a parameter's value may have. YAML reads keys of at most 1024
+# characters, in which an escape counts as several.
+_LONGEST_KEY = 128
+
+
+def _value_problem(value: object, depth: int) -> str:
+    if depth > _DEEPEST:
+        return _TOO_DEEP
+    if isinstance(value, float) and not math.isfinite(value):
+        return f"holds {value}, which is not a finite number; give another value, or leave it out"
+    if isinstance(value, str) and not is_unicode(value):
+        return f"holds {quoted(value)}, which is not Unicode text; write whole characters"
+    if isinstance(value, dict) and (long := [key for key in value if len(key) > _LONGEST_KEY]):
+        length = f"{len(long[0])} characters, but at most {_LONGEST_KEY} are allowed"
+        return f"has the key {quoted(long[0])} of {length}"
+    parts = [*value, *value.values()] if isinstance(value, dict) else value
+    nested = parts if isinstance(parts, list) else ()
+    return next(filter(None, (_value_problem(part, depth + 1) for part in nested)), "")
+
+
+# ---- goals of the reference's action ``DeploymentRequest`` ----
+
+Uint8 = Annotated[int, Field(ge=0, le=255)]
+
+
+class WireTopic(FrozenModel):
+    """``application_manager_interfaces/msg/Topic``."""
+
+    topic_name: str = ""
+    source_node_id: str = ""
+    type: str = ""
+
+
+class WireHeader(FrozenModel):
+    """``application_manager_interfaces/msg/ApplicationHeader``."""
+
+    id: str = ""
+    node_id: str = ""
+
+
+class WireBody(FrozenModel):
+    """``application_manager_interfaces/msg/ObjectDetectionFusionApp``."""
+
+    requester_ids: list[str] = Field(default_factory=list)
+    ego_data_topics: list[WireTopic] = Field(default_factory=list)
+    pointcloud_topics: list[WireTopic] = Field(default_factory=list)
+
+
+class WireApplication(FrozenModel):
+    """``application_manager_interfaces/msg/Application``."""
+
+    header: WireHeader = WireHeader()
+    type: Uint8 = 0
+    object_detection_fusion_app: WireBody = WireBody()
+
+
+class WireConnection(FrozenModel):
+    """``application_manager_interfaces/msg/Connection``."""
+
+    id: str = ""
+    broker_node_id: str = ""
+    requester_ids: list[str] = Field(default_factory=list)
+    source_node_id: str = ""
+    source_topics: list[str] = Field(default_factory=list)
+    target_node_id: str = ""
+    target_topics: list[str] = Field(default_factory=list)
+    type: Uint8 = 0
+
+
+# The lists of inputs in a goal, which stand for roles until the decision knows the definition.
+WIRE_LISTS = ("ego_data_topics", "pointcloud_topics")
+
+
+class WireGoal(FrozenModel):
+    """``application_manager_interfaces/action/DeploymentRequest``, the goal."""
+
+    apps: list[WireApplication] = Field(default_factory=list)
+    connections: list[WireConnection] = Field(default_factory=list)
+    id: str = ""
+    shutdown: bool = False
+
+    def faults(self) -> Iterator[Fault]:
+        for index, connection in enumerate(self.connections):
+            sources, targets = connection.source_topics, connection.target_topics
+            if type_numbered(connection.type) is None:
+                types = ", ".join(f"{kind.number} ({kind.name})" for kind in by_number())
+                message = f"{connection.type} is not a connection type; known: {types}"
+                yield fault(f"connections[{index}].type", message, code="unknown-connection-type")
+            if len(sources) != len(targets):
+                message = (
+                    f"has {len(targets)} names, but source_topics has {len(sources)}; source "
+                    "topic i goes to target topic i, so both lists must have the same length"
+                )
+                yield fault(f"connections[{index}].target_topics", message)
+
+    def read(self) -> Demand:
+        items = []
+        for index, app in enumerate(self.apps):
+            body = app.object_detection_fusion_app
+            held = Application(
+                app.header.id,
+                f"#{app.type}",
+                app.header.node_id,
+                {
+                    name: tuple(
+                        InputTopic(topic.topic_name, topic.source_node_id, topic.type)
+                        for topic in topics
+                    )
+                    for name in WIRE_LISTS
+                    if (topics := getattr(body, name))
+                },
+            )
+            requesters = tuple(dict.fromkeys(body.requester_ids))
+            items.append(Item(held, requesters, f"applications[{index}]"))
+        for index, connection in enumerate(self.connections):
+            topics = zip(connection.source_topics, connection.target_topics, strict=True)
+            carried = Connection(
+                connection.id,
+                type_numbered(connection.type),
+                connection.source_node_id,
+                connection.target_node_id,
+                connection.broker_node_id,
+                tuple(Route(source, target) for source, target in topics),
+            )
+            requesters = tuple(dict.fromkeys(connection.requester_ids))
+            items.append(Item(carried, requesters, f"connections[{index}]"))
+        return Demand("shutdown" if self.shutdown else "join", self.id, tuple(items))
+
+
+# ---- the way in: a goal becomes a demand, or is refused with the faults of its form ----
+
+_NOT_A_MAPPING = (
+    "a request is a mapping with the fields of a Demand (kind, demand, requesters and so on), or "
+    "with id, apps, connections and shutdown"
+)
+_Model = TypeVar("_Model", DemandGoal, WireGoal)
+
+
+def is_demand_goal(goal: dict[str, Any]) -> bool:
+    # the reference's goals have neither of these fields
+    return "kind" in goal or "apiVersion" in goal
+
+
+def read_goal(goal: object, limits: Limits = Limits()) -> Demand:  # noqa: B008 - it is frozen
+    """Return the demand that a goal of either action is; raise Refused with all faults of form."""
+    if isinstance(goal, Demand):
+        return goal
+    try:
+        # exactly what a restart would read from the journal, so that it decides the same
+        goal = json.loads(json.dumps(goal))
+        is_deep = _is_deeper(goal, strict_yaml.MAX_DEPTH)
+    except (TypeError, ValueError, RecursionError):
+        is_deep = True
+    if is_deep:
+        message = f"the goal is not plain data, or is nested more than {strict_yaml.MAX_DEPTH} "
+        message += "deep; give only text, numbers, true, false, null, lists and mappings"
+        raise Refused([fault("", message)])
+    # before anything is parsed, because the parser's work grows with the goal
+    if large := list(length_faults(goal, limits)):
+        raise Refused(large)
+    if not isinstance(goal, dict):
+        raise Refused([fault("", _NOT_A_MAPPING)])
+    faults = list(_keys_not_unicode(goal, ()))
+    if faults:
+        raise Refused(faults)
+    if not is_demand_goal(goal):
+        demand = _parsed(WireGoal, goal, faults)
+    else:
+        united, faults = _applications_read(goal)
+        demand = _parsed(DemandGoal, united, faults)
+    return replace(demand, goal=goal)
+
+
+def _parsed(model: type[_Model], goal: dict[str, Any], faults: list[Fault]) -> Demand:
+    try:
+        parsed = model.model_validate(goal)
+    except ValidationError as error:
+        raise Refused([*faults, *faults_of(error, model, most=MOST_FAULTS)]) from None
+    if faults := [*faults, *parsed.faults()]:
+        raise Refused(faults)
+    return parsed.read()
+
+
+def _is_deeper(value: object, levels: int) -> bool:
+    if not isinstance(value, dict | list):
+        return False
+    parts = value.values() if isinstance(value, dict) else value
+    return levels == 0 or any(_is_deeper(part, levels - 1) for part in parts)
+
+
+def is_unicode(text: str) -> bool:
+    # JSON can escape half of a surrogate pair, and no file in UTF-8 can contain the result
+    return not any("\ud800" <= char <= "\udfff" for char in text)
+
+
+def _keys_not_unicode(value: object, location: tuple[int | str, ...]) -> Iterator[Fault]:
+    if isinstance(value, list):
+        for index, part in enumerate(value):
+            yield from _keys_not_unicode(part, (*location, index))
+    elif isinstance(value, dict):
+        for key, part in value.items():
+            if is_unicode(key):
+                yield from _keys_not_unicode(part, (*location, key))
+            else:
+                message = f"the key {strict_yaml.short_repr(key)} is not text"
+                yield fault(field_path(location), f"{message}; write whole characters")
+
+
+# ---- operators' demands, which no action and no file can express; only the journal has them ----
+
+
+def decommission(name: str, kinds: frozenset[str], by: str, reason: str) -> Decommission:
+    goal = {"kind": "Decommission", "name": name, "as": sorted(kinds), "by": by}
+    return read_journaled(goal | ({"reason": reason} if reason else {}))  # type: ignore[return-value]
+
+
+def rollback(to: str, *, drop_newer: bool, reason: str, who: tuple[str, str]) -> Rollback:
+    goal = {"kind": "Rollback", "to": to, "dropNewer": drop_newer, "by": list(who)}
+    return read_journaled(goal | {"reason": " ".join(reason.split())})  # type: ignore[return-value]
+
+
+def read_journaled(goal: Any) -> Demand:  # noqa: ANN401 - plain data
+    kind = goal.get("kind") if isinstance(goal, dict) else None
+    if kind == "Decommission":
+        name = goal.get("name")
+        problem = id_problem(name) if isinstance(name, str) else "must be text"
+        if problem:
+            raise Refused.at("name", problem)
+        kinds = frozenset(kind for kind in goal.get("as", ()) if kind in ("node", "requester"))
+        by, reason = (str(goal.get(key) or "") for key in ("by", "reason"))
+        return Decommission(id=str(name), kinds=kinds, by=by, reason=reason, goal=goal)
+    if kind == "Rollback":
+        by, email = goal["by"]
+        return Rollback(
+            to=str(goal["to"]),
+            drop_newer=bool(goal["dropNewer"]),
+            reason=str(goal["reason"]),
+            by=by,
+            email=email,
+            goal=goal,
+        )
+    return read_goal(goal)
+
+
+# ---- the field of a goal that a fault is about ----
+
+_LISTED = re.compile(r"applications\[(\d+)\]\.?(.*)|connections\[(\d+)\]\.?(.*)")
+_BODY = "object_detection_fusion_app"
+
+
+def goal_field(field: str, demand: Demand, roles: Mapping[str, Mapping[str, str]]) -> str:
+    """Return the field of the demand's goal for the field of a fault.
+
+    For example, ``applications[0].inputs.ego_data[2].source`` becomes
+    ``apps[0].object_detection_fusion_app.ego_data_topics[2].source_node_id``. ``roles`` maps the
+    lists of a goal of the reference's action to roles, for each application definition.
+    """
+    match = _LISTED.fullmatch(field)
+    if match is None:
+        return field
+    if not demand.is_reference:
+        path = match[2] or match[4] or ""
+        return path if path.startswith("requesters") else field
+    if match[1] is None:
+        item, path = f"connections[{match[3]}]", match[4]
+        if path.startswith("requesters"):
+            return f"{item}.requester_ids{path.removeprefix('requesters')}"
+        if path in ("source", "target", "broker"):
+            return f"{item}.{path}_node_id"
+        if path.startswith("topics"):
+            place, _, name = path.removeprefix("topics").partition(".")
+            return f"{item}.{'target' if name == 'target' else 'source'}_topics{place}"
+        return f"{item}.{path}".rstrip(".")
+    item, path = f"apps[{match[1]}]", match[2]
+    name, _, within = path.partition(".")
+    if name in ("id", "node"):
+        return f"{item}.header.{'id' if name == 'id' else 'node_id'}"
+    if name.startswith("requesters"):
+        return f"{item}.{_BODY}.requester_ids{name.removeprefix('requesters')}"
+    if name != "inputs":
+        return f"{item}.{path}".rstrip(".")
+    role, bracket, place = within.partition("[")
+    place = place.replace("].topic", "].topic_name").replace("].source", "].source_node_id")
+    held = demand.demanded[int(match[1])].held
+    of_role = roles.get(held.appdef, {}) if isinstance(held, Application) else {}
+    listed = next((wire for wire, own in of_role.items() if own == role), role)
+    return f"{item}.{_BODY}{f'.{listed}' if listed else ''}{bracket}{place}"
+
+
+# ---- the size of a goal ----
+
+# The lists in these fields have no items of their own. The size of parameters is limited in bytes
+# instead, and each target topic belongs to a source topic, which counts.
+_NOT_COUNTED = ("parameters", "parameters_json", "target_topics")
+# About ten fields describe any item. Unknown fields are bounded too, because each would cost a
+# fault when the goal is parsed.
+_FIELDS_OF_ITEM = 10
+ITEMS = (
+    "items (applications, connections, topics, requesters and so on, also of the connections that "
+    "it needs)"
+)
+
+
+def length_faults(goal: object, limits: Limits) -> Iterator[Fault]:
+    """Yield a fault if a goal, as plain data, is far too large to be parsed at all."""
+    length = items = fields = 0
+    most_fields = max(1_000, _FIELDS_OF_ITEM * limits.demand_items)
+    # The walk ends as soon as a limit is passed, so that a huge goal costs no more than the limit.
+    # It keeps a list instead of calling itself, because a goal may be nested to any depth.
+    unread: list[tuple[object, bool]] = [(goal, True)]
+    while (
+        unread
+        and length <= limits.demand_characters
+        and items <= limits.demand_items
+        and fields <= most_fields
+    ):
+        value, counts = unread.pop()
+        if isinstance(value, str):
+            length += len(value)
+        elif isinstance(value, list):
+            length += 2 * len(value)  # each part is at least a character and a comma
+            items += len(value) if counts else 0
+            unread += [(part, counts) for part in value]
+        elif isinstance(value, dict):
+            fields += len(value)
+            length += sum(1 + len(key) if isinstance(key, str) else 1 for key in value)
+            unread += [(part, counts and key not in _NOT_COUNTED) for key, part in value.items()]
+        elif isinstance(value, int):
+            length += value.bit_length() // 4
+    for count, most, verb, what, limit in (
+        (length, limits.demand_characters, "has", "characters", "demandCharacters"),
+        (fields, most_fields, "has", "fields", "demandItems"),
+        (items, limits.demand_items, "lists", ITEMS, "demandItems"),
+    ):
+        if count > most:
+            message = too_large(f"{verb} more than {most} {what}", limit, most)
+            yield fault("", message, code="too-large")
+
+
+def too_large(size: str, limit: str, most: int) -> str:
+    return (
+        f"{size}, but at most {most} are allowed; a platform engineer may raise limits.{limit} in "
+        f"{ROOT_FILE}"
+    )
