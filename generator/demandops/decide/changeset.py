@@ -152,10 +152,6 @@ def _ledger_files(
         shutdown = ledger.shutdowns.by_digest.get(digest)
         path = records.shutdowns_path(digest)
         files[path] = records.shutdowns_text(shutdown) if shutdown else None
-    for instance in changes.kept:
-        steps = ledger.kept.steps.get(instance)
-        path = records.replicas_path(instance)
-        files[path] = records.replicas_text(instance, steps) if steps else None
     for demand in changes.waiting:
         waits = ledger.waiting.get(demand)
         files[records.waiting_path(demand)] = records.waiting_text(waits) if waits else None

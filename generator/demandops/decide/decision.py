@@ -23,7 +23,6 @@ from demandops.decide.booking import Drain, apply
 from demandops.decide.changeset import Changeset, FileReader, ReleaseChange
 from demandops.decide.checks import collisions, quotas, version_difference
 from demandops.decide.placement import capacity, relocation
-from demandops.decide.planning import planner
 from demandops.decide.planning.flows import flows, without_idle_deliveries
 from demandops.decide.planning.overrides import update_kept_claims, without_suspended
 from demandops.decide.planning.planner import is_bridged
@@ -31,15 +30,13 @@ from demandops.decide.planning.release_keys import ReleaseKey, affected_keys, ke
 from demandops.decide.rollback import Restoration
 from demandops.decide.state import State
 from demandops.model.config.config import Config
-from demandops.model.config.override import format_time
 from demandops.model.demand import demand_goal
 from demandops.model.demand.claim import Application
 from demandops.model.demand.demand_request import Decommission, DemandRequest
 from demandops.model.ledger import claim_file
 from demandops.model.ledger import ledger as ledgers
 from demandops.model.ledger.ledger import Changes, ClaimChange, Ledger, World
-from demandops.model.ledger.records import Instance, Wait
-from demandops.model.release import ServiceKey, ServiceRelease
+from demandops.model.ledger.records import Wait
 
 Stage = Literal["admitted", "booked"]
 Outcome = Literal["booked", "released", "restored", "unchanged", "waiting"]
@@ -314,8 +311,6 @@ def _booked(
     checkpoint()
     after = replace(state, ledger=ledger)
     keys = affected_keys(state, after, changes.claims)
-    ledger, kept = planner.with_kept_replicas(state, after, keys, now)
-    after, changes = replace(after, ledger=ledger), replace(changes, kept=kept)
     clashes = list(collisions.topic_faults(request, state, after, paced(keys, checkpoint)))
     clashes += collisions.name_faults(
         request, state, after, paced(keys, checkpoint), changes, state.names()
@@ -325,20 +320,6 @@ def _booked(
     if clashes:
         raise Refused(clashes)
     return after, changes, keys
-
-
-def scale_down(
-    state: State, instance: Instance, now: datetime, read: FileReader
-) -> tuple[State, changeset.Changeset]:
-    kept = state.ledger.kept
-    steps = tuple(step for step in kept.steps.get(instance) or () if step.until > now)
-    after = replace(state, ledger=replace(state.ledger, kept=kept.replace(instance, steps)))
-    changes, keys = Changes(kept=(instance,)), [ServiceKey.of(instance)]
-    change = changeset.build_changeset(
-        state, after, changes, keys, state.evaluate, read, state.plans
-    )
-    grown = capacity.growth(change.former, change.plans, state.config)
-    return state.followed_by(after.ledger, change, state.usage().plus(grown)), change
 
 
 # ---- notes for the requester, in addition to the outcome ----
@@ -379,13 +360,6 @@ def notes_on(
     if isinstance(request, Wait):
         yield from request.reasons
     yield from quotas.warnings(request, after)
-    for release in (rendered.plans.get(ServiceKey.of(instance)) for instance in changes.kept):
-        if isinstance(release, ServiceRelease) and release.keeps:
-            until = format_time(release.keeps.until)
-            yield (
-                f"{release.name} keeps {release.replicas} replicas until {until} (downAfter in its "
-                "definition), although its demands need fewer"
-            )
 
 
 # ---- claims that a person edits in the ledger ----

@@ -266,8 +266,6 @@ def names_of(world: World, key: ReleaseKey) -> Iterator[Name]:
         # Nothing is named if the configuration no longer has the service.
         if service is not None and service.scope == key.scope:
             yield "release", service_name(world.config, service, key)
-            if key.service in world.config.services_with_down_after:
-                yield "record of replicas", records.replicas_path(key.instance)
             return
 
 

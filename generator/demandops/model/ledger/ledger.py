@@ -19,8 +19,6 @@ from demandops.model.config.override import Override, by_rank, still_active
 from demandops.model.demand.claim import UNSTARTED, Application, Claim, ClaimKey, InputTopic
 from demandops.model.ledger.claim_file import minute_of
 from demandops.model.ledger.records import (
-    Instance,
-    KeptReplicas,
     RecentShutdown,
     RecentShutdowns,
     WaitingDemands,
@@ -58,7 +56,6 @@ class Ledger:
     # choice of nodes takes the emptiest, and must not count all claims for each demand.
     applications_on: HashTrieMap[str, int] = field(default_factory=HashTrieMap)
     waiting: WaitingDemands = field(default_factory=HashTrieMap)
-    kept: KeptReplicas = field(default_factory=KeptReplicas)
 
     def claims_on(self, subject: Subject) -> tuple[Claim, ...]:
         return self.claims.get(subject) or ()
@@ -317,8 +314,6 @@ class Changes:
     shutdowns: tuple[str, ...] = ()
     # the earlier shutdown that the request repeats
     repeats: RecentShutdown | None = None
-    # the service instances whose kept replicas changed
-    kept: tuple[Instance, ...] = ()
     # the ids of the demands that begin or cease to wait, or that now wait with another goal
     waiting: tuple[str, ...] = ()
 
