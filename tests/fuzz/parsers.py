@@ -224,12 +224,6 @@ def shutdown(data: bytes) -> None:
     records.read_all_shutdowns({records.shutdowns_path("0f" * 10): _text(data)})
 
 
-def replicas(data: bytes) -> None:
-    path = records.replicas_path(("replicas", "object-fusion", "edge", "", "", "", "", ""))
-    record = records.read_replicas(_text(data), path)
-    assert record is None or records.read_replicas(records.replicas_text(*record), path) == record
-
-
 def waiting_demand(data: bytes) -> None:
     path = records.waiting_path("x")
     record = records.read_waiting(_text(data), path)
@@ -444,7 +438,7 @@ TARGETS = (
     Target(chart_values, values=_changed_charts()),
     Target(set_key, tuple(_CONFIG[path].encode() for path in _FILES)),
     Target(claim, _bytes(path for path in _BOOKED if "shutdowns" not in path.parts)),
-    *(Target(one, _seeds(one)) for one in (marker, shutdown, replicas, waiting_demand)),
+    *(Target(one, _seeds(one)) for one in (marker, shutdown, waiting_demand)),
     Target(contexts_file, _seeds(contexts_file)),
     Target(detector_rules, (*_seeds(detector_rules), _RULES.read_bytes())),
     Target(end_of_override, _seeds(end_of_override), expected=(click.BadParameter,)),

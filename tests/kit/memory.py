@@ -14,7 +14,7 @@ import jsonschema_rs
 import yaml
 from demandops.base.errors import Refused
 from demandops.base.settings import data_folder
-from demandops.decide.decision import Decision, decide, scale_down
+from demandops.decide.decision import Decision, decide
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import Config
 from demandops.model.config.load import load
@@ -100,15 +100,6 @@ class MemoryRepo:
             assert text is None or not unread_fields(path, text), path
             self.files.pop(path) if text is None else self.files.update({path: text})
 
-    def scale_down(self, now: datetime) -> list[str]:
-        """Remove the replicas that are due; return the names of the changed releases."""
-        names = []
-        for instance in self.state.ledger.kept.due(now):
-            self.state, change = scale_down(self.state, instance, now, self.files.get)
-            names += [release.name for release in change.releases]
-            self._write(change.files)
-        return names
-
     def take(self, goal: object, now: datetime | None = None) -> Decision | Refused:
         before = dict(self.files), self.state
         try:
@@ -181,7 +172,7 @@ def rebuilt(claims: Iterable[Claim]) -> Ledger:
 
 
 def is_of_ledger(path: str) -> bool:
-    roots = (records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT, records.WAITING_ROOT)
+    roots = (records.SHUTDOWNS_ROOT, records.WAITING_ROOT)
     return bool(claim_files.kind_of(path)) or path.startswith(roots)
 
 
@@ -194,7 +185,6 @@ def ledger_in(files: Mapping[str, str]) -> Ledger:
         ledger,
         shutdowns=records.read_all_shutdowns(booked),
         waiting=records.read_all_waiting(booked),
-        kept=records.read_all_replicas(booked),
     )
 
 

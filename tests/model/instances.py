@@ -1,4 +1,4 @@
-"""A model of separate instances, of a node in two access domains, and of kept replicas.
+"""A model of separate instances, of a node in two access domains, and of replicas.
 
 It is written from what docs/versions.md, docs/policy.md and docs/appdef.md promise, and imports
 nothing of the program. In this model, each demand for an instance has one application, which runs
@@ -7,9 +7,7 @@ one service.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, field
-from datetime import datetime, timedelta
+from dataclasses import dataclass
 from typing import Any
 
 from tests.model.leases import Goal
@@ -27,7 +25,6 @@ MAY = {
 }
 """For each requester, the names under which it may demand the node ``hall``."""
 MOST = 3
-KEPT_FOR = timedelta(seconds=120)
 
 Instance = tuple[str, str]
 """An application's id, and its node."""
@@ -35,22 +32,18 @@ Instance = tuple[str, str]
 
 @dataclass
 class Instances(Places):
-    """Adds separate instances; ``kept[one] == {3: t}`` if one keeps a third replica until ``t``."""
+    """Adds separate instances."""
 
     testing: str = NEXT
-    kept: dict[Instance, dict[int, datetime]] = field(default_factory=dict)
 
     def take(self, goal: Goal, now: int, received: str = "") -> Outcome:
-        before = self.demanded()
         app: dict[str, Any] = next(iter(goal.get("applications", [])), {})
         if app.get("type") == TALLY:
             chosen = self._chosen(app, goal["requesters"])
             if chosen is None:
                 return "refused"
             goal = goal | {"applications": [chosen]}
-        outcome = super().take(goal, now, received)
-        self.keep(before, datetime.fromisoformat(received.replace("Z", "+00:00")))
-        return outcome
+        return super().take(goal, now, received)
 
     def _chosen(self, app: dict[str, Any], who: list[str]) -> dict[str, Any] | None:
         """Return ``app`` with the id, node and version for its claim; None to refuse the demand."""
@@ -82,37 +75,5 @@ class Instances(Places):
                     found[one] = found.get(one, frozenset()) | held.what["inputs"]["ego_data"]
         return found
 
-    def keep(self, before: Mapping[Instance, frozenset[Any]], now: datetime) -> None:
-        """Keep replicas that have become superfluous, until ``KEPT_FOR`` after ``now``."""
-        after = self.demanded()
-        for one in before.keys() | after.keys():
-            least, had = needed(after.get(one, ())), needed(before.get(one, ()))
-            kept = self.kept.pop(one, {}) | dict.fromkeys(range(least + 1, had + 1), now + KEPT_FOR)
-            if least and (kept := {number: kept[number] for number in kept if number > least}):
-                self.kept[one] = kept
-
-    def come_down(self, one: Instance, record: Mapping[int, datetime], now: datetime) -> None:
-        """Take over the program's ``record``, which may lack only what is over."""
-        least = needed(self.demanded().get(one, ()))
-        kept, told = _ends(self.kept.get(one, {}), least), _ends(record, least)
-        for number in kept.keys() - told.keys():
-            assert kept[number] <= now, f"{one} came down from {number} before {kept[number]}"
-        assert told.items() <= kept.items(), f"{one} keeps {told}, but expected {kept}"
-        self.kept.pop(one, None)
-        if told:
-            self.kept[one] = told
-
     def replicas(self, one: Instance) -> int:
-        return max(needed(self.demanded()[one]), *self.kept.get(one, ()), 0)
-
-
-def _ends(kept: Mapping[int, datetime], least: int) -> dict[int, datetime]:
-    """Map each number of replicas above ``least`` to the time when fewer than that remain."""
-    return {
-        number: max(end for one, end in kept.items() if one >= number)
-        for number in range(least + 1, max(kept, default=0) + 1)
-    }
-
-
-def needed(topics: Collection[Any]) -> int:
-    return min(MOST, len(topics))
+        return min(MOST, len(self.demanded()[one]))

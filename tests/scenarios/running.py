@@ -198,7 +198,6 @@ class World(MemoryRepo):
             taken = self.take(Expire(id=demand, demand=demand))
             assert isinstance(taken, Decision)
             assert taken.files, f"nothing of '{demand}' was released at {now}"
-        self.scale_down(now)
         for node in self.config.drained_nodes:
             if self.state.ledger.applications_on.get(node):
                 self.take(Drain(node))

@@ -23,7 +23,6 @@ from demandops.decide.placement import placement, relocation
 from demandops.decide.placement.candidates import Choice
 from demandops.decide.placement.capacity import Room, Usage
 from demandops.decide.planning import overrides, planner, release_keys
-from demandops.model.config.appdef import Scaling
 from demandops.model.config.config import Config
 from demandops.model.demand.demand import Lease
 from demandops.model.ledger import claim, ledger
@@ -41,7 +40,7 @@ from demandops.serve.evaluation import Evaluator
 from demandops.serve.queue import Receipt, Ticket
 from demandops.serve.timing import agenda, expiry
 from demandops.serve.timing.agenda import Draining, WaitingTurns
-from demandops.serve.timing.expiry import LeaseExpiry, ScaleDown
+from demandops.serve.timing.expiry import LeaseExpiry
 from demandops.serve.worker import Worker
 
 Wrong = Callable[..., Any]
@@ -115,7 +114,7 @@ def keep_former_requesters(
 plant("let_strangers_change_a_demand", 1, booking, "refuse_other_owners", nothing)
 plant("release_only_the_first_claim", 17, booking, "owned_claims", first_only)
 plant("replace_what_was_joined", 2, Claim, "extending", itself)
-plant("commit_what_is_booked_already", 8, Claim, "after_booking", itself)
+plant("commit_what_is_booked_already", 15, Claim, "after_booking", itself)
 plant("grant_one_claim_too_many", 4, quotas, "_held", lambda held, *given: held(*given) - 1)
 plant("take_a_repeat_for_another_shutdown", 16, RecentShutdowns, "earlier", nothing)
 
@@ -125,18 +124,29 @@ def take_back_promised_leases(_: Any, lease: Any, term: Any, now: Any) -> Any:
     return term.lease_from(now)
 
 
-plant("lose_renewals", 3, Lease, "renewed", itself)
+plant("lose_renewals", 2, Lease, "renewed", itself)
 
 
-@wrong(3, LeaseExpiry, "_has_ended")
+@wrong(11, LeaseExpiry, "_has_ended")
 def end_leases_by_the_wall_clock(_: Any, expiry: Any, claim: Any, now: Any) -> bool:
     return claim.lease is not None
 
 
-plant("come_down_at_once", 8, planner, "_steps", lambda *_: ())
-plant("come_down_early", 1, Scaling, "kept_for", lambda *_: timedelta(seconds=60))
-plant("never_come_down", 15, ScaleDown, "is_due", nothing)
-plant("never_come_down", 15, ScaleDown, "end_due", nothing)
+plant("never_scale", 8, planner, "_replicas_of", lambda _, scaling, *more: scaling.min)
+
+
+@wrong(1, planner, "_replicas_of")
+def exceed_the_most_replicas(_: Any, scaling: Any, parameters: Any, topics: Any, *more: Any) -> int:
+    return len(topics) or 1
+
+
+@wrong(15, planner, "_replicas_of")
+def count_sources_for_topics(
+    right: Any, scaling: Any, parameters: Any, topics: Any, *more: Any
+) -> Any:
+    return right(scaling, parameters, {topic.source: topic for topic in topics}.values(), *more)
+
+
 plant("share_one_instance", 1, admitted_request, "_separated", itself)
 
 
@@ -145,7 +155,7 @@ def move_instances_with_the_channel(separated: Any, app: Any, config: Any) -> An
     return replace(separated(app, config), version=app.version)
 
 
-@wrong(22, admitted_request, "_separated")
+@wrong(72, admitted_request, "_separated")
 def keep_the_channel_of_the_default_version(separated: Any, app: Any, config: Any) -> Any:
     made = separated(app, config)
     return made if made.separate else app
@@ -172,8 +182,8 @@ def name_a_shared_route_twice(_: Any, routes: Any) -> Any:
     return tuple(sorted(routes, key=lambda one: one.source))
 
 
-plant("deliver_under_the_source_topic", 6, Route, "written_topic", lambda _, one: one.source)
-plant("send_a_source_topic_to_two_targets", 6, booking, "_route_conflicts", lambda *_: ())
+plant("deliver_under_the_source_topic", 8, Route, "written_topic", lambda _, one: one.source)
+plant("send_a_source_topic_to_two_targets", 20, booking, "_route_conflicts", lambda *_: ())
 
 
 @wrong(0, decision, "affected_keys")
@@ -235,18 +245,18 @@ def apply_overrides_only_to_new_demands(followed: Any, batch: Any, advance: Any,
 plant("let_the_lowest_priority_win", 63, ledger, "by_rank", in_reverse)
 
 
-@wrong(8, overrides, "fits")
+@wrong(9, overrides, "fits")
 def override_all_nodes(fits: Any, selector: Any, traits: Any, config: Any) -> bool:
     return bool(selector.nodes and not traits.connections) or fits(selector, traits, config)
 
 
 plant("run_what_is_denied", 26, planner, "without_suspended", itself)
 plant("run_what_is_denied", 26, release_keys, "without_suspended", itself)
-plant("book_what_is_denied", 6, quotas, "denial_faults", lambda *_: ())
+plant("book_what_is_denied", 27, quotas, "denial_faults", lambda *_: ())
 
 
 @wrong(6, expiry, "expired_overrides")
-@wrong(6, relocation, "expired_overrides")
+@wrong(10, relocation, "expired_overrides")
 def end_overrides_early(expired: Any, one: Any, now: Any) -> Any:
     return expired(one, now + timedelta(minutes=2))
 
@@ -354,7 +364,7 @@ plant("resume_in_reverse", 1, journal, "read", lambda read, path: dict([*read(pa
 plant("skip_the_search_for_operations", 22, Evaluator, "published_before", lambda *_: [])
 
 
-@wrong(6, generator.state_in_effect, "first_snapshot")
+@wrong(30, generator.state_in_effect, "first_snapshot")
 def start_without_overrides(first: Any, *given: Any) -> Any:
     found = first(*given)
     config = replace(found.state.config, overrides={})

@@ -21,8 +21,7 @@ from tests.kit.promises import Maker, name_of
 from tests.kit.repo import GitRepo
 from tests.model.instances import DEFAULT, FIRST, FURTHER, HALL, NEXT, TALLY
 from tests.model.leases import Goal
-from tests.model.running import Running
-from tests.simulation.oracle import KEPT_REPLICAS, PLACES, SLACK_S, VISITOR, Oracle
+from tests.simulation.oracle import PLACES, SLACK_S, VISITOR, Oracle
 from tests.simulation.world import World
 
 STEPS = 30
@@ -61,7 +60,7 @@ class History:
         self._sent: list[Goal] = []
         self._often, self._edited_often = self.chance.choice(
             [
-                (self._tallied, self._come_down),
+                (self._tallied, self._delete_claim),
                 (self._tallied, self._move_channel),
                 (self._placed, self._drain),
                 (self._visitor, self._edit_generated),
@@ -237,7 +236,7 @@ class History:
 
     def edit(self) -> None:
         edits = [self._override] * 2 + [self._inventory, self._drain, self._stop_waiting]
-        edits += [self._come_down, self._move_channel] + [self._delete_claim] * 2
+        edits += [self._move_channel, self._delete_claim] * 2
         self.chance.choice([*edits, self._edit_generated, *[self._edited_often] * 4])()
 
     def _commit(self, changed: dict[str, str | None]) -> str:
@@ -287,21 +286,12 @@ class History:
         commit = self._changed(NODES, drain)
         self.oracle.edits[commit] = lambda books: books.drain(name, drained)
 
-    def _delete_record(self, under: str, follow: Callable[[Running, Any], object]) -> None:
-        self.oracle.check()
-        if found := sorted(self._files(under).items()):
-            path, text = self.chance.choice(found)
-            record = plain_yaml.load(text)
-            self.oracle.edits[self._commit({path: None})] = lambda books: follow(books, record)
-
     def _stop_waiting(self) -> None:
-        self._delete_record("ledger/waiting", lambda books, one: books.waiting.pop(one["demand"]))
-
-    def _come_down(self) -> None:
-        """Let a service scale down at once: delete the record of the replicas that it keeps."""
-        self._delete_record(
-            KEPT_REPLICAS, lambda books, one: books.kept.pop((one["application"], one["node"]))
-        )
+        self.oracle.check()
+        if found := sorted(self._files("ledger/waiting").items()):
+            path, text = self.chance.choice(found)
+            demand = plain_yaml.load(text)["demand"]
+            self.oracle.edits[self._commit({path: None})] = lambda books: books.waiting.pop(demand)
 
     def _move_channel(self) -> None:
         self.oracle.check()

@@ -23,7 +23,7 @@ from demandops.serve.queue import Ticket
 
 from tests.kit import plain_yaml
 from tests.kit.promises import claims_of, name_of
-from tests.model.instances import FURTHER, KEPT_FOR, NEXT, Instance
+from tests.model.instances import FURTHER, NEXT
 from tests.model.leases import Goal, Subject
 from tests.model.running import Link, Override, Running, Service
 from tests.simulation.world import Machine, World
@@ -31,7 +31,6 @@ from tests.simulation.world import Machine, World
 SLACK_S = 30
 PLACES = frozenset({"rack0", "rack1"})
 """The nodes for demands that name no node; each of these nodes has room for one application."""
-KEPT_REPLICAS = "ledger/replicas"
 VISITOR = "visitor"
 """A requester whose id starts with this needs approval for its demands."""
 
@@ -87,7 +86,6 @@ class Oracle:
         self._parsed: dict[pygit2.Oid, Claim] = {}
         self._last: dict[Any, int] = {}
         self._claims: dict[Any, Any] = {}
-        self._records: dict[Instance, dict[int, datetime]] = {}
         world.on_start = self._check_resumed
         world.on_push = lambda: self._guard(self._follow_main)
 
@@ -138,7 +136,6 @@ class Oracle:
     def _book(self, commit: pygit2.Commit, by: tuple[Machine, float, float] | None) -> None:
         self.counts["commits"] += 1
         claims = claims_of(self.claims(str(commit.id)).values())
-        records = _kept_replicas(commit)
         self.books.chosen = {
             subject: what["node"] for (_, subject), (what, _) in claims.items() if "node" in what
         }
@@ -151,9 +148,7 @@ class Oracle:
             asked = self.asked.get(operation)
             if asked is None:
                 assert by is not None
-                before = self.books.demanded()
                 self._own_work(claims, *by)
-                self.books.keep(before, self._time_of_own_work(commit, records))
                 continue
             if not asked.needs_approval:
                 self._assert_in_order(asked)
@@ -171,33 +166,26 @@ class Oracle:
             self.counts["waited"] += outcome == "waiting"
         _assert_same(commit, claims, self.books.claims())
         _assert_same(commit, self._waiting_on(commit), self.books.waiting_files())
-        self._compare_replicas(commit, records)
         if entry_of(commit).by_generator:
+            self._compare_replicas(commit)
             services, links = _rendered(commit)
             _assert_same(commit, services, self.books.services())
             _assert_same(commit, links, self.books.links())
         self.books.chosen = {}
-        self._claims, self._records = claims, records
+        self._claims = claims
         self._models.append(pickle.dumps(self.books))
 
-    def _compare_replicas(
-        self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
-    ) -> None:
-        entry, now = entry_of(commit), _made(commit) + timedelta(seconds=1)
-        self.counts["scaled_down"] += entry.first("Operation") == "scale-down"
-        for one in self.books.kept.keys() | records.keys():
-            self.books.come_down(one, records.get(one, {}), now)
-        if entry.by_generator:
-            expected = [
-                (
-                    "city" if one[1] == FURTHER else "perception",
-                    one[0].partition("@")[2],
-                    sorted(topic for _, topic in topics),
-                    self.books.replicas(one),
-                )
-                for one, topics in self.books.demanded().items()
-            ]
-            _assert_same(commit, sorted(_rendered_instances(commit)), sorted(expected))
+    def _compare_replicas(self, commit: pygit2.Commit) -> None:
+        expected = [
+            (
+                "city" if one[1] == FURTHER else "perception",
+                one[0].partition("@")[2],
+                sorted(topic for _, topic in topics),
+                self.books.replicas(one),
+            )
+            for one, topics in self.books.demanded().items()
+        ]
+        _assert_same(commit, sorted(_rendered_instances(commit)), sorted(expected))
 
     def _follow_overrides(self, commit: pygit2.Commit) -> None:
         """Update the model with the overrides of a commit; fail if one ended before its time."""
@@ -209,18 +197,6 @@ class Oracle:
             assert not is_new or (override.end and override.end <= latest), early
         self._ended = {one for one in overrides if one.name in ended}
         self.books.overrides = frozenset(overrides) - self._ended
-
-    def _time_of_own_work(
-        self, commit: pygit2.Commit, records: dict[Instance, dict[int, datetime]]
-    ) -> datetime:
-        """Return when a generator acted by itself; new records of replicas tell it exactly."""
-        known = {end for steps in self._records.values() for end in steps.values()}
-        told = {end for steps in records.values() for end in steps.values()} - known
-        made = _made(commit)
-        for end in told:
-            if abs(end - KEPT_FOR - made) <= timedelta(seconds=1):
-                return end - KEPT_FOR
-        return made
 
     def _take(self, books: Running, asked: Asked, time: float) -> str:
         received = asked.ticket.received.astimezone(timezone.utc).isoformat(timespec="microseconds")
@@ -380,7 +356,6 @@ class Oracle:
             error = asked.is_answered and asked.ticket.future.exception()
             told = f"{operation} is booked, but was answered {error}"
             assert not error or operation not in self._place, told
-        assert not self.books.kept, f"did not come down: {self.books.kept}"
         leased = [name_of(claim) for claim in self.claims().values() if claim.lease]
         assert not leased, f"leases did not end: {leased}"
         free, drained = self.books.free(), self.books.drained
@@ -399,19 +374,6 @@ def _assert_same(commit: pygit2.Commit, found: object, expected: object) -> None
 
 def _made(commit: pygit2.Commit) -> datetime:
     return datetime.fromtimestamp(commit.commit_time, timezone.utc)
-
-
-def _kept_replicas(commit: pygit2.Commit) -> dict[Instance, dict[int, datetime]]:
-    return dict(map(_record, trees.texts(commit.tree, [KEPT_REPLICAS]).values()))
-
-
-@lru_cache(maxsize=1024)
-def _record(text: str) -> tuple[Instance, dict[int, datetime]]:
-    record = plain_yaml.load(text)
-    ends = ((one["replicas"], str(one["until"])) for one in record["keeps"])
-    return (record["application"], record["node"]), {
-        replicas: datetime.fromisoformat(until.replace("Z", "+00:00")) for replicas, until in ends
-    }
 
 
 def _overrides(commit: pygit2.Commit) -> tuple[list[Override], set[str]]:

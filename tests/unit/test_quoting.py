@@ -19,7 +19,7 @@ from demandops.cli.authoring import check
 from demandops.cli.json_output import print_json, show
 from demandops.cli.table import Column, Table
 from demandops.model.config.base_model import parse_file
-from demandops.model.ledger.records import _KeptReplicasFile
+from demandops.model.ledger.records import _WaitingFile
 from demandops.repo.load import last_valid_config
 from hypothesis import given
 from hypothesis import strategies as st
@@ -111,4 +111,4 @@ def test_faults_that_are_passed_on_are_still_counted_right() -> None:
 
 def test_a_file_that_is_no_mapping_is_told_the_format_of_its_own_kind() -> None:
     with pytest.raises(InvalidInput, match=r"starts with apiVersion: demandops\.ledger/v2"):
-        parse_file(_KeptReplicasFile, "[]", "ledger/replicas/a.yaml")
+        parse_file(_WaitingFile, "[]", "ledger/waiting/a.yaml")

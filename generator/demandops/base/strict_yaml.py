@@ -371,6 +371,38 @@ def set_key(text: str, key: str, value: object) -> str:
     return changed
 
 
+def without_field(text: str, field: str) -> str:
+    """Return a file's text without a field, such as ``a.b``; the rest stays, including comments.
+
+    If its form does not permit this, the text is returned unchanged.
+    """
+    *parents, last = field.split(".")
+    wanted = inner = load(text)
+    node: Any = yaml.compose(text, Loader=yaml.SafeLoader)
+    try:
+        for parent in parents:
+            inner = inner[parent]
+            node = next(value for name, value in node.value if name.value == parent)
+        del inner[last]
+    except KeyError:  # a part is no text, like `1`
+        return text
+    key, value = next(pair for pair in node.value if pair[0].value == last)
+    head, tail = text[: key.start_mark.index], text[value.end_mark.index :]
+    if len(node.value) == 1:
+        head += "" if node.flow_style else "{}"
+    elif node.flow_style:
+        before_comma = re.sub(r",\s*\Z", "", head)
+        if before_comma == head:  # the field is the first, or a comment precedes it
+            tail = re.sub(r"\A\s*,\s*", "", tail)
+        head = before_comma
+    else:
+        head, tail = head[: head.rfind("\n") + 1], tail.partition("\n")[2]
+    try:
+        return head + tail if load(head + tail) == wanted else text
+    except InvalidInput:
+        return text
+
+
 def to_json(value: object) -> str:
     """Return JSON that is also valid YAML; ``{{ … }}`` in a template writes this text."""
     text = _JSON.encode(value)

@@ -19,6 +19,7 @@ from demandops.decide.placement.capacity import overcommitted, whole_usage
 from demandops.decide.placement.relocation import following_overrides, with_moves
 from demandops.decide.planning.flows import flows
 from demandops.decide.planning.overrides import without_suspended
+from demandops.model.config.appdef import ignored_fields
 from demandops.model.config.config import DOMAINS_FILE, NODES_FILE, Config
 from demandops.model.config.policy import AccessDomain, matches
 from demandops.model.demand.demand import Application, Demand
@@ -173,6 +174,19 @@ def _is_misspelling(topic: str, other: str) -> bool:
 def _common(text: str, other: str) -> int:
     pairs = zip(text, other, strict=False)
     return sum(1 for _ in takewhile(lambda pair: pair[0] == pair[1], pairs))
+
+
+# ---- fields that are read and ignored ----
+
+
+def ignored_field_warnings(config: Config) -> Iterator[Fault]:
+    for path, text in sorted(config.files.items()):
+        for field in ignored_fields(path, text):
+            message = (
+                "is ignored, because replicas follow demand at once; remove it, or run `demandops "
+                "upgrade`, which does so"
+            )
+            yield fault(field, message).within(path)
 
 
 # ---- warnings about patterns of the policy that match nothing now ----

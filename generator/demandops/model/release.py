@@ -9,14 +9,13 @@ from demandops.connections.connection import Client
 from demandops.model.config.appdef import Resource, Scope, Service
 from demandops.model.config.config import CHARTS_FILE, VERSIONS_FILE, Config
 from demandops.model.config.inventory import Node
-from demandops.model.config.override import UNSHAPED, Shaping, format_time
+from demandops.model.config.override import UNSHAPED, Shaping
 from demandops.model.config.policy import AccessDomain
 from demandops.model.config.registry import ApplicationVersion, ChartSource, Image
 from demandops.model.demand.demand import InputTopic
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger
-from demandops.model.ledger.records import Instance, Kept
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,19 +78,6 @@ class ServiceKey:
             return "cluster"
         return "node" if self.source is None else "topic"
 
-    @property
-    def instance(self) -> Instance:
-        # the key of the ledger's record of kept replicas
-        named = (self.service, self.node, self.application, self.source, self.topic, self.version)
-        scope = "cluster" if self.for_cluster else ""
-        return ("replicas", *(name or "" for name in named), scope)
-
-    @classmethod
-    def of(cls, instance: Instance) -> ServiceKey:
-        service, node, *others, version, scope = instance[1:]
-        application, source, topic = (name or None for name in others)
-        return cls(service, node, application, source, topic, version, scope == "cluster")
-
 
 @dataclass(frozen=True, slots=True)
 class ServiceRelease:
@@ -108,7 +94,6 @@ class ServiceRelease:
     outputs: Mapping[str, str]
     parameters: Mapping[str, object]
     replicas: int | Autoscaler
-    keeps: Kept | None  # while the service still has more replicas than its demands need
     applications: tuple[str, ...]
     requesters: tuple[str, ...]
     shaping: Shaping = UNSHAPED
@@ -132,11 +117,10 @@ class ServiceRelease:
 
     def facts(self) -> list[str]:
         # one fact a line, because a commit message shows the lines that changed
-        until = f" until {format_time(self.keeps.until)}" if self.keeps else ""
         return [
             *(f"{role} {t.topic}" for role, topics in self.inputs.items() for t in topics),
             *(f"{name} = {value}" for name, value in self.parameters.items()),
-            f"replicas {self.replicas}{until}",
+            f"replicas {self.replicas}",
             *([f"version {self.version.name}"] if self.version.name else []),
             f"chart {self.chart.version}",
             *(
@@ -157,9 +141,6 @@ class ServiceRelease:
         if self.version.name:
             entry = f"applications.{self.version.appdef}.versions.{self.version.name}"
             yield config.file_of(VERSIONS_FILE, self.version.appdef), entry, "its version"
-        if self.keeps:
-            what = f"{self.replicas} replicas until {format_time(self.keeps.until)}"
-            yield records.replicas_path(self.key.instance), "keeps", what
         chart, name = self.chart, self.service.chart
         where = chart.oci or chart.http or f"folder {chart.folder or f'{folder}/charts/{name}'}"
         file = config.file_of(CHARTS_FILE, name)

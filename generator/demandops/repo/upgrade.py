@@ -21,6 +21,7 @@ from demandops.decide.decision import faults_of_edit
 from demandops.decide.placement.relocation import update_ledger
 from demandops.decide.planning.flows import with_booked_topics_marked
 from demandops.decide.state import State
+from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.config import CONFIG_ROOTS, Config
 from demandops.model.config.load import load
 from demandops.model.config.repo_settings import ROOT_FILE
@@ -114,9 +115,9 @@ def _plan(
     batch, old = CommitBatch(repository, snapshot), snapshot.state.config
     tree = trees.commit_of(objects, tip).tree
     files = trees.texts(tree, CONFIG_ROOTS)
-    before = files[ROOT_FILE]
-    files[ROOT_FILE] = _root(before, old, request)
-    config = load(files)
+    by_people = {path: without_ignored_fields(path, text) for path, text in files.items()}
+    by_people[ROOT_FILE] = _root(files[ROOT_FILE], old, request)
+    config = load(by_people)
     state = State(config, snapshot.state.ledger, EVALUATE)
     # people may have edited since the state in effect; their edits are checked and applied too
     start = state_in_effect.start_at(objects, tip)
@@ -147,17 +148,18 @@ def _plan(
             raise InvalidInput(held)
     files_of_ledger = _in_this_schema(trees.texts(tree, (LEDGER_ROOT,)), state.ledger)
     changed = dict(batch.render_all(state, {**files_of_ledger, **applied.files}).files)
-    if files[ROOT_FILE] != before:
-        changed[ROOT_FILE] = files[ROOT_FILE]
+    changed |= {path: text for path, text in by_people.items() if text != files[path]}
     upgrade = Upgrade(str(tip), old, state.config, dict(sorted(changed.items())))
     return upgrade, batch, state, applied.keys
 
 
-def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str]:
-    written = {}
+def _in_this_schema(files: Mapping[str, str], ledger: Ledger) -> dict[str, str | None]:
+    written = dict[str, str | None]()
     for path, text in files.items():
-        new = text
-        if claim_files.kind_of(path) is not None:
+        new: str | None = text
+        if path.startswith(f"{records.REPLICAS_ROOT}/"):
+            new = None
+        elif claim_files.kind_of(path) is not None:
             claim = ledger.get(claim_files.read(text, path).key)
             new = claim_files.text_of(claim) if claim else text
         elif records.read_ended_override({path: text}):

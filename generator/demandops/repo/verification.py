@@ -13,13 +13,13 @@ from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.decide.planning.planner import TracedPlan
 from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.decide.state import State, rendered_files
+from demandops.model.config.appdef import without_ignored_fields
 from demandops.model.config.config import CONFIG_ROOTS
 from demandops.model.config.repo_settings import ROOT_FILE
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import OVERRIDE_PREFIX
 from demandops.model.ledger.ledger import ClaimChange, World
-from demandops.model.ledger.records import Instance
 from demandops.model.release import Release
 from demandops.render import manifests, release_file
 from demandops.render.gitops import path_of
@@ -27,7 +27,6 @@ from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.history.commit_log import PROPOSAL, LogEntry, entry_of
 from demandops.repo.load import ledger_files, state_in_effect
-from demandops.repo.load.snapshot import changed_kept_replicas
 
 # ---- the files that a commit of the generator changed, but was not allowed to change ----
 #
@@ -35,9 +34,7 @@ from demandops.repo.load.snapshot import changed_kept_replicas
 # names. Some operations may change further files.
 
 # The folders of the ledger that have records, such as recent shutdowns, instead of claims.
-_RECORDS = tuple(
-    f"{root}/" for root in (records.MARKERS_ROOT, records.SHUTDOWNS_ROOT, records.REPLICAS_ROOT)
-)
+_RECORDS = tuple(f"{root}/" for root in (records.MARKERS_ROOT, records.SHUTDOWNS_ROOT))
 # Operations that may rewrite a claim, to start its lease or to change its schema.
 _REWRITING = ("follow", "upgrade")
 # Operations that may add or remove the marker of an ended override.
@@ -56,7 +53,9 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
     named = {f"{claim_files.segment(demand)}.yaml" for demand in demands}
     for path, blob in trees.differences(before, commit.tree):
         root = path.split("/", 1)[0]
-        if root in (*GENERATED_ROOTS, NOTES_ROOT) or (path == ROOT_FILE and operation == "upgrade"):
+        if root in (*GENERATED_ROOTS, NOTES_ROOT):
+            continue
+        if operation == "upgrade" and (path == ROOT_FILE or _only_removes_ignored(commit, path)):
             continue
         if isinstance(trees.entry(commit.tree, path), Tree):  # the files in the folder count
             continue
@@ -70,6 +69,14 @@ def disallowed_files(commit: Commit, entry: LogEntry) -> Iterator[str]:
                 yield path
         elif operation not in _REWRITING or not _only_rewrites(commit, path):
             yield path
+
+
+def _only_removes_ignored(commit: Commit, path: str) -> bool:
+    # fields of a definition, and records that earlier versions wrote
+    before, after = (trees.read_text(tree, path) for tree in (commit.parents[0].tree, commit.tree))
+    if path.startswith(f"{records.REPLICAS_ROOT}/"):
+        return after is None
+    return before is not None and without_ignored_fields(path, before) == after
 
 
 def _only_rewrites(commit: Commit, path: str) -> bool:
@@ -98,11 +105,7 @@ def _may_record(commit: Commit, path: str, operation: str) -> bool:
     if path.startswith(f"{records.MARKERS_ROOT}/"):
         is_valid = not text or bool(records.read_ended_override({path: text}))
         return operation in _ENDING and is_valid
-    if path.startswith(f"{records.SHUTDOWNS_ROOT}/"):
-        return operation in ("shutdown", "join", "rollback")
-    record = records.read_replicas(text, path)
-    is_canonical = record is not None and records.replicas_text(*record) == text
-    return operation not in (*_REWRITING, *_ENDING) and (not text or is_canonical)
+    return operation in ("shutdown", "join", "rollback")
 
 
 # ---- rendering the files again, and comparing them with the committed ones ----
@@ -163,18 +166,15 @@ class _Proof:
         ledger = self.state.ledger
         for change in changes:
             ledger = ledger.replace(change.key, change.after)
-        kept = dict(changed_kept_replicas(before, after))
-        for instance, steps in kept.items():
-            ledger = replace(ledger, kept=ledger.kept.replace(instance, steps))
         for path, blob in trees.differences(before, after, GENERATED_ROOTS):
             self._committed.pop(path, None)
             if blob is not None:
                 self._committed[path] = blob
         self.state, self._commit = replace(self.state, ledger=ledger), commit
-        self._render(changes, kept)
+        self._render(changes)
 
-    def _render(self, changes: Sequence[ClaimChange], kept: Iterable[Instance] = ()) -> None:
-        for key, release in self._plan.advance(self.state.ledger, changes, kept).items():
+    def _render(self, changes: Iterable[ClaimChange]) -> None:
+        for key, release in self._plan.advance(self.state.ledger, changes).items():
             self._planned.pop(key, None)
             self._held.pop(key, None)
             if release is not None and release.shaping.held:

@@ -20,7 +20,7 @@ from demandops.decide.planning.release_keys import ReleaseKey
 from demandops.model.config.override import Override
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import World, changes_on
-from demandops.model.release import Release, ServiceKey, ServiceRelease
+from demandops.model.release import Release, ServiceRelease
 from demandops.repo.history.commit_log import LogEntry
 from demandops.repo.load.last_valid_config import Problem
 from demandops.repo.load.snapshot import Snapshot
@@ -117,12 +117,6 @@ class CommitState:
         subjects = [*dict.fromkeys(subject_before.get(id) or subject_now[id] for id in differing)]
         changes = changes_on(old.ledger, new.ledger, subjects)
         keys: set[ReleaseKey] = {*release_keys.affected_keys(old, new, changes)}
-        kept_before, kept_now = old.ledger.kept.steps, new.ledger.kept.steps
-        keys |= {
-            ServiceKey.of(instance)
-            for instance in {*kept_before, *kept_now}
-            if kept_before.get(instance) != kept_now.get(instance)
-        }
         for was, now in ((change.before, change.after) for change in changes):
             # the page shows requesters, but `affected_keys` omits a release whose file stays the
             # same although its requesters changed

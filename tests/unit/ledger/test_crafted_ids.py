@@ -15,7 +15,7 @@ import pytest
 import yaml
 from demandops.base import naming
 from demandops.base.errors import InvalidInput, Refused
-from demandops.base.naming import Subject, SubjectKind
+from demandops.base.naming import SubjectKind
 from demandops.connections import ros
 from demandops.decide.booking import Drain
 from demandops.decide.checks import collisions
@@ -30,11 +30,9 @@ from demandops.model.ledger import records
 from demandops.model.ledger.claim import ClaimKey, demand_id
 from demandops.model.ledger.ledger import Changes
 from demandops.model.ledger.records import RecentShutdown, RecentShutdowns, Wait, WaitingDemand
-from demandops.model.release import ServiceKey
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tests.appdefs.test_scaling import books, demand
 from tests.kit.chance import chances, examples, told
 from tests.kit.config import configuration, override, skeleton, state_of
 from tests.kit.goals import CLOUD, Goal, application, connection, goal, put
@@ -198,28 +196,6 @@ def test_a_shutdown_repeats_only_one_by_the_same_requesters() -> None:
     assert shutdowns.earlier(known) == known
     assert shutdowns.earlier(replace(known, requesters=("vehicle01",))) is None
     assert shutdowns.earlier(replace(known, request="other")) is None
-
-
-@pytest.mark.usefixtures("short_digests")
-def test_two_service_instances_keep_replicas_in_two_files() -> None:
-    repo = books("{max: 9, per: {topics: 1}, downAfter: 10m}")
-
-    def recording(id: str) -> Goal:
-        item = demand()["applications"][0] | {"id": id}
-        return demand(id) | {"applications": [item]}
-
-    def names(id: str) -> tuple[str, str, str]:
-        """Return the names of an application's replicas, release and claim."""
-        key = ClaimKey(Subject(SubjectKind.APPLICATION, id), id)
-        replicas = records.replicas_path(ServiceKey("recorder", "edge", id).instance)
-        return replicas, naming.object_name("rec", id), claim_files.path_of(key)
-
-    same, *apart = names("rec/x")
-    others = (f"rec/{'-' * number}x" for number in range(1, 1000))
-    other = next(id for id in others if names(id)[0] == same and not {*names(id)} & {*apart})
-    repo.send(recording("rec/x"))
-    (found,) = conflicts(repo, recording(other))
-    assert "replicas" in found
 
 
 def rivals_at(node: str) -> str:

@@ -25,7 +25,7 @@ from demandops.repo.reader import Reader
 # The operations that `--operation` accepts. `by-hand` selects the commits by people.
 OPERATIONS = (
     *("join", "shutdown", "put", "release", "renew", "expire", "wait", "decommission", "drain"),
-    *("scale-down", "follow", "expire-override", "rollback", "upgrade", "init", "by-hand"),
+    *("follow", "expire-override", "rollback", "upgrade", "init", "by-hand"),
 )
 
 _TRAILERS = {

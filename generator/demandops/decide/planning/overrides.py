@@ -277,7 +277,7 @@ def apply_effects(
             release = replace(release, chart=chart or release.chart)
         if "replicas" in effects and override.replicas is not None:
             replicas = overridden(release.replicas, override.replicas)
-            release = replace(release, replicas=replicas, keeps=None)
+            release = replace(release, replicas=replicas)
         if "node" in effects:
             node, domain = config.node_and_domain(str(override.node))
             release = replace(release, node=node, domain=domain)

@@ -9,8 +9,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from datetime import datetime
-from types import MappingProxyType, SimpleNamespace
+from types import MappingProxyType
 from typing import Any, TypeAlias, TypeGuard, TypeVar, cast
 
 from demandops.base import naming, strict_yaml
@@ -29,7 +28,6 @@ from demandops.model.config.override import Override
 from demandops.model.demand.demand import Application, InputTopic
 from demandops.model.ledger.claim import Claim, requesters_of
 from demandops.model.ledger.ledger import ClaimChange, Ledger, World, index_entries
-from demandops.model.ledger.records import Instance, Kept, Steps, extended
 from demandops.model.release import Autoscaler, Release, ServiceKey, ServiceRelease
 
 
@@ -43,13 +41,6 @@ def plan(world: World, key: ReleaseKey) -> Release | None:
     world = without_suspended(world)
     release = _unshaped(world, key)
     return overrides.apply_overrides(release, world) if release else None
-
-
-def without_kept(world: World, key: ServiceKey) -> ServiceRelease | None:
-    """Return a service as demands need it: without kept replicas, and without overrides."""
-    world = without_suspended(world)
-    kept = world.ledger.kept.replace(key.instance, ())
-    return _service(replace(world, ledger=replace(world.ledger, kept=kept)), key)
 
 
 def denied_release(world: World, key: ReleaseKey) -> tuple[Release, Override] | None:
@@ -104,9 +95,6 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
     applications = tuple(dict.fromkeys(app.id for app in apps))
     version = release_keys.version_of_service(world, service, applications)
     topics = [topic for role_topics in inputs.values() for topic in role_topics]
-    needed = replicas_of(service.scaling, parameters, topics, claims, requesters)
-    kept = world.ledger.kept.steps.get(key.instance)
-    replicas, keeps = with_kept(needed, service.scaling, kept or ())
     return ServiceRelease(
         key=key,
         name=service_name(config, service, key),
@@ -118,8 +106,7 @@ def _service(world: World, key: ServiceKey) -> ServiceRelease | None:
         inputs=MappingProxyType(inputs),
         outputs=MappingProxyType(outputs(config, service, key, further=further)),
         parameters=MappingProxyType(parameters),
-        replicas=replicas,
-        keeps=keeps,
+        replicas=_replicas_of(service.scaling, parameters, topics, claims, requesters),
         applications=applications,
         requesters=requesters,
     )
@@ -285,14 +272,7 @@ def is_bridged(route: Route, source: str, target: str, config: Config) -> bool:
     return route.read_topic in node.bridged.get(receiver, ())
 
 
-# ---- replicas: how many a service has, and how long it keeps those that no demand needs ----
-#
-# If the definition has such a time and demands need fewer replicas than before, the decision
-# records how many replicas the service keeps, and until when (:mod:`.records`). When that time is
-# over, the generator publishes a commit that removes these replicas from the record.
-
-
-def replicas_of(
+def _replicas_of(
     scaling: Scaling,
     parameters: Mapping[str, object],
     topics: Collection[InputTopic],
@@ -317,49 +297,6 @@ def replicas_of(
         needed = -(-len(counted[measure]) // share)  # rounded up
         return max(scaling.min, min(scaling.max, needed))
     return scaling.min
-
-
-def with_kept(
-    needed: int | Autoscaler, scaling: Scaling, steps: Steps
-) -> tuple[int | Autoscaler, Kept | None]:
-    """Return how many replicas a service has, and the step that decides this, if one does."""
-    if isinstance(needed, Autoscaler) or not (steps and scaling.down_after):
-        return needed, None
-    kept = min(steps[0].replicas, scaling.most)  # a person may have lowered the limit meanwhile
-    return (kept, steps[0]) if kept > needed else (needed, None)
-
-
-def with_kept_replicas(
-    before: World, after: World, keys: Iterable[ReleaseKey], now: datetime
-) -> tuple[Ledger, tuple[Instance, ...]]:
-    kept, changed = after.ledger.kept, list[Instance]()
-    for key in keys:
-        if not isinstance(key, ServiceKey):
-            continue
-        recorded = kept.steps.get(key.instance) or ()
-        if not recorded and key.service not in after.config.services_with_down_after:
-            continue
-        steps = _steps(before, after, key, recorded, now)
-        if steps != recorded:
-            kept = kept.replace(key.instance, steps)
-            changed.append(key.instance)
-    return replace(after.ledger, kept=kept) if changed else after.ledger, tuple(changed)
-
-
-def _steps(before: World, after: World, key: ServiceKey, recorded: Steps, now: datetime) -> Steps:
-    release = without_kept(after, key)
-    kept_for = release.service.scaling.kept_for if release else None
-    if release is None or kept_for is None:
-        return ()  # a service that nobody needs stops at once, as does one without ``downAfter``
-    try:
-        old = without_kept(before, key)
-    except Refused:  # the release before the demand can no longer be planned
-        old = None
-    return extended(recorded, _number(release), _number(old), now, now + kept_for)
-
-
-def _number(release: ServiceRelease | None) -> int:
-    return release.replicas if release and isinstance(release.replicas, int) else 0
 
 
 # ---- a plan that follows a sequence of ledgers, to verify commits ----
@@ -388,7 +325,7 @@ class TracedPlan:
         self._planned: set[ReleaseKey] = set()
 
     def advance(
-        self, ledger: Ledger, changes: Iterable[ClaimChange], kept: Iterable[Instance] = ()
+        self, ledger: Ledger, changes: Iterable[ClaimChange]
     ) -> dict[ReleaseKey, Release | None]:
         """Plan the releases that the changes may affect; the first call plans all releases.
 
@@ -396,7 +333,7 @@ class TracedPlan:
         out of date and must not be used again.
         """
         # The reads whose result may differ now.
-        reads: set[_Read] = {_ALL, *kept}
+        reads: set[_Read] = {_ALL}
         for change in changes:
             entries = index_entries(change.before), index_entries(change.after)
             reads |= {change.key.subject}.union(*entries)
@@ -426,8 +363,6 @@ class TracedPlan:
             cast(Any, _Recording(ledger.index, reads)),
             cast(Any, None),  # planning does not read the ends of leases
             ledger.ended,
-            # of the kept replicas, planning reads only the steps
-            kept=cast(Any, SimpleNamespace(steps=_Recording(ledger.kept.steps, reads))),
         )
         result = work(World(self._config, traced), unit)
         for read in reads:

@@ -8,8 +8,8 @@ detection), and each of these appdefs lists the service's name under ``uses``.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
-from datetime import timedelta
 from graphlib import CycleError, TopologicalSorter
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -20,7 +20,6 @@ from demandops.base.errors import sentences, suggestion
 from demandops.model.config import base_model, inventory
 from demandops.model.config.base_model import CamelModel, DnsLabel, FileModel, Items, Text, Word
 from demandops.model.config.inventory import LabelKey, LabelValue, NodeId, PropertyName, Resources
-from demandops.model.config.policy import Duration
 
 # ---- the number of replicas of a service ----
 
@@ -61,9 +60,7 @@ class Scaling(CamelModel):
 
     ``divides_work`` says that no two replicas publish the same data.
 
-    With ``per`` or ``sizes``, additional replicas start without delay. They stop once fewer
-    replicas have been needed for ``down_after``, or at once without it
-    (:mod:`.records`). No number is above ``max``, except one in ``sizes``.
+    No number is above ``max``, except one in ``sizes``.
     """
 
     min: Count = 1
@@ -73,15 +70,16 @@ class Scaling(CamelModel):
     autoscaler: Annotated[dict[Resource, Percent], Field(min_length=1)] | None = None
     may_depend_on_requesters: bool = False
     divides_work: bool = False
-    down_after: Duration | None = None
 
     @model_validator(mode="before")
     @classmethod
     def _renamed(cls, data: object) -> object:
-        if isinstance(data, dict) and "topicsPerReplica" in data:
+        if not isinstance(data, dict):
+            return data
+        if "topicsPerReplica" in data:
             per = strict_yaml.short_repr(data["topicsPerReplica"])
             raise ValueError(f"'topicsPerReplica' has a new name; write 'per: {{topics: {per}}}'")
-        return data
+        return {name: value for name, value in data.items() if name != "downAfter"}  # ignored
 
     @model_validator(mode="after")
     def _consistent(self) -> Scaling:
@@ -114,24 +112,28 @@ class Scaling(CamelModel):
             )
         if self.may_depend_on_requesters and not by_requesters:
             yield "'mayDependOnRequesters' does nothing unless 'per' counts requesters; remove it"
-        if self.down_after and not (self.per or self.sizes):
-            own = " (an autoscaler has a delay of its own)" if self.autoscaler else ""
-            yield f"'downAfter' does nothing without 'per' or 'sizes'{own}; remove 'downAfter'"
-        if self.down_after and base_model.seconds_of(self.down_after) < 1:
-            yield "downAfter is zero; leave it out"
-
-    # how long a service keeps replicas that no demand needs
-    @property
-    def kept_for(self) -> timedelta | None:
-        return (
-            timedelta(seconds=base_model.seconds_of(self.down_after)) if self.down_after else None
-        )
 
     @property
     def most(self) -> int:
         if self.sizes:
             return max(self.sizes.replicas.values())
         return self.max if self.per or self.autoscaler else self.min
+
+
+# A definition's fields that earlier versions read. They have no effect, whatever their value.
+_IGNORED = re.compile(r"(services\.[^.]+\.)?scaling\.downAfter")
+
+
+def ignored_fields(path: str, text: str) -> list[str]:
+    if not re.fullmatch(r"appdefs/[^/]+/(appdef|service)\.yaml", path) or "downAfter" not in text:
+        return []
+    return [field for field in strict_yaml.lines(text) if _IGNORED.fullmatch(field)]
+
+
+def without_ignored_fields(path: str, text: str) -> str:
+    for field in ignored_fields(path, text):
+        text = strict_yaml.without_field(text, field)
+    return text
 
 
 # ---- services as people define them ----

@@ -113,8 +113,6 @@ class Config:
     limits_capacity: bool = field(init=False, compare=False, repr=False)
     # The input roles, sorted, that are the `root` of a service in at least one appdef
     roles_with_services: tuple[str, ...] = field(init=False, compare=False, repr=False)
-    # The names of the services whose scaling has `downAfter`, in at least one appdef
-    services_with_down_after: frozenset[str] = field(init=False, compare=False, repr=False)
     # For each appdef, a map from names of versions and channels to versions. The empty name stands
     # for the default version.
     application_versions: Mapping[str, Mapping[str, ApplicationVersion]] = field(
@@ -149,7 +147,6 @@ class Config:
             "property_kinds": {name: (kind, ids[0]) for name, (kind, ids) in kinds.items()},
             "drained_nodes": tuple(sorted(id for id, node in self.nodes.items() if node.drained)),
             "limits_capacity": any(node.capacity is not None for node in self.nodes.values()),
-            "services_with_down_after": frozenset(s.name for s in services if s.scaling.down_after),
             "roles_with_services": tuple(sorted({s.root for s in services if s.root})),
             "application_versions": {name: self._versions(name) for name in self.services},
         }

@@ -19,6 +19,10 @@ from demandops.model.demand.demand import Demand, Operation
 from demandops.model.demand.goals import read_goal
 from demandops.model.ledger.claim import LEDGER_ROOT, segment
 
+# Earlier versions recorded here for how long a service kept replicas that no demand needed. Such
+# files are ignored, and `demandops upgrade` deletes them.
+REPLICAS_ROOT = f"{LEDGER_ROOT}/replicas"
+
 # ---- waiting demands, which the ledger keeps until a node has room ----
 #
 # A waiting demand holds nothing. When room may be free, the generator tries to book the waiting

@@ -20,7 +20,7 @@ from demandops.base.naming import SubjectKind
 from demandops.base.quoting import one_line
 from demandops.base.settings import GENERATED_ROOTS, NOTES_ROOT, RENDER_VERSION
 from demandops.decide.booking import Drain
-from demandops.decide.changeset import Changeset, ReleaseChange
+from demandops.decide.changeset import ReleaseChange
 from demandops.decide.decision import Decision
 from demandops.decide.rollback import Restoration
 from demandops.model.config.config import CONFIG_ROOTS
@@ -28,7 +28,7 @@ from demandops.model.config.override import OVERRIDES_ROOT, Override, format_tim
 from demandops.model.demand.demand import Decommission
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import LEDGER_ROOT, OVERRIDE_PREFIX, ClaimKey
-from demandops.model.ledger.records import Instance, Wait
+from demandops.model.ledger.records import Wait
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log, revisions
 from demandops.repo.history.commit_log import GENERATOR_EMAIL, GENERATOR_NAME, REPLACES, compose
@@ -255,25 +255,6 @@ def of_override_end(
         ("Operation", "expire-override"),
         *override_trailers([override.path, *keep_override_paths(keys)]),
         *demand_trailers(keys),
-        *more,
-        ("Render-Version", str(RENDER_VERSION)),
-    ]
-    return compose(paragraphs, trailers)
-
-
-def of_scale_down(
-    instance: Instance, change: Changeset, more: Iterable[tuple[str, str]] = ()
-) -> str:
-    service, node = instance[1:3]
-    names = ", ".join(release.name for release in change.releases) or f"{service} on {node}"
-    paragraphs = [
-        [one_line(f"Scale down {names}", _MAX_SUBJECT)],
-        ["Why: downAfter has passed since a demand last needed the replicas."],
-        _desired_state(change.releases) if change.releases else [_UNCHANGED],
-    ]
-    trailers = [
-        ("Operation", "scale-down"),
-        *override_trailers(change.overrides),
         *more,
         ("Render-Version", str(RENDER_VERSION)),
     ]

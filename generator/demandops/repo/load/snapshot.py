@@ -23,7 +23,6 @@ from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger import records
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import ClaimChange, Ledger
-from demandops.model.ledger.records import Instance, Steps
 from demandops.repo.git import tree as trees
 from demandops.repo.history import commit_log
 from demandops.repo.load import last_valid_config, ledger_files
@@ -79,8 +78,7 @@ def load(
     ended = last_valid_config.ended_overrides_at(commit.tree)
     shutdowns = records.read_all_shutdowns(trees.texts(commit.tree, (records.SHUTDOWNS_ROOT,)))
     waits = records.read_all_waiting(trees.texts(commit.tree, (records.WAITING_ROOT,)))
-    kept = records.read_all_replicas(trees.texts(commit.tree, (records.REPLICAS_ROOT,)))
-    ledger = replace(files.ledger(), ended=ended, shutdowns=shutdowns, waiting=waits, kept=kept)
+    ledger = replace(files.ledger(), ended=ended, shutdowns=shutdowns, waiting=waits)
     return Snapshot(commit.id, State(config, ledger, EVALUATE), commit.id)
 
 
@@ -123,10 +121,7 @@ def advance(
         shutdowns = shutdowns.replace(records.digest_in(path), shutdown)
     if trees.differ(old, new, (records.WAITING_ROOT,)):
         waits = records.read_all_waiting(trees.texts(new, (records.WAITING_ROOT,)))
-    kept = state.ledger.kept
-    for instance, steps in changed_kept_replicas(old, new):
-        kept = kept.replace(instance, steps)
-    ledger = replace(state.ledger, ended=ended, shutdowns=shutdowns, waiting=waits, kept=kept)
+    ledger = replace(state.ledger, ended=ended, shutdowns=shutdowns, waiting=waits)
     state = State(config, ledger, EVALUATE) if in_effect.config else replace(state, ledger=ledger)
     problems, claims, invalid = list(in_effect.faults), dict[str, Claim | None](), list[str]()
     # a quarantined file is read again, because another change may have made it valid
@@ -166,15 +161,6 @@ def advance(
     return Advance(snapshot, tuple(subjects), config_changed)
 
 
-def changed_kept_replicas(old: Tree | None, new: Tree) -> Iterator[tuple[Instance, Steps]]:
-    # what each instance whose kept replicas changed keeps now
-    for path, _ in trees.differences(old, new, (records.REPLICAS_ROOT,)):
-        texts = [trees.read_text(tree, path) for tree in (old, new)]
-        before, after = (records.read_replicas(text, path) if text else None for text in texts)
-        if record := after or before:
-            yield record[0], after[1] if after else ()
-
-
 def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
     # people may have changed generated files since ``before``
     people = list(commit_log.person_commits(repo, to, before))
@@ -183,8 +169,7 @@ def _must_render_all(repo: Repository, before: Oid, to: Oid) -> bool:
         return False
     # a person's commit may undo what another generator has committed meanwhile
     is_alone = len(people) == sum(1 for _ in commit_log.commits(repo, to, before))
-    own = (*GENERATED_ROOTS, records.REPLICAS_ROOT)
-    roots = own if is_alone else (*own, *ROOTS)
+    roots = GENERATED_ROOTS if is_alone else (*GENERATED_ROOTS, *ROOTS)
     return any(
         trees.differ(commit.parents[0].tree, commit.tree, roots)
         for commit in people

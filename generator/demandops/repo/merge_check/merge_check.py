@@ -135,6 +135,7 @@ def check(
             bookkeeping=_bookkeeping_changes(start, state),
             warnings=(
                 *(fault("", text).within(path) for path, text in idle),
+                *warnings.ignored_field_warnings(state.config),
                 *warnings.policy_warnings(state),
                 *warnings.unmatched_pattern_warnings(state.config),
                 *warnings.misspelled_topic_warnings(state),
@@ -289,9 +290,6 @@ class _Edit:
         root = f"{records.MARKERS_ROOT}/"
         markers = {path: text for path, text in self.files.items() if path.startswith(root)}
         ended = records.read_ended_override(markers)
-        root = f"{records.REPLICAS_ROOT}/"
-        kept = {path: text for path, text in self.files.items() if path.startswith(root)}
-        ledger = replace(ledger, kept=records.read_all_replicas(kept))
         expired = expired_overrides(World(config, replace(ledger, ended=ended)), self.now)
         ended |= {override.name: format_time(override.end) for override in expired if override.end}
         state = State(config, replace(ledger, ended=ended), EVALUATE)

@@ -22,7 +22,6 @@ from demandops.base.settings import GENERATED_ROOTS
 from demandops.decide.booking import Drain
 from demandops.decide.changeset import Change, Changeset, ReleaseChange
 from demandops.decide.decision import Decision, changeset_of_edit, decide
-from demandops.decide.decision import scale_down as scaled_down
 from demandops.decide.placement import relocation
 from demandops.decide.state import State, rendered_files
 from demandops.model.config.config import NODES_FILE
@@ -30,7 +29,6 @@ from demandops.model.config.override import Override
 from demandops.model.ledger import claim as claim_files
 from demandops.model.ledger.claim import ClaimKey
 from demandops.model.ledger.ledger import claim_changes
-from demandops.model.ledger.records import Instance
 from demandops.repo.git import signing
 from demandops.repo.git import tree as trees
 from demandops.repo.git.repository import StateRepository
@@ -211,14 +209,6 @@ class CommitBatch:
         more = state_in_effect.trailers_of(self.head)
         text = commit_message.of_override_end(override, change.releases, applied.keys, more)
         self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
-
-    def scale_down(self, instance: Instance, now: datetime) -> str:
-        # the title of the commit; InvalidInput if the service cannot be planned or rendered
-        state, change = scaled_down(self.head.state, instance, now, self.read)
-        more = state_in_effect.trailers_of(self.head)
-        text = commit_message.of_scale_down(instance, change, more)
-        self.commit_files(change.files, state, text, commit_message.generator_signature(now), now)
-        return text.partition("\n")[0]
 
     def drain(self, node: str, after: str, operation: str, now: datetime) -> Decision:
         # it begins with the application that follows ``after``; if none can move, nothing changes

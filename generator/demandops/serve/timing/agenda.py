@@ -16,7 +16,7 @@ from demandops.model.config.config import Config
 from demandops.model.ledger.ledger import World
 from demandops.model.ledger.records import in_turn
 from demandops.repo.write.commit_batch import CommitBatch
-from demandops.serve.timing.expiry import RETRY, OverrideExpiry, ScaleDown
+from demandops.serve.timing.expiry import RETRY, OverrideExpiry
 from demandops.serve.timing.pauses_and_limits import within
 
 # ---- drained nodes: placed applications and services move off them ----
@@ -146,29 +146,24 @@ class Agenda:
     def __init__(self, runtime: Runtime) -> None:
         self._runtime = runtime
         self._override_expiry = OverrideExpiry()
-        self._scale_down = ScaleDown()
         self._draining = Draining(runtime)
         self.waiting_turns = WaitingTurns(runtime)
 
     def commit_due(self, commits: CommitBatch) -> None:
-        # a scale-down frees room for what moves, and what runs moves before what waits is booked
+        # what runs moves before what waits is booked
         self._override_expiry.end_due(commits, self._runtime.now())
-        self._scale_down.end_due(commits, self._runtime.now())
         self._draining.move_due(commits)
         self.waiting_turns.book_due(commits)
 
     def postpone(self) -> None:
         # because a fetch or a publication failed
-        later = self._runtime.now() + RETRY
-        self._override_expiry.not_before = self._scale_down.not_before = later
+        self._override_expiry.not_before = self._runtime.now() + RETRY
         self._draining.after.clear()
         self.waiting_turns.left.clear()
 
     def is_due(self, state: State) -> bool:
-        now = self._runtime.now()
         return (
-            self._override_expiry.is_due(state, now)
-            or self._scale_down.is_due(state.ledger, now)
+            self._override_expiry.is_due(state, self._runtime.now())
             or self._draining.is_due(state)
             or self.waiting_turns.is_due(state)
         )
@@ -177,6 +172,4 @@ class Agenda:
         # what was left off goes on at once, but after the demands that arrived meanwhile
         if self._draining.after or self.waiting_turns.left:
             return 0.0
-        now = self._runtime.now()
-        seconds = self._override_expiry.seconds_until_due(state, now, longest)
-        return self._scale_down.seconds_until_due(state.ledger, now, seconds)
+        return self._override_expiry.seconds_until_due(state, self._runtime.now(), longest)

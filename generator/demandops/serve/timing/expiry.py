@@ -1,9 +1,9 @@
-"""Ends leases, overrides and kept replicas when their time comes.
+"""Ends leases and overrides when their time comes.
 
 A person may set the clock. A clock that is set back only delays the end of a lease. A clock that
 jumps forward would end leases that were renewed in time, so after a jump every lease gets its
-full term again. The sleep of a machine looks like a jump and has the same effect. Overrides and
-kept replicas get no more time after a jump.
+full term again. The sleep of a machine looks like a jump and has the same effect. Overrides get no
+more time after a jump.
 """
 
 from __future__ import annotations
@@ -12,14 +12,13 @@ import logging
 from concurrent.futures import Future
 from datetime import datetime, timedelta, timezone
 
-from demandops.base.errors import InvalidInput, OverLimit
+from demandops.base.errors import InvalidInput
 from demandops.base.quoting import quoted
 from demandops.base.runtime import Runtime
 from demandops.decide.placement.relocation import expired_overrides
 from demandops.model.demand.demand import Demand
 from demandops.model.ledger.claim import Claim
 from demandops.model.ledger.ledger import Ledger, World
-from demandops.model.ledger.records import Instance
 from demandops.repo.write.commit_batch import CommitBatch
 from demandops.serve.queue import Receipt, Ticket
 
@@ -32,7 +31,7 @@ _JUMP = timedelta(seconds=30)
 _SHORTEST_S = 1.0
 # The longest time between two checks of the leases; short, because a person may set the clock.
 LONGEST_WAIT_S = 60.0
-# The pause after a failed try to end a lease or an override, or to scale down.
+# The pause after a failed try to end a lease or an override.
 RETRY = timedelta(seconds=LONGEST_WAIT_S)
 
 
@@ -133,35 +132,6 @@ class OverrideExpiry:
             for override in world.overrides
             if override.end
         ]
-
-
-class ScaleDown:
-    def __init__(self) -> None:
-        self._retry_at: dict[Instance, datetime] = {}
-        self.not_before = datetime.min.replace(tzinfo=timezone.utc)
-
-    def end_due(self, commits: CommitBatch, now: datetime) -> None:
-        for instance in commits.head.state.ledger.kept.due(now):
-            if self._retry_at.get(instance, now) > now:
-                continue
-            try:
-                log.info("%s", commits.scale_down(instance, now))
-                self._retry_at.pop(instance, None)
-            except InvalidInput as error:
-                self._retry_at[instance] = now + RETRY
-                for problem in error.faults:
-                    log.error("cannot scale down: %s; trying again later", problem)
-                if isinstance(error, OverLimit):  # the next may take as long, and demands wait
-                    break
-
-    def is_due(self, ledger: Ledger, now: datetime) -> bool:
-        if now < self.not_before:
-            return False
-        return any(self._retry_at.get(due, now) <= now for due in ledger.kept.due(now))
-
-    def seconds_until_due(self, ledger: Ledger, now: datetime, longest: float) -> float:
-        end = ledger.kept.next_end()
-        return longest if end is None else _seconds_until(max(end, self.not_before), now, longest)
 
 
 def _seconds_until(time: datetime, now: datetime, longest: float) -> float:
